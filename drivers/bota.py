@@ -11,8 +11,8 @@ from drivers.force_sensor import checked_config, open_streaming
 from drivers.force_stream import SensorFormat
 from drivers.frame_losses import ByDeviceClock
 from drivers.frames import FrameFormat, crc_x25
-from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
+from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
 BAUD = 460800

@@ -6,17 +6,17 @@ import serial
 
 from drivers.force_stream import DEVICE, ForceStream, SensorFormat
 from drivers.serial_line import close_port, drain, line_failures, open_port
-from hilcal.acquire.devices import Losses, Report, WrenchSample
 from hilcal.config import CellConfig
 from hilcal.config.rig import ForceSensor as Section
 from hilcal.errors import InputError
+from hilcal.measuring.devices import Losses, Report, WrenchSample
 
 FIRST_FRAME_S = 1.0
 OLD_S = 0.05
 
 
 class StreamingSensor:
-    """A force sensor that sends by itself; see `hilcal.acquire.devices.ForceSensorDevice`."""
+    """A force sensor that sends by itself; see `hilcal.measuring.devices.ForceSensorDevice`."""
 
     def __init__(
         self,

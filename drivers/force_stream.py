@@ -16,8 +16,8 @@ import serial
 from drivers.frame_losses import LossCounter
 from drivers.frames import Deframer, FrameFormat
 from drivers.serial_line import line_failures
-from hilcal.acquire.devices import Losses, WrenchSample
 from hilcal.errors import DeviceError
+from hilcal.measuring.devices import Losses, WrenchSample
 from hilcal.types import Floats, Ints
 
 DEVICE = "force sensor"
@@ -92,7 +92,7 @@ class ForceStream:
             raise DeviceError(self._silence())
 
     def latest(self) -> WrenchSample:
-        """Return the newest frame; see `hilcal.acquire.devices.ForceSensorDevice`."""
+        """Return the newest frame; see `hilcal.measuring.devices.ForceSensorDevice`."""
         self._check()
         with self._lock:
             at = (self._kept - 1) % RING
@@ -102,7 +102,7 @@ class ForceStream:
         return WrenchSample(int(stamp), wrench, np.zeros((6, 6)), 1, temperature)
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean over the next seconds; see `hilcal.acquire.devices.ForceSensorDevice`."""
+        """Return the mean over the next seconds; see `measuring.devices.ForceSensorDevice`."""
         if not np.isfinite(seconds) or seconds < 0.0:
             raise ValueError(f"seconds = {seconds}; valid: 0 or more")
         self._check()

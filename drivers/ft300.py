@@ -18,9 +18,9 @@ from drivers.frame_losses import ByArrival
 from drivers.frames import FrameFormat, crc_modbus
 from drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
 from drivers.serial_line import close_port, drain, line_failures, open_port
-from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
+from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
 BAUD = 19200

@@ -16,12 +16,12 @@ from pydantic import Field
 from drivers import geocom_codes as geo
 from drivers.geocom_line import ANSWER_S, DEVICE, Link
 from drivers.geocom_reading import PolarReading, numbers, plausible, usable
-from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import Report, TargetLostError, TrackerSample
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
-from hilcal.data.covariance import TrackerNoise, tracker_covariance
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats
 
@@ -53,7 +53,7 @@ class Options(Section):
 
 
 class GeoComTracker:
-    """A GeoCOM instrument as a `hilcal.acquire.devices.TrackerDevice` of positions (m = 3)."""
+    """A GeoCOM instrument as a `hilcal.measuring.devices.TrackerDevice` of positions (m = 3)."""
 
     def __init__(self, link: Link, config: TrackerConfig, options: Options, clock: Clock) -> None:
         """Take over an open link; sends nothing yet."""

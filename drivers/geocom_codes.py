@@ -6,8 +6,8 @@ names of all codes are geocompy's.
 
 from geocompy.geo.gctypes import GeoComCode
 
-from hilcal.acquire.devices import TargetLostError
 from hilcal.errors import DeviceError
+from hilcal.measuring.devices import TargetLostError
 
 NULL = 0
 GEOCOM_VERSION = 110

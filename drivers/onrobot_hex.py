@@ -18,9 +18,9 @@ from drivers.force_sensor import checked_config, open_streaming
 from drivers.force_stream import SensorFormat
 from drivers.frame_losses import ByDeviceClock
 from drivers.frames import FrameFormat
-from hilcal.acquire.devices import ForceSensorDevice
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
+from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
 BAUD = 1_000_000

@@ -7,9 +7,9 @@ import termios
 
 from rich.console import Console
 
-from hilcal.acquire.devices import Report
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import Report
 from hilcal.names import escaped
 
 _NO_TERMINAL = (
@@ -25,7 +25,7 @@ class TerminalOperator:
     """Asks on standard error and listens to standard input.
 
     Attributes:
-        at_terminal: true, see `hilcal.acquire.devices.TerminalPerson`.
+        at_terminal: true, see `hilcal.measuring.devices.TerminalPerson`.
     """
 
     def __init__(self, config: CellConfig) -> None:
@@ -55,7 +55,7 @@ class TerminalOperator:
         self._ask(f"Not yet: {why}" if why else "", self._request(load), said)
 
     def confirm(self, question: str) -> None:
-        """Ask whether the arm may go on; see `hilcal.acquire.devices.ConfirmingOperator`.
+        """Ask whether the arm may go on; see `hilcal.measuring.devices.ConfirmingOperator`.
 
         Raises:
             DeviceError: the person gives up with q, or nobody is there to be asked.

@@ -27,9 +27,9 @@ from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
 from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
 from drivers.ur_link.survey import survey
 from drivers.ur_link.worker import WorkerError
-from hilcal.acquire.devices import ArmSample, Report
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
+from hilcal.measuring.devices import ArmSample, Report
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
@@ -48,7 +48,7 @@ NO_WHEEL = (3, 13)
 
 
 class UrArm:
-    """An arm of Universal Robots; see `hilcal.acquire.devices.ArmDevice`."""
+    """An arm of Universal Robots; see `hilcal.measuring.devices.ArmDevice`."""
 
     def __init__(
         self,

@@ -6,12 +6,12 @@ from pathlib import Path
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, FROM, TRACKER
-from hilcal.data.importing import import_readings
-from hilcal.data.readings import Readings
-from hilcal.identify.full_covariance import CovarianceParts, covariance_parts
-from hilcal.identify.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
+from hilcal.identification.full_covariance import CovarianceParts, covariance_parts
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_estimated_noise
+from hilcal.readings.covariance import COVERS, FROM, TRACKER
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.importing import import_readings
 
 Say = Callable[[str], None]
 

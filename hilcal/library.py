@@ -7,39 +7,39 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.data.covariance import tracker_noise
-from hilcal.data.importing import import_readings
-from hilcal.data.parquet_stream import open_stream
-from hilcal.data.readings import Readings
-from hilcal.data.schema import HEADER
-from hilcal.data.whitening import MODES, SCALINGS, Mode, usual_mode
-from hilcal.diagnose.serial_noise import with_serial_noise
-from hilcal.discover.proposal import LawSearch
+from hilcal.design.checked_plan import CheckedPlan, checked
+from hilcal.design.planner import Request, make
+from hilcal.design.summary import about, summarise
+from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identify import baseline as starting_models
-from hilcal.identify import bootstrap as bootstraps
-from hilcal.identify import fit as fits
-from hilcal.identify import posterior_document
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.carried import CarriedPrior, carried_prior, check_prior
-from hilcal.identify.fit import Fit
-from hilcal.identify.full_covariance import full_readings
-from hilcal.identify.noise_estimate import with_estimated_noise
-from hilcal.identify.posterior import Posterior
-from hilcal.model import Model
-from hilcal.plan.checked_plan import CheckedPlan, checked
-from hilcal.plan.planner import Request, make
-from hilcal.plan.summary import about, summarise
-from hilcal.refine import Refinement
-from hilcal.refine import refine as refine_model
-from hilcal.report.build_story import build_story
+from hilcal.identification import baseline as starting_models
+from hilcal.identification import bootstrap as bootstraps
+from hilcal.identification import fit as fits
+from hilcal.identification import posterior_document
+from hilcal.identification.arm_scatter import with_prior_scatter
+from hilcal.identification.carried import CarriedPrior, carried_prior, check_prior
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import full_readings
+from hilcal.identification.noise_estimate import with_estimated_noise
+from hilcal.identification.posterior import Posterior
+from hilcal.model.model import Model
+from hilcal.present.build_story import build_story
+from hilcal.readings.covariance import tracker_noise
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
+from hilcal.refinement import Refinement
+from hilcal.refinement import refine as refine_model
+from hilcal.store.schema import HEADER
 from hilcal.stream import fit as streams
 from hilcal.stream.fit import StreamFit
+from hilcal.tables.importing import import_readings
+from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
 
@@ -354,7 +354,7 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
     Raises:
         InputError: the port is taken, or rerun-sdk is not installed.
     """
-    from hilcal.report.viewer import serve
+    from hilcal.present.viewer import serve
 
     with serve(build_story(run.chapters()), port=port) as served:
         yield served.url

@@ -8,21 +8,21 @@ from pathlib import Path
 from typing import Any
 
 import hilcal
-from hilcal.campaign import Campaign
-from hilcal.data.overview import overview
-from hilcal.data.plan import Plan
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.revision import RevisionRecord, utc_now
-from hilcal.data.run_log import PLAN, RunLog
-from hilcal.data.whitening import SCALINGS, Scaling
+from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.fleet.fleet import Fleet
-from hilcal.identify.fit import Fit, fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
+from hilcal.present.build_story import build_story, of_left_out
+from hilcal.present.html.content import ReportContent, Tested
 from hilcal.procedure.state import IMPROVED, Files
-from hilcal.report.build_story import build_story, of_left_out
-from hilcal.report.html.content import ReportContent, Tested
-from hilcal.validate import validate
+from hilcal.readings.whitening import SCALINGS, Scaling
+from hilcal.store.overview import overview
+from hilcal.store.plan import Plan
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.revision import RevisionRecord, utc_now
+from hilcal.store.run_log import PLAN, RunLog
+from hilcal.transfer.fleet import Fleet
+from hilcal.validation import validate
 from hilcal.whole_file import replace_file
 
 Say = Callable[[str], None]
@@ -113,16 +113,16 @@ def write_report(
             raise InputError(
                 "a comparison of two campaigns takes no --validation, --limit or --appendix"
             )
-        from hilcal.compare import compare
-        from hilcal.report.html import change
+        from hilcal.present.html import change
+        from hilcal.transfer.compare import compare
 
         found = compare(run, later, asked.revision, say=say)
         names = ((run.path.name, _sha256(run.path)), (later.path.name, _sha256(later.path)))
         html = change.page(found, names, asked.operator, utc_now(), hilcal.__version__)
         first, verdict = change.first_screen(found, run.path.name), None
     else:
-        from hilcal.report.html.first_screen import first_screen
-        from hilcal.report.html.page import page
+        from hilcal.present.html.first_screen import first_screen
+        from hilcal.present.html.page import page
 
         with ExitStack() as stack:
             beside = Files(run.path).validation
@@ -194,7 +194,7 @@ def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    from hilcal.report.html.fleet import page
+    from hilcal.present.html.fleet import page
 
     replace_file(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
 

@@ -20,11 +20,11 @@ from drivers.simulated.world import World, stand
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.carried import carried_prior
-from hilcal.identify.fit import fit
-from hilcal.identify.posterior import Posterior
+from hilcal.identification.arm_scatter import with_prior_scatter
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.carried import carried_prior
+from hilcal.identification.fit import fit
+from hilcal.identification.posterior import Posterior
 from studies.change import GEOMETRY, measured
 from studies.compensation_command import judged
 from studies.study_cases import with_study_loads

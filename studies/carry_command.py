@@ -14,17 +14,17 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
-from hilcal.data.readings import Readings
 from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.baseline import baseline
-from hilcal.identify.carried import CarriedPrior, carried_prior
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.posterior import Posterior
+from hilcal.identification.arm_scatter import with_prior_scatter
+from hilcal.identification.baseline import baseline
+from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.posterior import Posterior
 from hilcal.library import read_table
-from hilcal.refine import refine
-from hilcal.report.progress import counting, working
+from hilcal.present.progress import counting, working
+from hilcal.readings.readings import Readings
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.carry_picture import PICTURE, Point

@@ -17,7 +17,7 @@ import typer
 from plotly.offline import get_plotlyjs
 
 from hilcal.errors import InputError
-from hilcal.report.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
+from hilcal.present.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
 from hilcal.whole_file import replace_file
 
 PICTURE = "../images/carry-over.svg"

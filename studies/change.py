@@ -19,16 +19,16 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
-from hilcal.diagnose.change import LEVEL, POWER, STATED_DOF, find_changes
-from hilcal.diagnose.change_candidates import changing
-from hilcal.diagnose.change_found import Changes
-from hilcal.diagnose.completed import completed
+from hilcal.diagnosis.change import LEVEL, POWER, STATED_DOF, find_changes
+from hilcal.diagnosis.change_candidates import changing
+from hilcal.diagnosis.change_found import Changes
+from hilcal.diagnosis.completed import completed
 from hilcal.errors import HilcalError
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.earlier import Earlier, earlier_fit
-from hilcal.identify.fit import fit
-from hilcal.identify.remeasured import setting
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.earlier import Earlier, earlier_fit
+from hilcal.identification.fit import fit
+from hilcal.identification.remeasured import setting
+from hilcal.readings.readings import Readings
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states

@@ -14,9 +14,9 @@ from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
-from hilcal.report import text
-from hilcal.report.numbers import length
-from hilcal.report.progress import counting
+from hilcal.numbers import length
+from hilcal.present import text
+from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
 from studies.change_real import ZERO_RAD, RealCase, RealStudy, real_case

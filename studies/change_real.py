@@ -11,14 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import Readings
-from hilcal.diagnose.change import find_changes
-from hilcal.diagnose.completed import completed
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.earlier import Earlier, earlier_fit
-from hilcal.identify.fit import fit
-from hilcal.identify.remeasured import setting
+from hilcal.diagnosis.change import find_changes
+from hilcal.diagnosis.completed import completed
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.earlier import Earlier, earlier_fit
+from hilcal.identification.fit import fit
+from hilcal.identification.remeasured import setting
 from hilcal.library import read_table
+from hilcal.readings.readings import Readings
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
 

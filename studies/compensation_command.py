@@ -21,15 +21,15 @@ from hilcal.calibration.poses import BAND, ToolPoses, band
 from hilcal.cell import Cell
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
-from hilcal.data.readings import Readings
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from hilcal.library import read_table
-from hilcal.refine import refine
-from hilcal.report.numbers import length
-from hilcal.report.progress import counting
+from hilcal.numbers import length
+from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Bools, Floats
 from studies.records import Figure, Keep, keep

@@ -37,9 +37,9 @@ from hilcal.config.loads import Load
 from hilcal.effects.catalogue import installed
 from hilcal.engine.engine import open_engine
 from hilcal.errors import DeviceError
+from hilcal.numbers import length
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import Settings
-from hilcal.report.numbers import length
 from hilcal.robot.catalogue import configs_dir, load_arm
 from studies.records import Figure, Keep, keep
 

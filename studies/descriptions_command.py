@@ -10,8 +10,8 @@ import typer
 from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.engine.engine import open_engine
-from hilcal.report import text
-from hilcal.report.progress import counting
+from hilcal.present import text
+from hilcal.present.progress import counting
 from studies.random_descriptions import Outcome, draw, judge
 from studies.records import Figure, Keep, keep
 

@@ -12,17 +12,17 @@ from typing import Literal
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.serial_noise import with_serial_noise
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.full_prediction import full_prediction
-from hilcal.refine import Refinement, refine
-from hilcal.report.verdict_words import message
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_prediction import full_prediction
+from hilcal.present.verdict_words import message
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
+from hilcal.refinement import Refinement, refine
 from hilcal.types import Floats
 
 Kind = Literal["hidden", "nothing", "noise", "pairs", "outside"]

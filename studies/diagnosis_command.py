@@ -10,11 +10,11 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import MODES, Mode
-from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.errors import InputError
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir, robot_names
 from hilcal.toml import suggest
 from studies.diagnosis import KINDS, Asked, Kind, Sample, run_case

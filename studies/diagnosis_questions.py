@@ -6,7 +6,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from hilcal.data.whitening import Mode
+from hilcal.readings.whitening import Mode
 from studies.diagnosis import Asked, Kind
 
 MANY = 3.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data.whitening import Mode
+from hilcal.readings.whitening import Mode
 from studies.diagnosis import Judgement, Outcome, Refined
 
 HELD_OUT = 1.05

@@ -11,16 +11,16 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import Mode, whitening
-from hilcal.discover.agreement import agreement
-from hilcal.discover.discovery import discover
-from hilcal.discover.law import Law
+from hilcal.discovery.agreement import agreement
+from hilcal.discovery.discovery import discover
+from hilcal.discovery.law import Law
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.residual import residual
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.residual import residual
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats, Ints
 from studies.foreign_laws import KINDS, Foreign
 from studies.law_scene import Scene, scene

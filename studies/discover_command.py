@@ -13,10 +13,10 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.whitening import MODES, Mode
 from hilcal.engine.engine import open_engine
-from hilcal.report import text
-from hilcal.report.progress import counting
+from hilcal.present import text
+from hilcal.present.progress import counting
+from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir
 from studies.discover import Asked, Outcome, run_case
 from studies.foreign_laws import KINDS

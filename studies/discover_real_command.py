@@ -11,18 +11,18 @@ import typer
 from hilcal.cell import Cell
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
-from hilcal.diagnose.residual_regression import residual_regression
-from hilcal.discover.discovery import Discovery, discover
-from hilcal.discover.write_effect import effect_class
+from hilcal.diagnosis.residual_regression import residual_regression
+from hilcal.discovery.discovery import Discovery, discover
+from hilcal.discovery.write_effect import effect_class
 from hilcal.engine.engine import open_engine
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
 from hilcal.library import read_table
-from hilcal.refine import refine
-from hilcal.report.numbers import length, percent
-from hilcal.report.progress import counting
-from hilcal.report.text_discover import coefficient
+from hilcal.numbers import length, percent
+from hilcal.present.progress import counting
+from hilcal.present.text_discover import coefficient
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
 

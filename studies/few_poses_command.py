@@ -20,15 +20,15 @@ from scipy.stats import chi2
 from hilcal.cell import Cell
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import whitening
 from hilcal.engine.engine import open_engine
-from hilcal.identify.arm_scatter import with_arm_scatter
-from hilcal.identify.baseline import baseline
-from hilcal.identify.predictive import predictive
+from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.baseline import baseline
+from hilcal.identification.predictive import predictive
 from hilcal.library import read_table
-from hilcal.refine import refine
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import whitening
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.whole_file import replace_file
 from studies.records import Figure, Keep, keep

@@ -5,12 +5,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import MODES, Mode
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.gross_errors import gross_errors
-from hilcal.refine import refine
+from hilcal.identification.baseline import baseline
+from hilcal.identification.gross_errors import gross_errors
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES, Mode
+from hilcal.refinement import refine
 from hilcal.types import Ints
 from studies.study_cases import study_case
 

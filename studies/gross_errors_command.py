@@ -10,8 +10,8 @@ from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
-from hilcal.report import text
-from hilcal.report.progress import counting
+from hilcal.present import text
+from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.gross_errors import Counted, Spoilt, count
 from studies.records import Figure, Keep, keep

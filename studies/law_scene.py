@@ -6,7 +6,7 @@ import numpy as np
 
 from drivers.simulated.mechanics import Equilibrium
 from drivers.simulated.world import World
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 

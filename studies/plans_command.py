@@ -16,11 +16,11 @@ from hilcal.cli.demo import CELL
 from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.readings import Readings, States
+from hilcal.design.nominal_model import nominal_tracker_place
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.plan.nominal_model import nominal_tracker_place
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.types import Floats

@@ -8,16 +8,16 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import UNLOADED
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import Mode
+from hilcal.design.information import Problem, readings_of
+from hilcal.design.nominal_model import nominal_states, planned_effects
+from hilcal.design.predicted import rms
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.fit import fit
-from hilcal.plan.information import Problem, readings_of
-from hilcal.plan.nominal_model import nominal_states, planned_effects
-from hilcal.plan.predicted import rms
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.fit import fit
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Mode
+from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats, Ints
 from studies.plans_kinds import Chosen, Scene
 

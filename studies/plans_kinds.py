@@ -8,15 +8,15 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.choice import choose
+from hilcal.design.compound_criteria import compound_objective
+from hilcal.design.draw import draw
+from hilcal.design.feasible import Space
+from hilcal.design.information import Problem, problem
+from hilcal.design.nominal_model import NominalModel, nominal_model
+from hilcal.design.predicted import Predicted, predicted, rms
+from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.choice import choose
-from hilcal.plan.compound_criteria import compound_objective
-from hilcal.plan.draw import draw
-from hilcal.plan.feasible import Space
-from hilcal.plan.information import Problem, problem
-from hilcal.plan.nominal_model import NominalModel, nominal_model
-from hilcal.plan.predicted import Predicted, predicted, rms
-from hilcal.plan.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.types import Floats, Ints
 
 LEVELS = (3, 4, 5, 6)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.plan.predicted import rms
+from hilcal.design.predicted import rms
 from hilcal.types import Floats
 from studies.plans_errors import Errors
 

@@ -17,8 +17,8 @@ from drivers.simulated.rehearsal import (
 )
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats, Ints
 from studies.temperatures import air, joints
 

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import STANDARD_GRAVITY, Cell
-from hilcal.data.readings import Readings, States
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.description import Change, Described
-from hilcal.identify.gate import Finding, examine
-from hilcal.identify.registration import register
+from hilcal.identification.description import Change, Described
+from hilcal.identification.gate import Finding, examine
+from hilcal.identification.registration import register
+from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names

@@ -11,11 +11,11 @@ from hilcal.cell import Cell
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.engine.engine import open_engine
-from hilcal.identify.baseline import baseline
+from hilcal.identification.baseline import baseline
 from hilcal.library import read_table
-from hilcal.refine import refine
-from hilcal.report.numbers import length
-from hilcal.report.progress import counting
+from hilcal.numbers import length
+from hilcal.present.progress import counting
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
 

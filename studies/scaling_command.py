@@ -7,9 +7,9 @@ import typer
 
 from hilcal.cli.engine import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
-from hilcal.data.whitening import SCALINGS
 from hilcal.engine.engine import open_engine
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
+from hilcal.readings.whitening import SCALINGS
 from hilcal.study.scaling import check, experiments, scaling_study
 from hilcal.study.scaling_table import table
 from studies.records import Figure, Keep, keep

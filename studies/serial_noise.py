@@ -6,15 +6,15 @@ import numpy as np
 
 from drivers.simulated.rehearsal import simulate
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
-from hilcal.data.serial_noise import symmetric_root
-from hilcal.data.whitening import Mode, whitening
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.predictive import predictive
-from hilcal.identify.residual import residual
-from hilcal.model import Model
-from hilcal.refine import Refinement, refine, refine_from
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.predictive import predictive
+from hilcal.identification.residual import residual
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings
+from hilcal.readings.serial_noise import symmetric_root
+from hilcal.readings.whitening import Mode, whitening
+from hilcal.refinement import Refinement, refine, refine_from
 from studies.random_campaigns import rehearsal_states
 from studies.study_cases import StudyCase, study_case, with_study_loads
 

@@ -13,7 +13,7 @@ from hilcal.cli.engine import Jobs, Scheduler
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep
 from studies.serial_noise import Outcome, SerialCase, serial_case

@@ -11,9 +11,9 @@ from drivers.simulated.rehearsal import as_told, measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
 from hilcal.errors import InputError
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import load_arm
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states

@@ -9,12 +9,12 @@ from drivers.simulated.planned import planned_states
 from drivers.simulated.rehearsal import simulate
 from hilcal.config import CellConfig
 from hilcal.config.loads import Load
-from hilcal.data.readings import Readings, States
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import in_doubt
+from hilcal.design.next import measure_next
+from hilcal.design.planner import Request
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.next import measure_next
-from hilcal.plan.planner import Request
+from hilcal.readings.readings import Readings, States
 from hilcal.types import Floats
 from studies.study_cases import StudyCase, with_study_loads
 from studies.temperatures import air, joints

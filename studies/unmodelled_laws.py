@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from drivers.simulated.world import World
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats, Ints
 
 ABSOLUTE, DEFLECTION = "absolute", "deflection"

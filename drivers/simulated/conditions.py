@@ -3,8 +3,8 @@
 import numpy as np
 
 from drivers.simulated.truth import Truth
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 

@@ -13,8 +13,8 @@ from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import IdealReading, World, stand
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
 DEFLECTION_EFFECTS = (

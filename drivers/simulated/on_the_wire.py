@@ -18,8 +18,8 @@ from drivers.simulated.rehearsal import (
     simulation_case,
 )
 from hilcal.config import CellConfig
-from hilcal.data.plan import UNLOADED, Plan
 from hilcal.effects.catalogue import Catalogue
+from hilcal.store.plan import UNLOADED, Plan
 
 
 def case_of_plan(

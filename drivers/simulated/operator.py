@@ -5,10 +5,10 @@ from pathlib import Path
 
 from drivers.simulated import admin
 from drivers.terminal_operator import TerminalOperator
-from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import Report
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.devices import Report
 
 HAND_S = 20.0
 """Time that a person takes to change a load, s."""

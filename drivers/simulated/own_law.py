@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
-from hilcal.model import Model
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.types import Floats
 

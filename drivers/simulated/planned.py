@@ -8,8 +8,8 @@ from drivers.simulated.rehearsal import CampaignStates
 from drivers.simulated.temperatures import warm_up
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import UNLOADED, Plan
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
+from hilcal.store.plan import UNLOADED, Plan
 
 _LOADING = 60.0  # s, to change a load
 _MEASURING = 5.0  # s, to settle and to measure

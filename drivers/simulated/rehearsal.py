@@ -12,10 +12,10 @@ from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Mode
 from hilcal.toml import suggest
 from hilcal.types import Ints
 

@@ -14,8 +14,8 @@ from drivers.simulated.rigid import displacement, inverse, moved_by, rotation_ve
 from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
 

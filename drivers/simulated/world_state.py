@@ -13,8 +13,8 @@ from drivers.simulated.sensor_mount import SensorMount
 from drivers.simulated.temperatures import AIR, warm_up
 from drivers.simulated.world import World
 from hilcal.config import CellConfig
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.toml import suggest
 from hilcal.types import Floats
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.ur_link import states
 from drivers.ur_link.receive_worker import GETTERS
-from hilcal.acquire.devices import ArmSample
+from hilcal.measuring.devices import ArmSample
 from hilcal.types import Floats
 
 N = 6

@@ -8,7 +8,7 @@ from drivers.ur_link.lines import LinkError
 from drivers.ur_link.probe import ControllerFacts
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.receiver import Receiver
-from hilcal.acquire.devices import Report
+from hilcal.measuring.devices import Report
 
 _RATE_S = (0.4, 2.0)
 """How long packets are counted, and again where they were too few; choices."""

@@ -6,7 +6,7 @@ is the root mean square over such poses,
 
     u² = κ c² + e² + s² + n²
 
-of the parameters without the pose (see `identify.predictive`), of what the model misses beyond the
+of the parameters without the pose (see `predictive`), of what the model misses beyond the
 noise, of the arm's scatter from one arrival to the next, and of the instrument. κ makes u at least
 what poses left out show. The expanded uncertainty is U = k u with k = 2.
 """
@@ -17,9 +17,9 @@ import numpy as np
 
 from hilcal.calibration.scatter import ScatterSource, scatter_of
 from hilcal.errors import InputError
-from hilcal.identify.errors import noise_floor
-from hilcal.identify.fit import Fit
-from hilcal.identify.predictive import position_factor, predictive
+from hilcal.identification.errors import noise_floor
+from hilcal.identification.fit import Fit
+from hilcal.identification.predictive import position_factor, predictive
 from hilcal.robot.chain import evaluate
 
 COVERAGE = 2.0

@@ -5,7 +5,7 @@ The true position of the tool differs from the prediction by
     Σ = κ J C Jᵀ + s² 1 + J_q Σ_q J_qᵀ
 
 C the covariance of the parameters, what a family does at places that nobody measured included (see
-`identify.predictive`); κ ≥ 1 what positions of poses left out were farther off than by C, in
+`identification.predictive`); κ ≥ 1 what positions of poses left out were farther off than by C, in
 metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
 allows; Σ_q the arm's scatter from one arrival to the next.
 
@@ -33,15 +33,15 @@ from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import Tool, in_chain, tool_of, tool_poses
-from hilcal.data.readings import States
-from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.identify.fit import Fit
-from hilcal.identify.predictive import open_prior, position_factor, predictive
-from hilcal.identify.robot_frames import RobotFrames, one_of_each, robot_frames
-from hilcal.identify.whole_turns import whole_turns
-from hilcal.model import Model, Prediction
+from hilcal.identification.fit import Fit
+from hilcal.identification.predictive import open_prior, position_factor, predictive
+from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames
+from hilcal.identification.whole_turns import whole_turns
+from hilcal.model.model import Model, Prediction
+from hilcal.readings.readings import States
+from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
@@ -280,11 +280,11 @@ class Calibration:
 
     @cached_property
     def turns(self) -> Bools:
-        """(n,) joints whose angles mean the same whole turns on, see `identify.whole_turns`."""
+        """(n,) joints whose angles mean the same after whole turns, see `whole_turns`."""
         return whole_turns(self.model, self.theta)
 
     def base_in_tracker(self) -> Floats:
-        """(4, 4) T_sensor_base, see `identify.robot_frames`."""
+        """(4, 4) T_sensor_base, see `identification.robot_frames`."""
         return self.frames.base
 
     def _tool(self, pose: Floats | None) -> Tool:

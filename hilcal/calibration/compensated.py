@@ -13,7 +13,7 @@ from hilcal.calibration.compensation import Inverse, singular
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.tool import Tool
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 

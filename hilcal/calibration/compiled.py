@@ -19,9 +19,9 @@ import numpy as np
 from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
 from hilcal.calibration.form import TRIALS, Form, given_the_columns, packed, repeated
 from hilcal.calibration.tool import Tool, in_chain
-from hilcal.data.readings import States
-from hilcal.data.whitening import Mode
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
+from hilcal.readings.readings import States
+from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data.readings import States
-from hilcal.model import Model
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 WORDS = {

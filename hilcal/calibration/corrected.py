@@ -2,7 +2,7 @@
 
 An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
 of another length or angle) goes into the constant transforms, from the declared base to the
-declared flange, see `identify.robot_frames`. Everything else (compliances, waves of gears,
+declared flange, see `identification.robot_frames`. Everything else (compliances, waves of gears,
 temperature) cannot, and is named.
 """
 

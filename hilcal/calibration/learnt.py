@@ -21,11 +21,11 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.calibration.check_stored import check_numbers
-from hilcal.data.readings import Readings, States
-from hilcal.data.serial_noise import SerialNoise
-from hilcal.data.whitening import Mode, whitening
-from hilcal.identify.gauss_newton import whitened_jacobian
-from hilcal.model import Model
+from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
 
 

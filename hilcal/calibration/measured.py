@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data.ranges import Range, angle_name, ranges_of, turning_variables, variables
-from hilcal.data.readings import States
-from hilcal.identify.extrapolation import FAR
-from hilcal.identify.predictive import Predictive
+from hilcal.identification.extrapolation import FAR
+from hilcal.identification.predictive import Predictive
+from hilcal.readings.ranges import Range, angle_name, ranges_of, turning_variables, variables
+from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats
 
 
@@ -35,7 +35,7 @@ class Measured:
     Attributes:
         ranges: of joint angles, force, moment, temperatures.
         most_std_m: standard deviation of a prediction, by the parameters alone, from which on a
-            point is far from all fitted ones; see `identify.extrapolation`. For the tracked target.
+            point is far from all fitted ones; see `extrapolation`. For the tracked target.
     """
 
     ranges: tuple[Range, ...]

@@ -26,7 +26,13 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.calibration.compensation import Pose, invert
-from hilcal.data.columns import (
+from hilcal.errors import InputError
+from hilcal.names import quoted
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.tables.columns import (
     OWN_PREFIX,
     POSITION,
     ROTATION,
@@ -36,18 +42,12 @@ from hilcal.data.columns import (
     known_columns,
     temperature_columns,
 )
-from hilcal.data.covariance import TrackerNoise
-from hilcal.data.csvfile import CsvTable, Dialect, read_columns
-from hilcal.data.grid import SEPARATORS
-from hilcal.data.mapped import import_mapped
-from hilcal.data.mapping import Mapping as TableMapping
-from hilcal.data.propose import propose
-from hilcal.data.sniff import sniff
-from hilcal.errors import InputError
-from hilcal.names import quoted
-from hilcal.robot import se3
-from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
+from hilcal.tables.csvfile import CsvTable, Dialect, read_columns
+from hilcal.tables.grid import SEPARATORS
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.guessing.sniff import sniff
+from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import Mapping as TableMapping
 from hilcal.types import Floats, Ints
 
 NO_LOAD = "none"

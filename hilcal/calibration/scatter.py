@@ -18,11 +18,11 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.diagnose.arm_repeatability import RP_PER_RMS, stated_repeatability
-from hilcal.diagnose.noise import FEWEST
-from hilcal.diagnose.repeats import classes
-from hilcal.identify.fit import Fit
-from hilcal.identify.full_covariance import joint_factors
+from hilcal.diagnosis.arm_repeatability import RP_PER_RMS, stated_repeatability
+from hilcal.diagnosis.noise import FEWEST
+from hilcal.diagnosis.repeats import classes
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import joint_factors
 from hilcal.robot.chain import Chain, drive_jacobian
 from hilcal.types import Floats
 

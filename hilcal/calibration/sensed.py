@@ -12,8 +12,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from hilcal.acquire.tool_load import shift
 from hilcal.cell import Cell
+from hilcal.measuring.tool_load import shift
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats

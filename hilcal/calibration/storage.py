@@ -30,12 +30,12 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.sensed import SensorMount
 from hilcal.cell import Cell
-from hilcal.data.whitening import MODES
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identify.robot_frames import one_of_each
-from hilcal.model import Model
+from hilcal.identification.robot_frames import one_of_each
+from hilcal.model.model import Model
 from hilcal.names import check_names
+from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
 from hilcal.toml import parse_json
 from hilcal.types import Floats

@@ -2,7 +2,7 @@
 
     T_base_tool = T_base_chain T_chain_flange(q, w) T_chainflange_flange T_flange_tool
 
-Base and flange are those that `identify.robot_frames` declares. What instruments do (fields
+Base and flange are those that `identification.robot_frames` declares. What instruments do (fields
 "station" and "scale") is no motion of the tool.
 """
 
@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.identify.robot_frames import one_of_each, robot_frames
-from hilcal.model import Model, Prediction
+from hilcal.identification.robot_frames import one_of_each, robot_frames
+from hilcal.model.model import Model, Prediction
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 

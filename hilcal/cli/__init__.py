@@ -18,8 +18,8 @@ from hilcal import __version__
 from hilcal.cli.commands import COMMANDS, Command, load
 from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
-from hilcal.data.command_line import typed
 from hilcal.errors import DeviceError, HilcalError, StoppedError
+from hilcal.store.command_line import typed
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"

@@ -11,21 +11,21 @@ from typing import Annotated, Any
 
 import typer
 
-from hilcal.acquire import devices
-from hilcal.acquire.connect import driver
 from hilcal.cell import cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
 from hilcal.config.template import cell_text
-from hilcal.data.quantities import LENGTHS
+from hilcal.design.nominal_model import check_effects
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError, StoppedError
+from hilcal.measuring import devices
+from hilcal.measuring.connect import driver
 from hilcal.names import quoted
-from hilcal.plan.nominal_model import check_effects
-from hilcal.report import text
+from hilcal.present import text
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
+from hilcal.tables.quantities import LENGTHS
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 

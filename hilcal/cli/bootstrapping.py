@@ -4,17 +4,17 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import fit_of
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identify.bootstrap import DRAWS, check_draws
-from hilcal.identify.bootstrap import bootstrap as draw_again
-from hilcal.report.progress import counting, working
-from hilcal.report.text_bootstrap import bootstrap_report, to_json
+from hilcal.identification.bootstrap import DRAWS, check_draws
+from hilcal.identification.bootstrap import bootstrap as draw_again
+from hilcal.present.progress import counting, working
+from hilcal.present.text_bootstrap import bootstrap_report, to_json
 
 
 def bootstrap(

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 
 from drivers.simulated.rehearsal import NOTHING, as_told
-from hilcal.acquire.run import HOW_ON
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.asking import somebody_there
 from hilcal.cli.calibrating_steps import Operator
@@ -21,12 +20,7 @@ from hilcal.cli.prior import Prior, PriorOptions
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.cli.viewing import View, followed
 from hilcal.config import CellConfig
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.new_campaign import may_write
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.quantities import parse_duration, parse_length
-from hilcal.data.run_log import RunLog
-from hilcal.data.whitening import Mode
+from hilcal.design.nominal_model import check_effects
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import (
     CannotAnswerError,
@@ -36,12 +30,18 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
+from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
-from hilcal.plan.nominal_model import check_effects
+from hilcal.present import text_calibrate
+from hilcal.present.progress import working
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
-from hilcal.report import text_calibrate
-from hilcal.report.progress import working
+from hilcal.readings.whitening import Mode
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.new_campaign import may_write
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.run_log import RunLog
+from hilcal.tables.quantities import parse_duration, parse_length
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""

@@ -4,7 +4,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from hilcal.acquire.connect import connect
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.living_cell import LivingCell
 from hilcal.cli.planning import refuse_unready
@@ -13,18 +12,19 @@ from hilcal.cli.rehearsing import to_the_end
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.procedure_log import ProcedureLog
 from hilcal.errors import StoppedError
+from hilcal.measuring.connect import connect
+from hilcal.present import text_calibrate, text_refine
+from hilcal.present.live_viewer import LiveViewer
+from hilcal.present.progress import working
+from hilcal.present.text_plan import plan_facts
+from hilcal.present.text_prior import prior_lines
 from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import REFINED, Step
-from hilcal.refine import Refinement
-from hilcal.report import text_calibrate, text_refine
-from hilcal.report.live_viewer import LiveViewer
-from hilcal.report.progress import working
-from hilcal.report.text_plan import plan_facts
-from hilcal.report.text_prior import prior_lines
+from hilcal.refinement import Refinement
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.procedure_log import ProcedureLog
 
 
 class Operator:

@@ -6,19 +6,19 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.terminal import Json, Run, terminal
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS
-from hilcal.data.overview import overview
-from hilcal.data.repair import put_robot
-from hilcal.data.repair import repair as repaired
-from hilcal.data.revision import RevisionRecord
 from hilcal.errors import InputError
-from hilcal.identify.full_covariance import covariance_parts
-from hilcal.identify.noise_estimate import NOISE, NoiseEstimate
+from hilcal.identification.full_covariance import covariance_parts
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
-from hilcal.report import text
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.text_info import info_report, to_json
+from hilcal.present import text
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.text_info import info_report, to_json
+from hilcal.readings.covariance import COVERS
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.overview import overview
+from hilcal.store.repair import put_robot
+from hilcal.store.repair import repair as repaired
+from hilcal.store.revision import RevisionRecord
 
 
 def info(run: Run, as_json: Json = False) -> None:

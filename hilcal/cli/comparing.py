@@ -6,18 +6,18 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import called, finish, fit_of, titles
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
-from hilcal.compare import compare as compare_campaigns
-from hilcal.diagnose.misfit_breakdown import misfit_breakdown
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.identify.full_prediction import full_prediction
-from hilcal.identify.linearisation import linearise
-from hilcal.report import text, text_change
-from hilcal.report.progress import working
+from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.linearisation import linearise
+from hilcal.present import text, text_change
+from hilcal.present.progress import working
+from hilcal.transfer.compare import compare as compare_campaigns
 
 
 def compare(

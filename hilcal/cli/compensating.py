@@ -21,18 +21,18 @@ from hilcal.calibration.urscript import (
     program_points,
     with_joints,
 )
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Terminal, terminal
-from hilcal.data.columns import joint_columns
-from hilcal.data.mapping import find_mapping
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.fit_document import plain
+from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
-from hilcal.report import text_compensate
-from hilcal.report.progress import working
+from hilcal.present import text_compensate
+from hilcal.present.progress import working
 from hilcal.robot import se3
+from hilcal.tables.columns import joint_columns
+from hilcal.tables.mapping import find_mapping
 from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file
 

@@ -8,7 +8,7 @@ from drivers.geocom import Options as GeoComOptions
 from drivers.ur_link.options import UrOptions
 from hilcal.cli.terminal import Json, terminal
 from hilcal.config import reference
-from hilcal.report import text_config
+from hilcal.present import text_config
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file
 

@@ -19,8 +19,10 @@ from drivers.simulated.rehearsal import (
     check_choice,
     invented_law,
 )
+from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.revisions import to_record
 from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, finish, record_story
@@ -34,25 +36,24 @@ from hilcal.cli.rehearsing import (
 )
 from hilcal.cli.terminal import Json, Record, Terminal, terminal
 from hilcal.config import load_config
-from hilcal.data.new_campaign import may_write
-from hilcal.discover.agreement import agreement
-from hilcal.discover.proposal import LawSearch
-from hilcal.discover.search import SAME
+from hilcal.discovery.agreement import agreement
+from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.search import SAME
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.baseline import baseline
+from hilcal.identification.baseline import baseline
 from hilcal.names import quoted
+from hilcal.present import text, text_calibrate, text_demo, text_refine
+from hilcal.present.build_story import Chapter
+from hilcal.present.diagnosis_document import to_json
+from hilcal.present.progress import working
+from hilcal.present.text_discover import laws_json, refined_laws
+from hilcal.present.verdict_words import message
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import Files, Settings
-from hilcal.refine import Refinement
-from hilcal.refine import refine as refine_model
-from hilcal.report import numbers, text, text_calibrate, text_demo, text_refine
-from hilcal.report.build_story import Chapter
-from hilcal.report.diagnosis_document import to_json
-from hilcal.report.progress import working
-from hilcal.report.text_discover import laws_json, refined_laws
-from hilcal.report.verdict_words import message
-from hilcal.revisions import to_record
+from hilcal.refinement import Refinement
+from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.new_campaign import may_write
 
 CELL = "demo_ur10e.toml"
 POSES = 15

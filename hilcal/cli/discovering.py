@@ -6,23 +6,23 @@ from typing import Annotated
 import typer
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_options, fit_of, wanted_effects
 from hilcal.cli.terminal import Json, Revision, Run, terminal
-from hilcal.diagnose.serial_noise import with_serial_noise
-from hilcal.discover.discovery import discover as search
-from hilcal.discover.discovery import rival_sources
+from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.discovery.discovery import discover as search
+from hilcal.discovery.discovery import rival_sources
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import fit
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import fit
 from hilcal.names import quoted
-from hilcal.report import text
-from hilcal.report.progress import working
-from hilcal.report.text_discover import discovery_report, silence, to_json
+from hilcal.present import text
+from hilcal.present.progress import working
+from hilcal.present.text_discover import discovery_report, silence, to_json
 from hilcal.whole_file import replace_file
 
 

@@ -17,8 +17,8 @@ from hilcal.doctor.network import reachable
 from hilcal.doctor.ports import adapters, serial_ports
 from hilcal.doctor.program import program
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.report.progress import working
-from hilcal.report.text_doctor import doctor_report, summary
+from hilcal.present.progress import working
+from hilcal.present.text_doctor import doctor_report, summary
 
 SIMULATED = "simulated"
 """The port of a device that only the demo's own simulation has."""

@@ -11,29 +11,30 @@ import numpy as np
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import NOTHING, Rehearsal
-from hilcal.acquire.dry_run import dry_run
+from hilcal import numbers
 from hilcal.cli.next import separates
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan
 from hilcal.cli.terminal import Terminal
-from hilcal.data.plan import REFERENCE, Plan
-from hilcal.data.records import content_hash
-from hilcal.diagnose.diagnosis import Diagnosis, History
-from hilcal.diagnose.doubt import in_doubt as left_open
-from hilcal.diagnose.effect_ranking import candidates, rank_suspects
-from hilcal.diagnose.evidence import Evidence
-from hilcal.diagnose.verdict import diagnose, judge
+from hilcal.design.checked_plan import refuse
+from hilcal.design.next import measure_next
+from hilcal.design.planner import Request
+from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.doubt import in_doubt as left_open
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.evidence import Evidence
+from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.effects.catalogue import Catalogue
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
-from hilcal.plan.checked_plan import refuse
-from hilcal.plan.next import measure_next
-from hilcal.plan.planner import Request
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.measuring.dry_run import dry_run
+from hilcal.present import text, text_demo
+from hilcal.present.progress import Say, working
+from hilcal.present.text_next import next_report
+from hilcal.present.verdict_words import message
 from hilcal.procedure.separate import plan_of
-from hilcal.report import numbers, text, text_demo
-from hilcal.report.progress import Say, working
-from hilcal.report.text_next import next_report
-from hilcal.report.verdict_words import message
+from hilcal.store.plan import REFERENCE, Plan
+from hilcal.store.records import content_hash
 
 STRENGTH = 4.0
 """Of what is hidden, in units of the noise: clearly there in so few readings."""

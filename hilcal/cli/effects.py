@@ -19,9 +19,9 @@ from hilcal.effects.example import ROBOT, example_cell, example_states
 from hilcal.effects.protocol import Effect
 from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
-from hilcal.identify.fit_document import plain
+from hilcal.identification.fit_document import plain
 from hilcal.names import quoted
-from hilcal.report import text
+from hilcal.present import text
 from hilcal.whole_file import replace_file
 
 OPTIONS_NOTE = (

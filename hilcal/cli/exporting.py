@@ -13,19 +13,19 @@ import typer
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected, corrected
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
-from hilcal.data.covariance import INSTRUMENT
-from hilcal.data.revision_table import revision_table
-from hilcal.data.robot_file import ROBOT_FILE
-from hilcal.data.tabular import check_suffix, write_columns
 from hilcal.errors import InputError
-from hilcal.identify import parameters_document
-from hilcal.identify.residual_table import residual_table
-from hilcal.report.numbers import length
-from hilcal.report.progress import Say, working
-from hilcal.report.text_registration import base_line
+from hilcal.identification import parameters_document
+from hilcal.identification.residual_table import residual_table
+from hilcal.numbers import length
+from hilcal.present.progress import Say, working
+from hilcal.present.text_registration import base_line
+from hilcal.readings.covariance import INSTRUMENT
+from hilcal.store.robot_file import ROBOT_FILE
+from hilcal.tables.revision_table import revision_table
+from hilcal.tables.tabular import check_suffix, write_columns
 from hilcal.whole_file import replace_file
 
 MANY = 10.0

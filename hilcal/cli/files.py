@@ -3,20 +3,20 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.terminal import Terminal
-from hilcal.data.readings import Readings
-from hilcal.data.revision import RevisionRecord
-from hilcal.data.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.errors import InputError
-from hilcal.identify.fit import Fit
-from hilcal.model import Model
-from hilcal.report import text
-from hilcal.report.build_story import Chapter, build_story
-from hilcal.report.progress import Say, working
+from hilcal.identification.fit import Fit
+from hilcal.model.model import Model
+from hilcal.present import text
+from hilcal.present.build_story import Chapter, build_story
+from hilcal.present.progress import Say, working
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.store.revision import RevisionRecord
 
 
 def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
@@ -174,7 +174,7 @@ def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> Non
     """Write a recording, where it is asked for."""
     if path is None:
         return
-    from hilcal.report.viewer import save  # loads the viewer's library, which takes a while
+    from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
 
     with working(t.progress) as say:
         say(f"writing {path}")

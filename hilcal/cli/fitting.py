@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal import numbers
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import (
@@ -20,23 +21,23 @@ from hilcal.cli.files import (
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.streaming import identify_stream
 from hilcal.cli.terminal import Details, Json, Run, terminal
-from hilcal.data.purpose import purpose_of, refuse_fitting, release
-from hilcal.data.tabular import is_parquet
-from hilcal.data.whitening import Scaling
-from hilcal.diagnose.serial_noise import with_serial_noise
+from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.fit_document import to_json
-from hilcal.identify.other_arm import other_arm_of
-from hilcal.report import numbers, text
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.progress import working
-from hilcal.report.text_prior import prior_lines
-from hilcal.report.text_registration import other_arm_line
-from hilcal.report.text_scalings import scalings_table
+from hilcal.identification.arm_scatter import with_prior_scatter
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit_document import to_json
+from hilcal.identification.other_arm import other_arm_of
+from hilcal.present import text
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.progress import working
+from hilcal.present.text_prior import prior_lines
+from hilcal.present.text_registration import other_arm_line
+from hilcal.present.text_scalings import scalings_table
+from hilcal.readings.whitening import Scaling
+from hilcal.store.purpose import purpose_of, refuse_fitting, release
+from hilcal.tables.tabular import is_parquet
 
 Readings = Annotated[
     str | None,

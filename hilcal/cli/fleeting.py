@@ -11,13 +11,13 @@ from hilcal.cli.files import check_record
 from hilcal.cli.terminal import Json, Record, terminal
 from hilcal.cli.viewing import opening
 from hilcal.engine.engine import open_engine
-from hilcal.fleet.document import to_json
-from hilcal.fleet.fleet import fleet as pool_fleet
-from hilcal.fleet.members import entries
-from hilcal.identify.posterior_document import write
+from hilcal.identification.posterior_document import write
 from hilcal.names import quoted
-from hilcal.report.progress import counting
-from hilcal.report.text_fleet import fleet_report
+from hilcal.present.progress import counting
+from hilcal.present.text_fleet import fleet_report
+from hilcal.transfer.document import to_json
+from hilcal.transfer.fleet import fleet as pool_fleet
+from hilcal.transfer.members import entries
 from hilcal.write_report import write_fleet_report
 
 
@@ -55,7 +55,7 @@ def fleet(
         t.show(f"{report}: the report")
         document["report"] = str(report)
     if record is not None:
-        from hilcal.report.viewer.fleet_stream import record_fleet  # loads the viewer's library
+        from hilcal.present.viewer.fleet_stream import record_fleet  # loads the viewer's library
 
         record_fleet(found, record)
         t.notice(f"recorded {record}; open it with: {opening(record)}")

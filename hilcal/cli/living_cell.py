@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.rehearsal import NOTHING, SimulationCase
 from hilcal.config import CellConfig
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.run_log import RunLog
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import WORLD
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.run_log import RunLog
 
 NEXT_SEED = 1000
 """Between the seeds of two starts: each device takes the seed and a few that follow."""

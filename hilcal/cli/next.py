@@ -5,26 +5,26 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal import numbers as words_of
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, effect_names, fit_of
 from hilcal.cli.plan_output import Csv, Output, Quick, Seed, generator, write
 from hilcal.cli.planning import read_cell
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions, fitted_with
 from hilcal.cli.terminal import Details, Json, Record, Revision, Run, Terminal, terminal
-from hilcal.diagnose.doubt import MOST
-from hilcal.diagnose.verdict import diagnose
+from hilcal.design.next import Next
+from hilcal.diagnosis.doubt import MOST
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.identify.carried import CarriedPrior
+from hilcal.identification.carried import CarriedPrior
 from hilcal.names import quoted
-from hilcal.plan.next import Next
+from hilcal.present.progress import Say, working
+from hilcal.present.text_next import brief_plan, next_report, poses_report
+from hilcal.present.text_plan import plan_report
 from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
-from hilcal.report import numbers as words_of
-from hilcal.report.progress import Say, working
-from hilcal.report.text_next import brief_plan, next_report, poses_report
-from hilcal.report.text_plan import plan_report
 
 
 def next_(

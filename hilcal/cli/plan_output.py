@@ -9,11 +9,11 @@ import typer
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
-from hilcal.data.plan_csv import plan_csv
+from hilcal.design.checked_plan import CheckedPlan
+from hilcal.design.next import PairPower
 from hilcal.errors import InputError
-from hilcal.plan.checked_plan import CheckedPlan
-from hilcal.plan.next import PairPower
-from hilcal.report.progress import working
+from hilcal.present.progress import working
+from hilcal.tables.plan_csv import plan_csv
 from hilcal.whole_file import replace_file
 
 POSES = 20
@@ -64,7 +64,7 @@ def write(
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
         replace_file(csv, plan_csv(made.plan, pulls))
     if record is not None:
-        from hilcal.report.viewer.plan_stream import record_plan  # loads the viewer, which lasts
+        from hilcal.present.viewer.plan_stream import record_plan  # loads the viewer, which lasts
 
         with working(t.progress) as say:
             say(f"recording {record}")

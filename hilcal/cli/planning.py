@@ -6,9 +6,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from hilcal.acquire.connect import ConnectionResult, connect
-from hilcal.acquire.dry_run import DryRun, dry_run
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, fit_of
@@ -16,19 +14,21 @@ from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, gener
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Details, Json, Record, Revision, Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.data.plan import Plan, load_plan
+from hilcal.design.checked_plan import CheckedPlan, checked, refusal
+from hilcal.design.choice import CRITERIA, canonical
+from hilcal.design.nominal_model import check_effects
+from hilcal.design.planner import Planned, Request, make
+from hilcal.design.summary import about, remarks, summarise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.identify.fit import Fit
-from hilcal.identify.fit_document import plain
-from hilcal.plan.checked_plan import CheckedPlan, checked, refusal
-from hilcal.plan.choice import CRITERIA, canonical
-from hilcal.plan.nominal_model import check_effects
-from hilcal.plan.planner import Planned, Request, make
-from hilcal.plan.summary import about, remarks, summarise
-from hilcal.report import text_run
-from hilcal.report.progress import Say, working
-from hilcal.report.text_plan import plan_report, plan_screen
+from hilcal.identification.fit import Fit
+from hilcal.identification.fit_document import plain
+from hilcal.measuring.connect import ConnectionResult, connect
+from hilcal.measuring.dry_run import DryRun, dry_run
+from hilcal.present import text_run
+from hilcal.present.progress import Say, working
+from hilcal.present.text_plan import plan_report, plan_screen
+from hilcal.store.plan import Plan, load_plan
 
 CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
 PlanFile = Annotated[

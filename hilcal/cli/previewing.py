@@ -6,11 +6,11 @@ from rich.padding import Padding
 
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Terminal
-from hilcal.data.proposal import Proposal
 from hilcal.errors import InputError
-from hilcal.identify.table_preview import preview_table
-from hilcal.report import text
-from hilcal.report.text_import import preview
+from hilcal.identification.table_preview import preview_table
+from hilcal.present import text
+from hilcal.present.text_import import preview
+from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file
 
 

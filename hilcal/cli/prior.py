@@ -6,15 +6,15 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.files import chosen
-from hilcal.diagnose.serial_noise import with_serial_noise
+from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.identify.arm_scatter import with_prior_scatter
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.carried import CarriedPrior, carried_prior
-from hilcal.identify.fit import Fit, fit
+from hilcal.identification.arm_scatter import with_prior_scatter
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.carried import CarriedPrior, carried_prior
+from hilcal.identification.fit import Fit, fit
 
 Prior = Annotated[
     Path | None,

@@ -8,8 +8,9 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
-from hilcal.changes import add_effect, remove_effect
+from hilcal import numbers
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
     check_options,
@@ -25,34 +26,34 @@ from hilcal.cli.fitting import Readings, options_json, options_line
 from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
 from hilcal.cli.terminal import Details, Json, Record, Revision, Run, terminal
 from hilcal.cli.viewing import View, followed
-from hilcal.data.purpose import refuse_fitting
-from hilcal.data.revision import change
-from hilcal.diagnose.verdict import NOTHING
-from hilcal.diagnose.verdict import diagnose as judge
-from hilcal.discover.proposal import LawSearch
+from hilcal.diagnosis.verdict import NOTHING
+from hilcal.diagnosis.verdict import diagnose as judge
+from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
-from hilcal.identify.background import background_of
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import Fit
-from hilcal.identify.fit_document import prior_to_json
-from hilcal.identify.frames_document import fit_to_json
-from hilcal.identify.other_arm import other_arm_of
-from hilcal.identify.weight import weight_note
-from hilcal.refine import Step as RefinementStep
-from hilcal.refine import refine as refine_model
-from hilcal.report import numbers, text, text_refine
-from hilcal.report.build_story import Chapter
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.diagnosis_document import suspect_json, to_json
-from hilcal.report.progress import working
-from hilcal.report.text_discover import laws_json, refined_laws
-from hilcal.report.text_prior import prior_lines
-from hilcal.report.text_registration import fitted_lines, other_arm_line
-from hilcal.report.text_unknown import curves
-from hilcal.report.verdict_words import message
+from hilcal.identification.background import background_of
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import Fit
+from hilcal.identification.fit_document import prior_to_json
+from hilcal.identification.frames_document import fit_to_json
+from hilcal.identification.other_arm import other_arm_of
+from hilcal.identification.weight import weight_note
+from hilcal.present import text, text_refine
+from hilcal.present.build_story import Chapter
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.diagnosis_document import suspect_json, to_json
+from hilcal.present.progress import working
+from hilcal.present.text_discover import laws_json, refined_laws
+from hilcal.present.text_prior import prior_lines
+from hilcal.present.text_registration import fitted_lines, other_arm_line
+from hilcal.present.text_unknown import curves
+from hilcal.present.verdict_words import message
+from hilcal.refinement import Step as RefinementStep
+from hilcal.refinement import refine as refine_model
+from hilcal.store.purpose import refuse_fitting
+from hilcal.store.revision import change
 
 
 @dataclass(frozen=True, slots=True, eq=False)

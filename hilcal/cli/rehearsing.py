@@ -10,25 +10,25 @@ import numpy as np
 
 from drivers.simulated.on_the_wire import case_of_plan, read_plan, simulated_cell
 from drivers.simulated.rehearsal import Rehearsal, SimulationCase, as_told
-from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import cell_from_config
 from hilcal.cli.planning import make_plan
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
-from hilcal.data.appended import with_new_names
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
-from hilcal.data.plan import Plan
-from hilcal.data.readings import Readings
-from hilcal.data.run_log import RunLog, create_run
+from hilcal.design.checked_plan import refuse
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
-from hilcal.identify.full_covariance import campaign_readings
-from hilcal.plan.checked_plan import refuse
+from hilcal.identification.full_covariance import campaign_readings
+from hilcal.measuring.dry_run import dry_run
+from hilcal.present.progress import Say, counting, working
+from hilcal.present.text_demo import NEWCOMER
 from hilcal.procedure.procedure import Measure
-from hilcal.report.progress import Say, counting, working
-from hilcal.report.text_demo import NEWCOMER
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.store.appended import with_new_names
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan
+from hilcal.store.run_log import RunLog, create_run
 
 TRIES = 4
 BREAK = 600.0

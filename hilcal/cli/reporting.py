@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, terminal
-from hilcal.data.quantities import parse_length
-from hilcal.report.progress import working
+from hilcal.present.progress import working
+from hilcal.tables.quantities import parse_length
 
 
 def report(

@@ -12,12 +12,6 @@ from typing import Annotated
 
 import typer
 
-from hilcal.acquire.clock import Clock
-from hilcal.acquire.connect import ConnectionResult, connect
-from hilcal.acquire.progress import Watcher
-from hilcal.acquire.rig import Rig
-from hilcal.acquire.run import HOW_ON
-from hilcal.acquire.run import run as run_plan
 from hilcal.cell import Cell
 from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
@@ -34,10 +28,9 @@ from hilcal.cli.planning import (
 from hilcal.cli.terminal import Json, Terminal, terminal
 from hilcal.cli.viewing import View, followed
 from hilcal.config import CellConfig
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan, load_plan
-from hilcal.data.run_log import RunLog, check_same_cell, create_run
-from hilcal.diagnose.live_model import LiveModel
+from hilcal.design.checked_plan import refuse
+from hilcal.design.goal_rule import GoalRule
+from hilcal.diagnosis.live_model import LiveModel
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import (
     CannotAnswerError,
@@ -47,14 +40,21 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.connect import ConnectionResult, connect
+from hilcal.measuring.progress import Watcher
+from hilcal.measuring.rig import Rig
+from hilcal.measuring.run import HOW_ON
+from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
-from hilcal.plan.checked_plan import refuse
-from hilcal.plan.goal_rule import GoalRule
-from hilcal.report.goal_words import full_words, missed_words
-from hilcal.report.live_run import watching
-from hilcal.report.live_viewer import LiveViewer, Several
-from hilcal.report.progress import Say, working
-from hilcal.report.text_plan import plan_facts
+from hilcal.present.goal_words import full_words, missed_words
+from hilcal.present.live_run import watching
+from hilcal.present.live_viewer import LiveViewer, Several
+from hilcal.present.progress import Say, working
+from hilcal.present.text_plan import plan_facts
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, load_plan
+from hilcal.store.run_log import RunLog, check_same_cell, create_run
 
 
 def run(

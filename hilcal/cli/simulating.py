@@ -17,9 +17,9 @@ from hilcal.cli.planning import CellFile, PlanFile, make_plan, read_cell
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.config.write import to_toml
-from hilcal.data.plan import load_plan
 from hilcal.errors import InputError
-from hilcal.report.progress import working
+from hilcal.present.progress import working
+from hilcal.store.plan import load_plan
 from hilcal.whole_file import replace_file
 
 FASTEST = 200.0

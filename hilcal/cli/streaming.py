@@ -7,17 +7,17 @@ from pathlib import Path
 from hilcal.calibration.streamed import calibration_of_stream
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Terminal
-from hilcal.data.covariance import tracker_noise
-from hilcal.data.parquet_stream import open_stream
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identify.carried import CarriedPrior
-from hilcal.report.progress import counting
-from hilcal.report.text_stream import stream_report
+from hilcal.identification.carried import CarriedPrior
+from hilcal.present.progress import counting
+from hilcal.present.text_stream import stream_report
+from hilcal.readings.covariance import tracker_noise
 from hilcal.stream.document import to_json
 from hilcal.stream.fit import fit_stream
+from hilcal.tables.parquet_stream import open_stream
 
 
 def identify_stream(

@@ -9,7 +9,7 @@ from hilcal.cli.engine import OneWorker, Scheduler, one_by_default
 from hilcal.cli.terminal import Json, terminal
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.report.progress import counting
+from hilcal.present.progress import counting
 
 
 def scaling(

@@ -11,17 +11,17 @@ from rich.padding import Padding
 from hilcal.cell import Cell
 from hilcal.cli.previewing import show_preview
 from hilcal.cli.terminal import Json, terminal
-from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify import description_words, frames_document
-from hilcal.identify.gate import examine
-from hilcal.identify.other_arm import other_arm
-from hilcal.identify.registration import Registration, register
+from hilcal.identification import description_words, frames_document
+from hilcal.identification.gate import examine
+from hilcal.identification.other_arm import other_arm
+from hilcal.identification.registration import Registration, register
 from hilcal.import_campaign import import_campaign
-from hilcal.report import text
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.progress import working
-from hilcal.report.text_registration import other_arm_line, registration_lines
+from hilcal.present import text
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.progress import working
+from hilcal.present.text_registration import other_arm_line, registration_lines
+from hilcal.readings.readings import Readings
 
 
 def import_(

@@ -12,8 +12,8 @@ from rich.console import Console, RenderableType
 
 from hilcal.cli.failing import error_document
 from hilcal.errors import HilcalError
-from hilcal.identify.fit_document import plain
-from hilcal.report.progress import SafeConsole
+from hilcal.identification.fit_document import plain
+from hilcal.present.progress import SafeConsole
 
 WIDTH = 100
 

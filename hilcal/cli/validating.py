@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import called, record_of, titles
 from hilcal.cli.terminal import Json, Revision, Run, terminal
-from hilcal.data.quantities import parse_length
 from hilcal.errors import CannotAnswerError, HilcalError, LimitError
-from hilcal.report import text, text_validate
-from hilcal.report.progress import working
-from hilcal.validate import validate as validate_campaign
+from hilcal.present import text, text_validate
+from hilcal.present.progress import working
+from hilcal.tables.quantities import parse_length
+from hilcal.validation import validate as validate_campaign
 
 OVER = 5.0
 """Errors in units of the noise from which another place of the tracker is suspected; a guess."""

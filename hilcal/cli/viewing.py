@@ -13,14 +13,14 @@ from typing import Annotated
 
 import typer
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import check_record, record_story
 from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
-from hilcal.report.build_story import build_story
-from hilcal.report.live_viewer import PORT, LiveViewer
-from hilcal.report.progress import working
+from hilcal.present.build_story import build_story
+from hilcal.present.live_viewer import PORT, LiveViewer
+from hilcal.present.progress import working
 
 ENDING = 5.0
 
@@ -53,7 +53,7 @@ def view(
         return
     with working(t.progress) as say:
         say("preparing the viewer")
-        from hilcal.report.viewer import serve  # loads the viewer's library, which takes a while
+        from hilcal.present.viewer import serve  # loads the viewer's library, which takes a while
 
         story = build_story(chapters)
     # Ending the server can wait for a viewer that does not answer; the campaign is closed.

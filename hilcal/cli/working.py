@@ -10,13 +10,13 @@ import typer
 
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Terminal, terminal
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.schema import is_campaign
 from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.progress import working
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.progress import working
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.schema import is_campaign
 from hilcal.workbench.guard import UNUSED_S
 from hilcal.workbench.server import require_nicegui, serve
 from hilcal.workbench.session import Session

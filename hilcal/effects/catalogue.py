@@ -6,7 +6,6 @@ from importlib.metadata import entry_points
 from pathlib import Path
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.backlash import Backlash
 from hilcal.effects.base_compliance import BaseCompliance
 from hilcal.effects.base_frame import BaseFrame
@@ -38,6 +37,7 @@ from hilcal.effects.transmission_error import TransmissionError
 from hilcal.effects.wrench_bias import WrenchBias
 from hilcal.effects.wrench_gain import WrenchGain
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.toml import suggest
 
 ENTRY_POINT_GROUP = "hilcal.effects"

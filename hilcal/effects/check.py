@@ -8,7 +8,6 @@ from typing import Any, get_args
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.failure import failure_of
 from hilcal.effects.options import PRIOR_HELP
@@ -27,6 +26,7 @@ from hilcal.effects.source import source_of
 from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
 from hilcal.names import escaped
+from hilcal.readings.readings import States
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import load_wrench_change, slot_wrenches
 from hilcal.types import Floats

@@ -5,11 +5,11 @@ from typing import ClassVar
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.options import Options, choice
 from hilcal.effects.per_joint import COMMON, EACH, PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 SECOND = 1.0

@@ -6,9 +6,9 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Robot
-from hilcal.data.readings import States
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Situation
+from hilcal.readings.readings import States
 from hilcal.robot import chain as chains
 from hilcal.robot.statics import Load, slot_wrenches
 

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.options import numbers
 from hilcal.effects.protocol import Columns, Effect, Situation
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.statics import load_wrench_change
 from hilcal.types import Floats

@@ -5,9 +5,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.robot.conventions import may_follow
 
 ABOUT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])

@@ -8,10 +8,10 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import Columns, Effect, Parameter
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
 EACH, COMMON = "each", "common"

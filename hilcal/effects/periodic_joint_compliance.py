@@ -4,11 +4,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.options import rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 MOST_ORDER = 1000

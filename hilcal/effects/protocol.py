@@ -16,12 +16,12 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.changed import Changeable
 from hilcal.effects.options import Options
 from hilcal.effects.source import source_of
 from hilcal.effects.total import total
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load

@@ -4,11 +4,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.changed import Changeable
 from hilcal.effects.options import choice, number
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 REFERENCE_DEGC = 20.0

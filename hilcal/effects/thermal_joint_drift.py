@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.options import numbers
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Situation
+from hilcal.readings.readings import States
 
 
 class ThermalJointDrift(PerJoint):

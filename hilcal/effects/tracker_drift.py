@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.data.readings import States
 from hilcal.effects.options import number
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 
 

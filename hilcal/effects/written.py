@@ -5,11 +5,11 @@ import re
 from collections.abc import Iterator
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 
 EXAMPLE = "valid: NAME or NAME(option=value, option=value), as hysteresis(joints=1-3)"
 _VALUES = 'a number, true, false, a word, "quoted text", or a list of them, as [2, 4]'

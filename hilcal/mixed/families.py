@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES, Effect
-from hilcal.model import Model
+from hilcal.model.model import Model
 from hilcal.types import Floats, Ints
 
 KNOWN = 1e-3

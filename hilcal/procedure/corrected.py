@@ -6,22 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.acquire.dry_run import dry_run
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import REFERENCE, UNLOADED, Plan
-from hilcal.data.readings import Readings, States
+from hilcal.design.checked_plan import refuse
+from hilcal.design.feasible import REASONS, Space
+from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.checked_plan import refuse
-from hilcal.plan.feasible import REASONS, Space
-from hilcal.plan.run_order import Chosen, Ordering, order_plan
+from hilcal.measuring.dry_run import dry_run
+from hilcal.present.text_compensate import refusals
 from hilcal.procedure.expected import expected_states
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
-from hilcal.report.text_compensate import refusals
+from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan
 from hilcal.types import Bools, Floats, Ints
 
 Say = Callable[[str], None]

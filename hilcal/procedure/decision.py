@@ -10,17 +10,17 @@ from hilcal.calibration.poses import band
 from hilcal.calibration.tool import tool_of
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import Plan
-from hilcal.data.readings import States
-from hilcal.diagnose.diagnosis import Diagnosis
+from hilcal.design.planner import Request, make
+from hilcal.design.predicted import predicted
+from hilcal.design.summary import about
+from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.planner import Request, make
-from hilcal.plan.predicted import predicted
-from hilcal.plan.summary import about
 from hilcal.procedure.separate import doubt_of, plan_of, separating
 from hilcal.procedure.state import Settings, duration_of
 from hilcal.procedure.validation_plan import RECORDED
+from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
+from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
 Say = Callable[[str], None]

@@ -5,12 +5,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.acquire.route import duration, route
 from hilcal.config import CellConfig
-from hilcal.data.plan import Plan
-from hilcal.data.readings import States
-from hilcal.plan.timing import pace
+from hilcal.design.timing import pace
+from hilcal.measuring.route import duration, route
+from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
+from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
 

@@ -4,17 +4,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.effect_ranking import Suspect
+from hilcal.design.checked_plan import CheckedPlan, checked
+from hilcal.design.next import Next
+from hilcal.design.summary import summarise
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.errors import CannotAnswerError
 from hilcal.names import quoted
-from hilcal.plan.checked_plan import CheckedPlan, checked
-from hilcal.plan.next import Next
-from hilcal.plan.summary import summarise
 from hilcal.procedure.separate import Doubt, Say, plan_of, separating, without
 from hilcal.procedure.shared import reference_in
 

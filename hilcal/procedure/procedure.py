@@ -15,21 +15,16 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT
-from hilcal.data.plan import Plan
-from hilcal.data.procedure_log import ENTRY, ProcedureLog, entry
-from hilcal.data.run_log import PLAN, RunLog, check_same_cell, create_run
-from hilcal.diagnose.verdict import diagnose
+from hilcal.design.checked_plan import CheckedPlan, checked
+from hilcal.design.planner import Request, make
+from hilcal.design.summary import about, remarks, summarise
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.plan.checked_plan import CheckedPlan, checked
-from hilcal.plan.planner import Request, make
-from hilcal.plan.summary import about, remarks, summarise
+from hilcal.identification.baseline import baseline
 from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
 from hilcal.procedure.shared import reference_of
 from hilcal.procedure.state import (
@@ -44,8 +39,13 @@ from hilcal.procedure.state import (
     settings_of,
 )
 from hilcal.procedure.validation_steps import ValidationSteps
-from hilcal.refine import Refinement, refine
-from hilcal.refine import Step as RefinementStep
+from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.refinement import Refinement, refine
+from hilcal.refinement import Step as RefinementStep
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan
+from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
+from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
 Say = Callable[[str], None]
 Measure = Callable[[CampaignFile, float | None], None]

@@ -7,17 +7,17 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import Plan
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.more_poses import pose_powers
-from hilcal.diagnose.pose_alone import PoseAlone
-from hilcal.diagnose.stepwise import remove
-from hilcal.identify.fit import Fit
-from hilcal.plan.many_poses import measure_poses
-from hilcal.plan.next import Next, PairPower, measure_next
-from hilcal.plan.planner import Request
-from hilcal.plan.summary import about
+from hilcal.design.many_poses import measure_poses
+from hilcal.design.next import Next, PairPower, measure_next
+from hilcal.design.planner import Request
+from hilcal.design.summary import about
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.more_poses import pose_powers
+from hilcal.diagnosis.pose_alone import PoseAlone
+from hilcal.diagnosis.stepwise import remove
+from hilcal.identification.fit import Fit
+from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
 Say = Callable[[str], None]

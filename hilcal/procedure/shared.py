@@ -6,30 +6,30 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.arm_scatter import ArmScatter
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT
-from hilcal.data.plan import REFERENCE, Plan, read_plan
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.purpose import CALIBRATION, PURPOSE
-from hilcal.data.readings import Readings
-from hilcal.data.revision import RevisionRecord
-from hilcal.data.run_log import PLAN, create_run
-from hilcal.data.whitening import Mode, usual_mode
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.identify.arm_scatter import with_arm_scatter
-from hilcal.identify.carried import CarriedPrior
-from hilcal.identify.full_covariance import full_readings
+from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.full_covariance import full_readings
 from hilcal.procedure.state import (
     REFINED,
     Files,
     Settings,
     identity,
 )
+from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode, usual_mode
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import REFERENCE, Plan, read_plan
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.purpose import CALIBRATION, PURPOSE
+from hilcal.store.revision import RevisionRecord
+from hilcal.store.run_log import PLAN, create_run
 from hilcal.types import Floats
 
 

@@ -4,13 +4,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.data.run_log import RunLog
-from hilcal.data.whitening import Mode
 from hilcal.errors import InputError
+from hilcal.readings.whitening import Mode
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.store.run_log import RunLog
 
 Kind = Literal[
     "plan",

@@ -5,18 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.acquire.dry_run import dry_run
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import REFERENCE, UNLOADED, Plan
-from hilcal.data.readings import Readings, States
+from hilcal.design.checked_plan import refuse
+from hilcal.design.draw import draw
+from hilcal.design.feasible import Space
+from hilcal.design.run_order import Chosen, Ordering, order_plan
+from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError
-from hilcal.plan.checked_plan import refuse
-from hilcal.plan.draw import draw
-from hilcal.plan.feasible import Space
-from hilcal.plan.run_order import Chosen, Ordering, order_plan
-from hilcal.plan.timing import pace, timeline
+from hilcal.measuring.dry_run import dry_run
+from hilcal.readings.readings import Readings, States
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan
 from hilcal.types import Bools, Floats
 
 Say = Callable[[str], None]
@@ -48,7 +48,7 @@ def validation_plan(
 
     The poses are drawn evenly over the joint angles that were measured; those that the cell does
     not allow, that are not reached, or that lie far from all measured ones (see
-    `identify.extrapolation`) are left out. Each is measured under one load, for deflections
+    `identification.extrapolation`) are left out. Each is measured under one load, for deflections
     unloaded as well; of a fit to positions the unloaded arm is one of the loads.
 
     Args:

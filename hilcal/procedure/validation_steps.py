@@ -8,18 +8,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilcal.calibration.improvement import Improvement, improvement
-from hilcal.campaign import Campaign
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan, read_plan
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.purpose import CORRECTED, VALIDATION
-from hilcal.data.records import content_hash
-from hilcal.data.run_log import PLAN
-from hilcal.data.same_readings import already
+from hilcal.campaign.campaign import Campaign
 from hilcal.errors import InputError
-from hilcal.identify import validation
-from hilcal.identify.acceptance import Acceptance, acceptance
-from hilcal.identify.extrapolation import extrapolation
+from hilcal.identification import validation
+from hilcal.identification.acceptance import Acceptance, acceptance
+from hilcal.identification.extrapolation import extrapolation
 from hilcal.procedure.corrected import corrected_plan, expected_of, paired
 from hilcal.procedure.shared import Shared, reference_in, reference_of
 from hilcal.procedure.state import (
@@ -29,6 +22,13 @@ from hilcal.procedure.state import (
     opened,
 )
 from hilcal.procedure.validation_plan import validation_plan
+from hilcal.readings.same_readings import already
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, read_plan
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.purpose import CORRECTED, VALIDATION
+from hilcal.store.records import content_hash
+from hilcal.store.run_log import PLAN
 
 Say = Callable[[str], None]
 VALIDATING, CORRECTING = 2, 3

@@ -1,6 +1,6 @@
 """The JSON of a fit to a stream: the keys of `identify`, as far as they have a meaning."""
 
-from hilcal.identify.fit_document import finite
+from hilcal.identification.fit_document import finite
 from hilcal.stream.fit import StreamFit
 
 

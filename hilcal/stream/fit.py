@@ -1,6 +1,6 @@
 """A model fitted to a stream: Gauss-Newton in which each step is one pass.
 
-The steps are those of readings in memory (`identify.minimise`): the linear problem of a step has
+The steps are those of readings in memory (`minimise`): the linear problem of a step has
 the triangle of the whitened rows in place of the rows, whose products are the same. What needs all
 readings at once is replaced:
 
@@ -20,39 +20,39 @@ import numpy as np
 from scipy.stats import chi2
 
 from hilcal.cell import Cell
-from hilcal.data import columns
-from hilcal.data.covariance import WHOLE
-from hilcal.data.parquet_stream import ReadingStream
-from hilcal.data.readings import Readings
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.engine.engine import Advance, Engine
 from hilcal.errors import CannotAnswerError
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.carried import CarriedPrior
-from hilcal.identify.coordinates import coordinates_of
-from hilcal.identify.errors import ErrorBlock
-from hilcal.identify.estimates import Estimates
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.folds import FOLDS
-from hilcal.identify.full_covariance import with_joint_scatter
-from hilcal.identify.gauss_newton import over_all_parameters, prior_coordinates
-from hilcal.identify.minimise import Point, Problem, linear_problem, minimise
-from hilcal.identify.outliers import bulk, limit
-from hilcal.identify.priors import prior_of, scales_of
-from hilcal.identify.regularisation import LinearProblem, Regularisation, spent_parameters
-from hilcal.identify.uncertainty import (
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.coordinates import coordinates_of
+from hilcal.identification.errors import ErrorBlock
+from hilcal.identification.estimates import Estimates
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.folds import FOLDS
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.gauss_newton import over_all_parameters, prior_coordinates
+from hilcal.identification.minimise import Point, Problem, linear_problem, minimise
+from hilcal.identification.outliers import bulk, limit
+from hilcal.identification.priors import prior_of, scales_of
+from hilcal.identification.regularisation import LinearProblem, Regularisation, spent_parameters
+from hilcal.identification.uncertainty import (
     MISFIT_CHANCE,
     identifiable_parameters,
     in_ordinary_magnitudes,
     name_directions,
 )
-from hilcal.identify.variance_factor import WithVarianceFactor
-from hilcal.model import Model
+from hilcal.identification.variance_factor import WithVarianceFactor
+from hilcal.model.model import Model
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.readings import Readings
 from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
 from hilcal.stream.passes import Errors, Reduced, Work, errors_of_group, reduce_group, sample_group
+from hilcal.tables import columns
+from hilcal.tables.parquet_stream import ReadingStream
 from hilcal.types import Bools, Floats, Ints
 
 Result = TypeVar("Result")
@@ -207,7 +207,7 @@ def fit_stream(
         effects: options by effect, besides unknown frames; the baseline where None.
         catalogue: the effects that a model can have; the installed ones unless given.
         prior: what another campaign taught of the arm.
-        counting: shows how far a pass is, as `report.progress.counting` does.
+        counting: shows how far a pass is, as `present.progress.counting` does.
 
     Raises:
         InputError: a row that cannot be right, or effects that cannot be.

@@ -10,15 +10,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.data.parquet_stream import ReadingStream
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Whitening, whitening
-from hilcal.identify.folds import FOLDS
-from hilcal.identify.full_covariance import joint_factors
-from hilcal.identify.gauss_newton import whitened_jacobian
-from hilcal.identify.residual import residual
-from hilcal.model import Model, Prediction
+from hilcal.identification.folds import FOLDS
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.residual import residual
+from hilcal.model.model import Model, Prediction
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Whitening, whitening
 from hilcal.regression.triangle import Triangle
+from hilcal.tables.parquet_stream import ReadingStream
 from hilcal.types import Bools, Floats, Ints
 
 

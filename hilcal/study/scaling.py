@@ -1,6 +1,6 @@
 """What `none`, `gu` and `gc` do to the same data, by Monte-Carlo.
 
-The whitening of `hilcal.data.whitening` is applied to simulated readings of an arm under known
+The whitening of `hilcal.readings.whitening` is applied to simulated readings of an arm under known
 loads. The noise is drawn per reading; deflections are formed as in a campaign, loaded minus
 unloaded; errors of the estimates are set against the Cramér–Rao bound, and the stated 95 %
 intervals are counted.
@@ -15,10 +15,10 @@ import numpy as np
 from scipy import stats
 from scipy.linalg import solve_triangular
 
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.engine.engine import ALONE, Advance, Engine
 from hilcal.errors import InputError
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.study.scaling_design import Design, bound, make_design, make_readings

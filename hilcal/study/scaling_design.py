@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.data.covariance import TrackerNoise, joint_scatter, tracker_covariance
-from hilcal.data.readings import Readings, States
 from hilcal.errors import CannotAnswerError
+from hilcal.readings.covariance import TrackerNoise, joint_scatter, tracker_covariance
+from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Chain, evaluate, joint_jacobian
 from hilcal.robot.statics import Load, slot_wrenches

@@ -4,7 +4,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.data.whitening import Scaling
+from hilcal.readings.whitening import Scaling
 from hilcal.study.scaling import UNITS, ScalingStudy, StudyCell
 
 BOUND_TOLERANCE = 0.03

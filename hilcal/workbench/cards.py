@@ -10,19 +10,20 @@ import numpy as np
 from nicegui import background_tasks, run, ui
 from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
-from hilcal.data.plan import UNLOADED
-from hilcal.data.revision import RevisionRecord
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.distinguish import Difference
-from hilcal.diagnose.effect_ranking import Suspect
-from hilcal.report import numbers, text
-from hilcal.report.charts import error_per_revision, measured_predicted, misfit, residuals
-from hilcal.report.charts.added_variable import added_variable
-from hilcal.report.charts.law import law
-from hilcal.report.charts.residual_over import residual_over
-from hilcal.report.text_info import model_words
-from hilcal.report.two_revisions import left_out_m, two_revisions, verdict_of
-from hilcal.report.verdict_words import headline, message
+from hilcal import numbers
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.distinguish import Difference
+from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.present import text
+from hilcal.present.charts import error_per_revision, measured_predicted, misfit, residuals
+from hilcal.present.charts.added_variable import added_variable
+from hilcal.present.charts.law import law
+from hilcal.present.charts.residual_over import residual_over
+from hilcal.present.text_info import model_words
+from hilcal.present.two_revisions import left_out_m, two_revisions, verdict_of
+from hilcal.present.verdict_words import headline, message
+from hilcal.store.plan import UNLOADED
+from hilcal.store.revision import RevisionRecord
 from hilcal.workbench.elements import answer, button, chart, number, plain, point, title
 from hilcal.workbench.next_card import next_measurement
 from hilcal.workbench.snapshot import Figure, Snapshot

@@ -11,7 +11,7 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
-from hilcal.report.charts import style
+from hilcal.present.charts import style
 from hilcal.workbench.work import Work
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from hilcal.report import text_next
+from hilcal.present import text_next
 from hilcal.workbench.elements import answer, button, title
 from hilcal.workbench.session import Session
 from hilcal.workbench.snapshot import Snapshot

@@ -10,9 +10,10 @@ from fastapi.responses import PlainTextResponse, Response
 from nicegui import app as bench
 from nicegui import ui
 
-from hilcal.changes import Changed
-from hilcal.report import numbers, text_refine
-from hilcal.report.two_revisions import refitted
+from hilcal import numbers
+from hilcal.campaign.changes import Changed
+from hilcal.present import text_refine
+from hilcal.present.two_revisions import refitted
 from hilcal.workbench import cards, next_card
 from hilcal.workbench.elements import Status
 from hilcal.workbench.session import Say, Session

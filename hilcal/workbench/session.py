@@ -13,24 +13,24 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.campaign import Campaign
-from hilcal.changes import Changed, add_effect, change_cell, refit, remove_effect
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.changes import Changed, add_effect, change_cell, refit, remove_effect
+from hilcal.campaign.revisions import chain_in_cell
 from hilcal.config.changes import Changes, read_value
-from hilcal.data.purpose import refuse_fitting
-from hilcal.data.revision import RevisionRecord
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.distinguish import Difference, Recorded, distinguish, recorded_values
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.distinguish import Difference, Recorded, distinguish, recorded_values
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identify.full_prediction import full_prediction
+from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
+from hilcal.present.build_story import Chapter, build_story, regressor
+from hilcal.present.covariance_words import covariance_words
+from hilcal.present.story import Regressor
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
-from hilcal.report.build_story import Chapter, build_story, regressor
-from hilcal.report.covariance_words import covariance_words
-from hilcal.report.story import Regressor
-from hilcal.revisions import chain_in_cell
+from hilcal.store.purpose import refuse_fitting
+from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
 from hilcal.workbench.snapshot import Snapshot, Stamp, figures_of, require_judged
 from hilcal.write_report import Asked, write_report

@@ -2,14 +2,14 @@
 
 from dataclasses import dataclass
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.config import Target
 from hilcal.config.changes import CHANGEABLE, INSTRUMENT_NOISE, Changes, described, write_value
-from hilcal.data.revision import RevisionRecord
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.identify.fit import Fit
-from hilcal.report.build_story import Chapter
-from hilcal.report.story import Story, StoryRevision
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.identification.fit import Fit
+from hilcal.present.build_story import Chapter
+from hilcal.present.story import Story, StoryRevision
+from hilcal.store.revision import RevisionRecord
 
 Stamp = tuple[int, int, int]
 """Size (bytes), time of the last change (ns) and inode of a file, by which a change is noticed."""

@@ -16,7 +16,7 @@ from http.client import HTTPConnection, HTTPException
 from pathlib import Path
 
 from hilcal.errors import HilcalError
-from hilcal.report.story import Story
+from hilcal.present.story import Story
 
 FILES = {
     "index.html": "text/html; charset=utf-8",
@@ -71,10 +71,10 @@ class WebViewer:
         Raises:
             HilcalError: the viewer cannot be had, or the story not be recorded.
         """
-        from hilcal.report.viewer import save  # loads the viewer's library, which takes a while
-        from hilcal.report.viewer.digest import Limits, digest
-        from hilcal.report.viewer.layout import blueprint
-        from hilcal.report.viewer.stream import APPLICATION
+        from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
+        from hilcal.present.viewer.digest import Limits, digest
+        from hilcal.present.viewer.layout import blueprint
+        from hilcal.present.viewer.stream import APPLICATION
 
         say("recording")
         names = (f"story-{count}.rrd", f"layout-{count}.rbl")
@@ -99,7 +99,7 @@ class WebViewer:
 
 def _fetched() -> dict[str, bytes]:
     """Return the files of the web viewer that came with rerun-sdk."""
-    from hilcal.report.viewer.stream import executable  # loads the viewer's library
+    from hilcal.present.viewer.stream import executable  # loads the viewer's library
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

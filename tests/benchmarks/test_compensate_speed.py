@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from hilcal.robot.chain import evaluate
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign, plan

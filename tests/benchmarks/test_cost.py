@@ -15,20 +15,20 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import Whitening, whitening
 from hilcal.effects.base_compliance import BaseCompliance
 from hilcal.effects.base_frame import BaseFrame
 from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
-from hilcal.identify.gauss_newton import whitened_jacobian
-from hilcal.identify.minimise import Point, linear_problem
-from hilcal.identify.priors import prior_of, scales_of
-from hilcal.identify.regularisation import regularise
-from hilcal.identify.residual import residual
-from hilcal.model import Model, Prediction
+from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.minimise import Point, linear_problem
+from hilcal.identification.priors import prior_of, scales_of
+from hilcal.identification.regularisation import regularise
+from hilcal.identification.residual import residual
+from hilcal.model.model import Model, Prediction
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Whitening, whitening
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
@@ -88,7 +88,7 @@ def assemble(p: Problem, prediction: Prediction, w: Whitening) -> Floats:
 
 
 def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats:
-    """A step of `identify.minimise`: rank analysis, normal equations and solution."""
+    """A step of `identification.minimise`: rank analysis, normal equations and solution."""
     white = w.whiten(residual(p.readings, prediction, w)).reshape(-1)
     prior, scale = prior_of(p.model)[0], scales_of(p.model)
     point = Point(p.theta, p.theta, float(white @ white), white.size)

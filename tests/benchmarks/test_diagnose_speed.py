@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 
-from hilcal.data.whitening import Mode
-from hilcal.diagnose.effect_ranking import Suspect, candidates, rank_suspects
-from hilcal.diagnose.verdict import diagnose
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.linearisation import linearise
-from hilcal.model import Model
+from hilcal.diagnosis.effect_ranking import Suspect, candidates, rank_suspects
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.model.model import Model
+from hilcal.readings.whitening import Mode
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import make

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.acquire.guard import Guard
-from hilcal.acquire.motion import POLL_S
 from hilcal.config import Obstacle
+from hilcal.measuring.guard import Guard
+from hilcal.measuring.motion import POLL_S
 from tests.benchmarks.conftest import Claim
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import TABLE

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.data.whitening import Mode
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.plan.next import CANDIDATES, Next, measure_next
-from hilcal.plan.planner import Request
+from hilcal.design.next import CANDIDATES, Next, measure_next
+from hilcal.design.planner import Request
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.readings.whitening import Mode
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign
 from tests.support.plan_cases import config_of

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.data.readings import States
+from hilcal.design.approximate_design import relax
+from hilcal.design.candidate_set import CandidateSet
+from hilcal.design.criteria import D
+from hilcal.design.optimum import best
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.link_geometry import LinkGeometry
-from hilcal.identify.priors import scales_of
-from hilcal.model import Model
-from hilcal.plan.approximate_design import relax
-from hilcal.plan.candidate_set import CandidateSet
-from hilcal.plan.criteria import D
-from hilcal.plan.optimum import best
+from hilcal.identification.priors import scales_of
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from rerun.chunk import RrdReader
 
-from hilcal.report.live_viewer import LiveViewer
-from hilcal.report.viewer import save
+from hilcal.present.live_viewer import LiveViewer
+from hilcal.present.viewer import save
 from tests.benchmarks.conftest import Claim
 from tests.support.live_story import events, measuring, plan
 from tests.support.viewer_story import story

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.refine import Refinement, refine
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.refinement import Refinement, refine
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign
 

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 from playwright.sync_api import CDPSession
 
-from hilcal.report.charts.readings_drawn import MOST
-from hilcal.report.html.content import ReportContent
-from hilcal.report.html.page import page as page_of
+from hilcal.present.charts.readings_drawn import MOST
+from hilcal.present.html.content import ReportContent
+from hilcal.present.html.page import page as page_of
 from tests.benchmarks.conftest import Claim
 from tests.support.browser import DESKTOP, needs_chromium, open_browser
 from tests.support.report_pages import opened, small_content

@@ -17,12 +17,12 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from hilcal.data.parquet_stream import ReadingStream, open_stream
 from hilcal.effects.protocol import Effect
-from hilcal.identify.priors import scales_of
-from hilcal.model import Model
+from hilcal.identification.priors import scales_of
+from hilcal.model.model import Model
 from hilcal.regression.triangle import Triangle
 from hilcal.stream import passes
+from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.benchmarks.test_cost import EFFECTS

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import rerun as rr
 
-from hilcal.acquire.progress import ArmAt
-from hilcal.report.live_messages import Measuring
-from hilcal.report.viewer import live, save
-from hilcal.report.viewer.live_scene import LiveScene
+from hilcal.measuring.progress import ArmAt
+from hilcal.present.live_messages import Measuring
+from hilcal.present.viewer import live, save
+from hilcal.present.viewer.live_scene import LiveScene
 from tests.benchmarks.conftest import Claim
 from tests.support.live_story import events, measuring, plan
 from tests.support.picture import opened, vulkan_available

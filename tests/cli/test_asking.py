@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import run
 from tests.support.screen import AtTerminal
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.procedure_log import ProcedureLog
 from hilcal.procedure.state import BEGUN
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import CELL
 from tests.support.cli_cases import ok, refused, run
 from tests.support.procedure_cases import Drawn, drawn, small

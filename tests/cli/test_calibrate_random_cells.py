@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tomli_w
 
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, TRIES
 from tests.support.cli_cases import Outcome, ok, run
 from tests.support.random_cells import random_cell, random_options

@@ -10,9 +10,9 @@ import pytest
 
 from drivers.simulated.rehearsal import simulate
 from hilcal import __version__
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.table import read_table
 from hilcal.effects.catalogue import installed
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import read_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
 
 Capsys = pytest.CaptureFixture[str]

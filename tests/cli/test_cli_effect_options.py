@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, Outcome, ok, refused, table
 
 Capsys = pytest.CaptureFixture[str]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
 from hilcal.errors import InputError
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, start, table
 
 Capsys = pytest.CaptureFixture[str]
@@ -227,7 +227,7 @@ def test_numerical_warnings_do_not_reach_the_user(
 ) -> None:
     import warnings
 
-    from hilcal.diagnose.misfit_breakdown import misfit_breakdown
+    from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 
     def noisy(p: object) -> object:
         warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.campaign import Campaign
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.command_line import COMMAND, typed, typed_now
-from hilcal.data.overview import overview
-from hilcal.report.html.page import page
+from hilcal.campaign.campaign import Campaign
+from hilcal.present.html.page import page
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.command_line import COMMAND, typed, typed_now
+from hilcal.store.overview import overview
 from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import ok

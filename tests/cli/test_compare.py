@@ -10,9 +10,9 @@ import pytest
 import hilcal as hc
 from drivers.simulated.world import World, stand
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.cli_cases import ok, refused

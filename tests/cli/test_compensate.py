@@ -10,11 +10,11 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
-from hilcal.data.readings import States
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.se3 import matrix, of_six, rotation, six
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"

@@ -14,12 +14,12 @@ from drivers.simulated.rehearsal import (
 )
 from hilcal.cli.rehearsing import RehearsalSettings, first_plan
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan
-from hilcal.data.purpose import purpose_of
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.report.progress import Say
+from hilcal.present.progress import Say
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan
+from hilcal.store.purpose import purpose_of
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal
 from tests.support.user_effect_cases import CLASS

@@ -12,22 +12,22 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.config.write import to_toml
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import WHOLE
-from hilcal.data.readings import States
-from hilcal.data.table import write_table
-from hilcal.discover import shapes
-from hilcal.discover.amplitudes import Amplitude, Factor
-from hilcal.discover.discovery import Discovery
-from hilcal.discover.law import Coefficient, Form, Part
-from hilcal.discover.law import Law as FoundLaw
-from hilcal.discover.sites import sites
-from hilcal.discover.variables import variables
-from hilcal.discover.write_effect import source_of_form
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.discovery import Discovery
+from hilcal.discovery.law import Coefficient, Form, Part
+from hilcal.discovery.law import Law as FoundLaw
+from hilcal.discovery.sites import sites
+from hilcal.discovery.variables import variables
+from hilcal.discovery.write_effect import source_of_form
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
-from hilcal.identify.fit import Fit
+from hilcal.identification.fit import Fit
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.readings import States
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import write_table
 from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states, rehearse
 from studies.unmodelled_laws import Law, UnmodelledLaw, shift

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 
 import hilcal as hc
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT, WHOLE
-from hilcal.data.readings import Readings
-from hilcal.data.records import content_hash
-from hilcal.data.table import import_table, with_what_rounding_does, write_table
-from hilcal.identify.parameters_document import covariance_of, read
+from hilcal.identification.parameters_document import covariance_of, read
+from hilcal.readings.covariance import COVERS, INSTRUMENT, WHOLE
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.tables.table import import_table, with_what_rounding_does, write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.readings_cases import make_arm, simple
 

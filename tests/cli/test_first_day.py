@@ -22,10 +22,10 @@ from drivers.simulated.rehearsal import SimulationCase, measurement_noise
 from drivers.simulated.rigid import displacement
 from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
-from hilcal.data.plan import load_plan
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.se3 import inverse, of_six, rotation
+from hilcal.store.plan import load_plan
 from hilcal.types import Floats
 from tests.support.campaign_cases import STARVED
 from tests.support.foreign_tables import lines as table_of

@@ -11,13 +11,13 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import load_config
-from hilcal.data import rows, schema
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
-from hilcal.data.readings import Readings
-from hilcal.data.records import content_hash
-from hilcal.data.revision import STORED, fitted_to, from_text, to_text
 from hilcal.errors import InputError
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.store import rows, schema
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.store.revision import STORED, fitted_to, from_text, to_text
 from tests.support.appending import again, appending
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.unguarded import unguarded
@@ -179,8 +179,8 @@ def test_what_was_fitted_is_not_searched_for_ever(run: Path, found: hc.Fit, monk
         more(run, k + 1)
     with CampaignFile.open(run) as file:
         file.append_revision(replace(first, options={**first.options, STORED: "0" * 64}))
-        monkeypatch.setattr("hilcal.data.campaign_file.content_hash", counting)
-        monkeypatch.setattr("hilcal.data.campaign_file._HASHED", 3 * len(found.readings))
+        monkeypatch.setattr("hilcal.store.campaign_file.content_hash", counting)
+        monkeypatch.setattr("hilcal.store.campaign_file._HASHED", 3 * len(found.readings))
         assert file.bad_revision() is not None
     assert len(hashed) <= 4
 

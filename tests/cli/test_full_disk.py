@@ -12,9 +12,9 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
-from hilcal.data.table import write_table
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, rehearsal, run
 from tests.support.paths import ROOT
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.data.covariance import WHOLE
-from hilcal.data.readings import Readings
-from hilcal.data.table import write_table
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.tables.table import write_table
 from studies.gross_errors import spoil
 from tests.support.cli_cases import CELL, ok, rehearsal
 

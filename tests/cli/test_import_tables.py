@@ -11,7 +11,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.cli import main
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
 from tests.support.foreign_tables import CELL, campaign, lines, write
 

@@ -7,10 +7,10 @@ import pytest
 
 from hilcal.cli import main
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT
-from hilcal.data.plan import Plan, Step
-from hilcal.data.run_log import RunLog, create_run
+from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import RunLog, create_run
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
 
 Capsys = pytest.CaptureFixture[str]

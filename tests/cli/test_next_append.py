@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.appended import joined, with_new_names
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import REFERENCE, Plan, Step, load_plan
-from hilcal.data.run_log import RunLog
 from hilcal.errors import InputError
+from hilcal.store.appended import joined, with_new_names
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import REFERENCE, Plan, Step, load_plan
+from hilcal.store.run_log import RunLog
 from tests.cli.test_until_goal import Site, site
 from tests.support.cli_cases import ok, refused
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
@@ -105,8 +105,8 @@ _KILLED = """
 import os, sys
 from pathlib import Path
 from tests.cli.test_next_append import made
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 with CampaignFile.open(Path(sys.argv[1])) as campaign:
     log = RunLog(campaign)
     log.append(log.with_new_names(made("p8", "p9")))

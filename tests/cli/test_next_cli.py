@@ -9,20 +9,20 @@ from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from hilcal.cli import doubting
 from hilcal.cli.rehearsing import RehearsalSettings
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import load_plan
-from hilcal.diagnose.diagnosis import History
-from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.evidence import Evidence
-from hilcal.diagnose.verdict import judge
+from hilcal.diagnosis.diagnosis import History
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.evidence import Evidence
+from hilcal.diagnosis.verdict import judge
 from hilcal.effects.catalogue import installed
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import load_plan
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
-from tests.unit.plan.test_many_poses import fine_error
+from tests.unit.design.test_many_poses import fine_error
 
 Capsys = pytest.CaptureFixture[str]
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.verdict import diagnose
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit
-from hilcal.refine import refine
-from hilcal.report.build_story import build_story
-from hilcal.report.diagnosis_document import to_json
-from hilcal.report.verdict_words import message
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit
+from hilcal.present.build_story import build_story
+from hilcal.present.diagnosis_document import to_json
+from hilcal.present.verdict_words import message
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from studies.diagnosis import judgement
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
@@ -183,7 +183,7 @@ def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch: pytest.Monke
     def predicts_better(before: Fit, after: Fit) -> bool:
         return next(answers, None) is None and judged(before, after)
 
-    refinement = sys.modules["hilcal.refine"]  # hilcal.refine is a function of the library
+    refinement = sys.modules["hilcal.refinement"]  # hilcal.refine is a function of the library
     judged = refinement.predicts_better
     monkeypatch.setattr(refinement, "predicts_better", predicts_better)
     start = baseline(c.cell, c.readings, "deflection")

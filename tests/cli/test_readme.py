@@ -14,20 +14,20 @@ import openpyxl
 import pytest
 
 from drivers.simulated.on_the_wire import case_of_plan, read_plan
-from hilcal.acquire.connect import ConnectionResult
 from hilcal.cell import cell_from_config
 from hilcal.cli import planning
 from hilcal.cli.commands import COMMANDS
 from hilcal.config import CellConfig, load_config
-from hilcal.data.appended import with_new_names
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.columns import joint_columns
-from hilcal.data.covariance import WHOLE
-from hilcal.data.plan import Plan, load_plan
-from hilcal.data.readings import Readings
-from hilcal.data.run_log import RunLog, create_run
-from hilcal.data.table import write_table
-from hilcal.plan.planner import Request, make
+from hilcal.design.planner import Request, make
+from hilcal.measuring.connect import ConnectionResult
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.store.appended import with_new_names
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, load_plan
+from hilcal.store.run_log import RunLog, create_run
+from hilcal.tables.columns import joint_columns
+from hilcal.tables.table import write_table
 from tests.support import readme
 from tests.support.cli_cases import Outcome, run
 from tests.support.paths import ROOT

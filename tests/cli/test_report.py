@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from hilcal.config import Repeatability
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, INSTRUMENT
-from hilcal.identify.full_covariance import joint_factors
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from studies.change import measured
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import cell_of, configuration

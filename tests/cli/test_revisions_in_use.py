@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.revisions import chain
 from hilcal.cli import main
 from hilcal.config import load_config
-from hilcal.data import schema
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.revision import from_text, to_text
 from hilcal.errors import InputError
-from hilcal.revisions import chain
+from hilcal.store import schema
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.revision import from_text, to_text
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
@@ -130,7 +130,7 @@ def test_a_reading_connection_can_write_nothing(run: Path) -> None:
 
 KILLED = """
 import os, pathlib, sys
-from hilcal.data import schema
+from hilcal.store import schema
 connection = schema.connect(pathlib.Path(sys.argv[1]))
 connection.execute("PRAGMA cache_size = 1")
 connection.execute("BEGIN IMMEDIATE")

@@ -11,14 +11,14 @@ import hilcal as hc
 from hilcal.calibration.handover import urdf
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan, Step
-from hilcal.data.robot_file import ROBOT_FILE
-from hilcal.data.run_log import check_same_cell
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.robot_file import ROBOT_FILE
+from hilcal.store.run_log import check_same_cell
 from tests.support.cli_cases import ok, refused
-from tests.unit.discover.test_discover import campaign as simulated
+from tests.unit.discovery.test_discover import campaign as simulated
 
 
 @pytest.fixture

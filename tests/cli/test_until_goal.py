@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 
 import hilcal.cli.running as running
-from hilcal.acquire.connect import ConnectionResult
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, Repeatability
 from hilcal.config.write import to_toml
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan, Step
-from hilcal.data.run_log import RunLog, create_run
+from hilcal.design import goal_rule
+from hilcal.design.goal_rule import GoalRule
+from hilcal.design.nominal_model import nominal_states
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.plan import goal_rule as goal_rule
-from hilcal.plan.goal_rule import GoalRule
-from hilcal.plan.nominal_model import nominal_states
-from hilcal.report.goal_words import full_words, status_words
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.measuring.connect import ConnectionResult
+from hilcal.present.goal_words import full_words, status_words
 from hilcal.robot import chain as chains
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import RunLog, create_run
 from tests.support.campaigns import Campaign, campaign, configuration, noiseless, plan, with_noise
 from tests.support.cli_cases import ok, refused, run
 from tests.support.fake_bench import POSES, Bench

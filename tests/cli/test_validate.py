@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.covariance import WHOLE
-from hilcal.data.table import write_table
+from hilcal.readings.covariance import WHOLE
+from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run
 
 Capsys = pytest.CaptureFixture[str]
@@ -74,7 +74,7 @@ def test_of_a_mixture_only_the_unseen_readings_are_judged(folder: Path, capsys: 
 
 
 def test_readings_that_came_after_a_revision_are_unseen_by_it(folder: Path, capsys: Capsys) -> None:
-    from hilcal.data.campaign_file import CampaignFile
+    from hilcal.store.campaign_file import CampaignFile
 
     fit = folder / "fit.hilcal"
     with CampaignFile.open(folder / "rest.hilcal") as rest, CampaignFile.open(fit) as file:

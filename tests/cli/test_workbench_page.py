@@ -24,10 +24,10 @@ import pytest
 from playwright.sync_api import Browser, Locator, Page, expect
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.config.write import to_toml
-from hilcal.data.table import write_table
 from hilcal.import_campaign import import_campaign
+from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from hilcal.workbench.guard import Guard, Message, Receive, Scope, Send
 from tests.support.bench_cases import BASE, TILT, stored

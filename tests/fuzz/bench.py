@@ -9,16 +9,16 @@ from pathlib import Path
 from typing import Any
 
 import hilcal as hc
-from hilcal.campaign import Campaign
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import INSTRUMENT
-from hilcal.data.plan import Plan, Step
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.run_log import RunLog, create_run
-from hilcal.data.table import write_table
-from hilcal.identify import parameters_document
+from hilcal.campaign.campaign import Campaign
+from hilcal.identification import parameters_document
 from hilcal.procedure.state import Settings
+from hilcal.readings.covariance import INSTRUMENT
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.run_log import RunLog, create_run
+from hilcal.tables.table import write_table
 from tests.support.campaigns import campaign, configuration
 
 EVENTS: dict[str, dict[str, Any]] = {

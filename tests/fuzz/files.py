@@ -14,15 +14,15 @@ import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.handover import urdf
 from hilcal.calibration.points import read_points
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
-from hilcal.data.importing import import_readings
-from hilcal.data.mapping import load_mapping
-from hilcal.data.plan import load_plan
-from hilcal.identify import parameters_document, posterior_document
+from hilcal.identification import parameters_document, posterior_document
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.dh import arm_from_dh
 from hilcal.robot.urdf import arm_from_urdf
+from hilcal.store.plan import load_plan
+from hilcal.tables.importing import import_readings
+from hilcal.tables.mapping import load_mapping
 from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged

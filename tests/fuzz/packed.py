@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data import matfile
-from hilcal.data.mapping_sections import FileFormat
-from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError
+from hilcal.tables import matfile
+from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.sheets import open_grid
 from tests.fuzz.bench import Bench
 from tests.fuzz.damage import NUMBERS, ODD, bytes_damaged, words_damaged
 from tests.fuzz.harness import Parser

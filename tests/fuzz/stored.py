@@ -15,23 +15,23 @@ from rich.console import Console
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.urscript import program_points, with_joints
-from hilcal.data import revision, run_log
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.mapping import load_mapping
-from hilcal.data.overview import overview
-from hilcal.data.parquet_stream import open_stream
-from hilcal.data.propose import propose
-from hilcal.data.revision_table import revision_table
-from hilcal.data.rows import _reading_crc, text_crc
 from hilcal.effects import template
 from hilcal.effects.catalogue import installed
-from hilcal.fleet.members import LIST, entries
-from hilcal.identify import posterior_document
-from hilcal.identify.carried import carried_prior, check_arm
+from hilcal.identification import posterior_document
+from hilcal.identification.carried import carried_prior, check_arm
+from hilcal.present import text_info
+from hilcal.present.two_revisions import two_revisions
 from hilcal.procedure.state import next_step, settings_of
-from hilcal.report import text_info
-from hilcal.report.two_revisions import two_revisions
 from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.store import revision, run_log
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.overview import overview
+from hilcal.store.rows import _reading_crc, text_crc
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.mapping import load_mapping
+from hilcal.tables.parquet_stream import open_stream
+from hilcal.tables.revision_table import revision_table
+from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import (
     NUMBERS,

@@ -21,8 +21,8 @@ from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
 from drivers.force_stream import RING, ForceStream, SensorFormat
 from drivers.geocom import GeoComTracker, Options
 from drivers.geocom_line import Link
-from hilcal.acquire.clock import Clock
 from hilcal.config.cell import Tracker
+from hilcal.measuring.clock import Clock
 from tests.fuzz import controller
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed

@@ -9,7 +9,7 @@ from functools import partial
 import pytest
 from scipy.stats import binom
 
-from hilcal.data.whitening import Mode
+from hilcal.readings.whitening import Mode
 from studies.diagnosis import KINDS, Kind, Outcome, run_case
 from studies.diagnosis_claims import FOUND, Claim, claims
 from studies.diagnosis_command import simulate

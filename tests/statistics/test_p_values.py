@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, wishart
 
-from hilcal.data.covariance import PRIOR_REPEATS
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import MODES
-from hilcal.diagnose.effect_ranking import candidates, rank_suspects
-from hilcal.diagnose.stepwise import add
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.stepwise import add
 from hilcal.effects.catalogue import installed
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.identify.linearisation import linearise
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import linearise
+from hilcal.readings.covariance import PRIOR_REPEATS
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES
 from tests.support.campaigns import NOTHING, campaign
 
 SAMPLES = 5

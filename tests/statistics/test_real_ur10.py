@@ -9,14 +9,14 @@ import pytest
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
-from hilcal.data.ipa_ur10 import read_ipa_ur10
-from hilcal.data.readings import Readings
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.validation import validate
-from hilcal.refine import Refinement, refine
-from hilcal.report.verdict_words import message
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.validation import validate
+from hilcal.present.verdict_words import message
+from hilcal.readings.readings import Readings
+from hilcal.refinement import Refinement, refine
 from hilcal.robot.catalogue import configs_dir
+from hilcal.tables.ipa_ur10 import read_ipa_ur10
 
 pytestmark = pytest.mark.slow
 

@@ -14,8 +14,8 @@ from subprocess import PIPE, Popen
 
 import numpy as np
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.paths import ROOT
 
 

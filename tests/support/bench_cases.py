@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
-from hilcal.data.campaign_file import CampaignFile
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.next_cases import SMALL, doubtful
 
 FEW = ("base_frame", "joint_compliance", "base_compliance", "joint_tilt_compliance")

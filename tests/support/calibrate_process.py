@@ -9,9 +9,9 @@ from pathlib import Path
 
 import psutil
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
 from hilcal.procedure.state import Files
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 from tests.support.campaign_run import LOOK_S
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hilcal.cell import Cell
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Step
-from hilcal.data.run_log import RunLog
-from hilcal.identify.full_covariance import with_joint_scatter
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Step
+from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 from tests.support.campaign_run import EndedError, Run
 from tests.support.campaign_site import Site, site

@@ -13,12 +13,12 @@ import numpy as np
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.world import World
-from hilcal.acquire.dry_run import dry_run
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
-from hilcal.data.plan import Plan
+from hilcal.measuring.dry_run import dry_run
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.plan import Plan
 from tests.support.spread_plan import spread_plan
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import Mode
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats, Ints

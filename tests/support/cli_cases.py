@@ -13,9 +13,9 @@ import pytest
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.cli import main
 from hilcal.config import CellConfig, load_config
-from hilcal.data.covariance import WHOLE
-from hilcal.data.table import write_table
+from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
+from hilcal.tables.table import write_table
 from studies.__main__ import main as studies
 from studies.random_campaigns import rehearse
 

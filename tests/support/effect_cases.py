@@ -3,11 +3,11 @@
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.catalogue import BUILT_IN, installed
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Situation
-from hilcal.model import Model
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from hilcal.robot import chain as chains
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches

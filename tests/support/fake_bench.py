@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.acquire.rig import Rig
 from hilcal.cell import cell_from_config
 from hilcal.config import (
     Acquire,
@@ -18,7 +17,8 @@ from hilcal.config import (
     Tool,
     Tracker,
 )
-from hilcal.data.plan import Plan, Step
+from hilcal.measuring.rig import Rig
+from hilcal.store.plan import Plan, Step
 from tests.support.fake_devices import FakeArm, FakeClock, FakeForce, FakeOperator, FakeTracker
 from tests.support.fake_store import MemoryStore, Notes
 from tests.support.fake_world import World

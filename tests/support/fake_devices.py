@@ -4,8 +4,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilcal.acquire.clock import Clock
-from hilcal.acquire.devices import (
+from hilcal.config import Load
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.devices import (
     ArmSample,
     Losses,
     Report,
@@ -13,7 +14,6 @@ from hilcal.acquire.devices import (
     TrackerSample,
     WrenchSample,
 )
-from hilcal.config import Load
 from hilcal.types import Floats
 from tests.support.fake_world import World
 

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.data.plan import Step
-from hilcal.data.readings import Readings
-from hilcal.data.stored_schema import Detail, check, check_event
 from hilcal.errors import DeviceError
+from hilcal.readings.readings import Readings
+from hilcal.store.plan import Step
+from hilcal.store.stored_schema import Detail, check, check_event
 from tests.support.fake_world import World
 
 

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.data.readings import Readings
-from hilcal.identify.fit import Fit
-from hilcal.model import Model
+from hilcal.identification.fit import Fit
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings
 from hilcal.robot import se3
 
 MODES = ("absolute", "deflection")

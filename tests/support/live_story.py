@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from hilcal.acquire.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark
-from hilcal.data.plan import Plan, Step
-from hilcal.report.live_messages import Measuring
+from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark
+from hilcal.present.live_messages import Measuring
+from hilcal.store.plan import Plan, Step
 from tests.support.viewer_story import ur10e
 
 BEGUN = 1_800_000_000.0

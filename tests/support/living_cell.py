@@ -14,7 +14,7 @@ from drivers.simulated.world import World
 from drivers.simulated.world_state import WorldState
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
 

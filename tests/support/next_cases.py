@@ -9,16 +9,16 @@ from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import Rehearsal, SimulationCase
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.data.appended import with_new_names
-from hilcal.data.plan import Plan
-from hilcal.data.readings import Readings, States
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.doubt import in_doubt
-from hilcal.diagnose.verdict import diagnose
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.plan.next import Next, measure_next
-from hilcal.plan.planner import Request, make
+from hilcal.design.next import Next, measure_next
+from hilcal.design.planner import Request, make
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.readings.readings import Readings, States
+from hilcal.store.appended import with_new_names
+from hilcal.store.plan import Plan
 from tests.support.cli_cases import CELL
 
 _CONFIG = load_config(CELL)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
+from hilcal.readings.readings import Readings
 from hilcal.types import Floats
 from tests.support.campaigns import configuration, plan
 

@@ -7,14 +7,14 @@ from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import SimulationCase
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import WHOLE
-from hilcal.data.run_log import RunLog
-from hilcal.data.whitening import Mode
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import Settings, Step
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 
 HOUR = 3600.0
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hilcal.data.readings import Readings, States
+from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 

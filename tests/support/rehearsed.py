@@ -9,7 +9,7 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
-from hilcal.data.readings import Readings
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Ints
 from studies.random_campaigns import dead_weights, rehearsal_states

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, Page, Route
 
-from hilcal.campaign import Campaign
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.report.html.content import ReportContent
+from hilcal.campaign.campaign import Campaign
+from hilcal.present.html.content import ReportContent
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration
 

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from hilcal.acquire.run import run
-from hilcal.data.plan import Plan
-from hilcal.data.readings import Readings
+from hilcal.measuring.run import run
+from hilcal.readings.readings import Readings
+from hilcal.store.plan import Plan
 from hilcal.types import Bools
 from tests.support.fake_bench import Bench, usual_plan
 

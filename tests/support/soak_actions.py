@@ -15,9 +15,9 @@ from random import Random
 
 import numpy as np
 
-from hilcal.acquire.dry_run import dry_run
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
+from hilcal.measuring.dry_run import dry_run
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 from tests.support.calibrate_process import Calibration
 from tests.support.campaign_cases import STARVED, Fault, right, stopped_on_its_way
 from tests.support.campaign_run import BEGUN, EndedError, Run

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from hilcal.acquire.clearance import Clearance
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Obstacle
-from hilcal.plan.draw import Drawn, draw
-from hilcal.plan.feasible import Space
+from hilcal.design.draw import Drawn, draw
+from hilcal.design.feasible import Space
+from hilcal.measuring.clearance import Clearance
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule
 from hilcal.types import Floats

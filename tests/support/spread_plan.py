@@ -4,10 +4,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.data.plan import Plan
-from hilcal.plan.draw import draw
-from hilcal.plan.feasible import Space
-from hilcal.plan.run_order import Chosen, Ordering, order_plan
+from hilcal.design.draw import draw
+from hilcal.design.feasible import Space
+from hilcal.design.run_order import Chosen, Ordering, order_plan
+from hilcal.store.plan import Plan
 from hilcal.types import Bools, Floats
 
 

@@ -9,9 +9,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
-from hilcal.identify.priors import scales_of
-from hilcal.model import Model
+from hilcal.identification.priors import scales_of
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats

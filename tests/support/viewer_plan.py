@@ -10,18 +10,18 @@ from rerun.chunk import RrdReader
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.plan.confounding import Confounding
-from hilcal.plan.summary import (
+from hilcal.design.confounding import Confounding
+from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
     DetectableEffect,
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.plan.timing import Duration
-from hilcal.report.viewer.plan_stream import record_plan
+from hilcal.design.timing import Duration
+from hilcal.present.viewer.plan_stream import record_plan
 from hilcal.robot.chain import evaluate
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 
 CELL = Path(__file__).parents[2] / "configs" / "cells" / "demo_ur10e.toml"
 TRACKER = np.array([-2.5, 1.0, 1.3])

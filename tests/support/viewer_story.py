@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.report.story import (
+from hilcal.present.story import (
     Regressor,
     Story,
     StoryCurve,

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.config import load_config
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.refine import refine
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import rehearsal
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.campaign import Campaign
-from hilcal.changes import change_cell
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.changes import change_cell
 from hilcal.config.changes import Changes, changed, read_value, write_value
 from hilcal.config.write import to_toml
-from hilcal.data.table import write_table
 from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.robot.se3 import rotation_vector
+from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
 from tests.support.bench_cases import BASE, few_effects
 from tests.support.campaigns import NOTHING, campaign, configuration

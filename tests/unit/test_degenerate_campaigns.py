@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 import hilcal as hc
 from hilcal.cell import Cell
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
-from hilcal.diagnose.diagnosis import VERDICTS
+from hilcal.diagnosis.diagnosis import VERDICTS
 from hilcal.errors import HilcalError
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of, noiseless, plan, with_noise, world_of
 

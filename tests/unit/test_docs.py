@@ -11,10 +11,10 @@ import pytest
 import hilcal as hc
 from hilcal.config import load_config
 from hilcal.config.write import to_toml
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import WHOLE
-from hilcal.data.table import write_table
+from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import write_table
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import ok, quickly_planned
 from tests.support.paths import ROOT

@@ -9,11 +9,11 @@ from typing import Any
 
 import pytest
 
-from hilcal.acquire.devices import TRACKERS
 from hilcal.config import CellConfig, load_config
-from hilcal.data.campaign_file import CampaignFile
 from hilcal.effects.catalogue import ENTRY_POINT_GROUP
+from hilcal.measuring.devices import TRACKERS
 from hilcal.robot.catalogue import load_arm
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.toml import check_section
 from studies.random_campaigns import rehearse
 from tests.support import readme

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from drivers.simulated.injected_effects import hide
-from hilcal.data.readings import Readings
-from hilcal.diagnose.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.identify.linearisation import linearise
-from hilcal.model import Model
-from hilcal.refine import MOST_REVISIONS, Refinement, add, refine
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import linearise
+from hilcal.model.model import Model
+from hilcal.present.verdict_words import message
+from hilcal.readings.readings import Readings
+from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
 from hilcal.regression.paired_test import LEAST_GAIN
-from hilcal.report.verdict_words import message
 from tests.support.campaigns import campaign, cell_of, measured, plan, world_of
 from tests.support.effect_cases import make
 

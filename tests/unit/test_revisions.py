@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
-from hilcal.data.records import content_hash
-from hilcal.data.revision import RevisionRecord, from_text, to_text
-from hilcal.data.whitening import usual_mode
-from hilcal.diagnose.verdict import diagnose
+from hilcal.campaign.revisions import chain, restore, restore_model, to_record
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.fit_document import plain, to_json
-from hilcal.refine import add
-from hilcal.report.diagnosis_document import to_json as diagnosis_json
-from hilcal.revisions import chain, restore, restore_model, to_record
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit_document import plain, to_json
+from hilcal.present.diagnosis_document import to_json as diagnosis_json
+from hilcal.readings.whitening import usual_mode
+from hilcal.refinement import add
+from hilcal.store.records import content_hash
+from hilcal.store.revision import RevisionRecord, from_text, to_text
 from tests.support.cli_cases import rehearsal
 
 

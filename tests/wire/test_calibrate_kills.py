@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.procedure_log import ProcedureLog
 from hilcal.procedure.state import IMPROVED, next_step
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import Calibration
 
 MOMENTS = int(os.environ.get("HILCAL_KILLS", "50"))

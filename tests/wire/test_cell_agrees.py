@@ -10,7 +10,7 @@ from drivers.geocom import open_tracker
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.operator import open_operator
 from drivers.ur import open_arm
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from tests.support.living_cell import WEIGHT, Q, config, world_of
 
 MOUNT = {"origin_m": [0.0, 0.0, 0.04], "rotvec_rad": [0.0, 0.0, 0.7]}

@@ -11,9 +11,9 @@ from pathlib import Path
 import psutil
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
 from hilcal.errors import HilcalError
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 from tests.support.cluster import HERE, WORKER, running, scheduler
 from tests.support.paths import ROOT
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
-from hilcal.acquire.average import average
-from hilcal.acquire.clock import Clock
-from hilcal.acquire.connect import ConnectionResult, connect
-from hilcal.acquire.devices import ForceSensorDevice
-from hilcal.acquire.rig import Rig
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.average import average
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.connect import ConnectionResult, connect
+from hilcal.measuring.devices import ForceSensorDevice
+from hilcal.measuring.rig import Rig
 from hilcal.robot.catalogue import configs_dir
 from tests.support.spread_plan import spread_plan
 

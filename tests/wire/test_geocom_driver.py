@@ -8,8 +8,8 @@ import pytest
 
 from drivers.geocom import DEADLINE_S, open_tracker
 from drivers.geocom_line import ANSWER_S
-from hilcal.acquire.devices import TargetLostError
 from hilcal.errors import DeviceError
+from hilcal.measuring.devices import TargetLostError
 from tests.support import sim_serial_cases as simulated
 from tests.support.geocom_cases import cell
 

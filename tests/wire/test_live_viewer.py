@@ -11,7 +11,7 @@ import psutil
 import pytest
 from rerun.chunk import RrdReader
 
-from hilcal.report.viewer.stream import executable
+from hilcal.present.viewer.stream import executable
 from tests.support.campaign_cases import (
     STARVED,
     TRIES,
@@ -35,7 +35,7 @@ URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
 def live_process(run: Run) -> psutil.Process:
     """The process that serves and records."""
     children = psutil.Process(run.process.pid).children(recursive=True)
-    return next(p for p in children if "hilcal.report.live_process" in p.cmdline())
+    return next(p for p in children if "hilcal.present.live_process" in p.cmdline())
 
 
 def drawn(recording: Path) -> int:

@@ -14,8 +14,8 @@ import pytest
 from drivers.simulated import admin
 from drivers.simulated.operator import open_operator as open_simulated
 from drivers.terminal_operator import open_operator as open_terminal
-from hilcal.acquire import devices
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring import devices
 from tests.support.living_cell import config
 from tests.support.paths import ROOT
 

@@ -7,8 +7,8 @@ import pytest
 
 from drivers.geocom import open_tracker
 from drivers.simulated.cell_processes import SimulatedCell
-from hilcal.acquire.devices import PointingTracker, TargetLostError
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
+from hilcal.measuring.devices import PointingTracker, TargetLostError
 from hilcal.robot.catalogue import configs_dir
 from tests.support.cli_cases import run as command
 from tests.support.living_cell import config, world_of

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 from tests.support.campaign_cases import (
     STARVED,
     begin,

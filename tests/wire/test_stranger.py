@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import load_plan
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import load_plan
 from tests.support.campaign_cases import STARVED
 from tests.support.paths import ROOT
 from tests.support.screen import AtTerminal

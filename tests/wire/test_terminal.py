@@ -6,7 +6,7 @@ import pytest
 
 from hilcal.cli.simulating import with_person
 from hilcal.config.write import to_toml
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
 from tests.support.campaign_site import Site
 from tests.support.cli_cases import run

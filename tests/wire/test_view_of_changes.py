@@ -13,8 +13,8 @@ import psutil
 import pytest
 from rerun.chunk import RrdReader
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.report.viewer.stream import executable
+from hilcal.present.viewer.stream import executable
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.bench_cases import BASE, stored
 
 pytestmark = pytest.mark.slow

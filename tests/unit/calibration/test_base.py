@@ -16,10 +16,10 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import corrected
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import UR_JOINTS, frames, ur_kinematics, urdf
-from hilcal.data.readings import States
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.fit import fit
-from hilcal.identify.frames_document import fit_to_json
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.fit import fit
+from hilcal.identification.frames_document import fit_to_json
+from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate

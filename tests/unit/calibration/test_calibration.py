@@ -19,13 +19,13 @@ from hilcal.calibration.poses import band
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.calibration.tool import tool_poses
-from hilcal.data.readings import States
-from hilcal.data.whitening import Mode
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.identify.robot_frames import one_of_each
-from hilcal.model import Model
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.robot_frames import one_of_each
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
+from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate, joint_jacobian

@@ -7,11 +7,11 @@ import pytest
 
 from hilcal.calibration.points import on_branch, read_points
 from hilcal.calibration.urscript import movej_program, program_points, waypoints, with_joints
-from hilcal.data.mapping import find_mapping
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
+from hilcal.tables.mapping import find_mapping
 
 ARM = load_arm("ur10e")
 LOADS = {"10kg": np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])}

@@ -22,8 +22,8 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.effects.protocol import Columns, Parameter, Situation
-from hilcal.identify.robot_frames import one_of_each
-from hilcal.model import Model
+from hilcal.identification.robot_frames import one_of_each
+from hilcal.model.model import Model
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names

@@ -8,12 +8,12 @@ import pytest
 from hilcal.calibration.budget import budget
 from hilcal.calibration.calibration import Calibration
 from hilcal.config import Repeatability
-from hilcal.data.readings import Readings
-from hilcal.data.whitening import Mode
-from hilcal.diagnose.arm_repeatability import RP_PER_RMS
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.full_covariance import joint_factors
+from hilcal.diagnosis.arm_repeatability import RP_PER_RMS
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
 from tests.support.campaigns import Campaign, campaign
 
 TRUE = 1e-5

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from hilcal.cli.configuring import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
-from hilcal.report.text_config import page
+from hilcal.present.text_config import page
 from hilcal.toml import Section, section_of
 from tests.support.cli_cases import ok, refused
 from tests.support.paths import ROOT

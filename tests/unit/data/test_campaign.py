@@ -16,12 +16,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
-from hilcal.data.records import content_hash
-from hilcal.data.revision import RevisionRecord
-from hilcal.data.schema import sqlite_errors
 from hilcal.errors import InputError
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.store.revision import RevisionRecord
+from hilcal.store.schema import sqlite_errors
 from tests.support.readings_cases import assert_same, readings, simple
 
 per_example_file = settings(
@@ -288,7 +288,7 @@ def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
 
 WRITER = """
 import sys
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 with CampaignFile.open(sys.argv[1]) as source:
     readings = source.readings()
 with CampaignFile.open(sys.argv[2]) as run:

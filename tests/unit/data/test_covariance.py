@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hilcal.data.covariance import (
+from hilcal.errors import InputError
+from hilcal.readings.covariance import (
     TrackerNoise,
     covariance_of_mean,
     expected_share_of_mean,
     joint_scatter,
     tracker_covariance,
 )
-from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.types import Floats
 

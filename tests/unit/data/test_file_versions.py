@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.revisions import restore
 from hilcal.cli import main
-from hilcal.data import schema
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.revision import STORED
-from hilcal.data.rows import _reading_crc
 from hilcal.errors import InputError
-from hilcal.revisions import restore
+from hilcal.store import schema
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.revision import STORED
+from hilcal.store.rows import _reading_crc
 from tests.support.paths import ROOT
 from tests.support.unguarded import unguarded
 

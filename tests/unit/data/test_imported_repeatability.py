@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
-from hilcal.data.table import write_table
 from hilcal.errors import InputError
-from hilcal.identify.full_covariance import with_joint_scatter
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import write_table
 from hilcal.types import Floats
 from tests.support.cli_cases import CELL, ok, rehearsal
 

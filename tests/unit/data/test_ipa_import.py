@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.data.covariance import tracker_covariance
-from hilcal.data.ipa_ur10 import COLUMNS, JOINTS, TRACKER, ImportResult, read_ipa_ur10
 from hilcal.errors import InputError
+from hilcal.readings.covariance import tracker_covariance
+from hilcal.tables.ipa_ur10 import COLUMNS, JOINTS, TRACKER, ImportResult, read_ipa_ur10
 from tests.support.readings_cases import make_arm
 
 ARM = make_arm()

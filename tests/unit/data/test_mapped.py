@@ -14,14 +14,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hilcal.data.covariance import TrackerNoise, tracker_covariance
-from hilcal.data.imported import ImportResult
-from hilcal.data.mapped import import_mapped
-from hilcal.data.mapping import Mapping
-from hilcal.data.propose import propose
-from hilcal.data.sniff import sniff
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.guessing.sniff import sniff
+from hilcal.tables.imported import ImportResult
+from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
 

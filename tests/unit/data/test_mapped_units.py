@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.data.covariance import TrackerNoise
-from hilcal.data.mapped import import_mapped
-from hilcal.data.mapping import Mapping
-from hilcal.data.readings import Readings
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.readings import Readings
+from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
 

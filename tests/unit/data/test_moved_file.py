@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.run_log import RunLog
 from hilcal.errors import HilcalError, MovedFileError
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
 from tests.unit.data.test_run_log import STEPS, _campaign, _reading
 
 

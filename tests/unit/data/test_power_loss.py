@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
 from hilcal.errors import InputError
+from hilcal.store.campaign_file import CampaignFile
 from tests.support import power_loss
 from tests.support.paths import ROOT
 from tests.support.readings_cases import assert_same, simple
@@ -14,7 +14,7 @@ from tests.support.readings_cases import assert_same, simple
 WRITER = """
 import os, sys
 from pathlib import Path
-from hilcal.data.campaign_file import CampaignFile
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.readings_cases import simple
 from tests.unit.data.test_campaign import REVISION
 folder = Path(sys.argv[1])

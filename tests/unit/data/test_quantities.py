@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from hilcal.data.quantities import parse_duration, parse_length
 from hilcal.errors import InputError
+from hilcal.tables.quantities import parse_duration, parse_length
 
 
 @pytest.mark.parametrize(

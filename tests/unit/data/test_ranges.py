@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.data.ranges import Range
+from hilcal.readings.ranges import Range
 
 MEASURED = Range("joint 1 angle", "rad", np.radians(-176.0), np.radians(168.0))
 

@@ -10,13 +10,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.data import schema
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Plan, Step, load_plan, read_plan
-from hilcal.data.readings import Readings, States
-from hilcal.data.run_log import PLAN, RunLog
 from hilcal.errors import DeviceError, InputError
 from hilcal.names import escaped
+from hilcal.readings.readings import Readings, States
+from hilcal.store import schema
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step, load_plan, read_plan
+from hilcal.store.run_log import PLAN, RunLog
 
 STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
 MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
@@ -97,9 +97,9 @@ _FILL = """
 import resource, sys
 from pathlib import Path
 from tests.unit.data.test_run_log import _reading
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import Step
-from hilcal.data.run_log import RunLog
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Step
+from hilcal.store.run_log import RunLog
 from hilcal.errors import DeviceError
 path = Path(sys.argv[1])
 with CampaignFile.open(path) as campaign:

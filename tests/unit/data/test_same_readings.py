@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.data.readings import Readings, States
-from hilcal.data.same_readings import already, never_fitted
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.same_readings import already, never_fitted
 
 LOADS = 3
 NOISE_M = 5e-6

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.data import whitening as scaling_module
-from hilcal.data.reading_groups import has_unloaded
-from hilcal.data.readings import Readings
-from hilcal.data.serial_noise import SerialNoise, symmetric_root
-from hilcal.data.whitening import MODES, Mode, whitening
+from hilcal.readings import whitening as scaling_module
+from hilcal.readings.reading_groups import has_unloaded
+from hilcal.readings.readings import Readings
+from hilcal.readings.serial_noise import SerialNoise, symmetric_root
+from hilcal.readings.whitening import MODES, Mode, whitening
 from hilcal.types import Floats
 from tests.unit.data.test_whitening import make_readings, random_readings, spd
 

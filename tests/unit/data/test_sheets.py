@@ -15,16 +15,16 @@ import pytest
 from pyarrow import parquet
 from scipy.io import savemat
 
-from hilcal.data.covariance import TrackerNoise
-from hilcal.data.mapped import import_mapped
-from hilcal.data.mapping import Mapping
-from hilcal.data.mapping_sections import FileFormat
-from hilcal.data.propose import propose
-from hilcal.data.readings import Readings
-from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import Mapping
+from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.sheets import open_grid
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign
 

@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.covariance import TrackerNoise, tracker_covariance
-from hilcal.data.imported import ImportResult
-from hilcal.data.readings import Readings
-from hilcal.data.stated_noise import rounding_variance, step
-from hilcal.data.table import import_table, write_table
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.readings import Readings
+from hilcal.tables.imported import ImportResult
+from hilcal.tables.stated_noise import rounding_variance, step
+from hilcal.tables.table import import_table, write_table
 from tests.support.readings_cases import make_arm, simple
 
 ARM = make_arm()

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from hilcal.data.covariance import TrackerNoise, tracker_covariance
-from hilcal.data.readings import Readings
-from hilcal.data.table import read_table, write_table
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.readings import Readings
+from hilcal.tables.table import read_table, write_table
 from tests.support.readings_cases import assert_same, make_arm, readings, simple
 
 ARM = make_arm()

@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.cell import Cell
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import TrackerNoise
-from hilcal.data.readings import Readings, States
-from hilcal.data.records import content_hash
-from hilcal.data.table import read_table, write_table
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.readings import Readings, States
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import cell_of
 
 NAMES = ("R1", "R2", "R3")

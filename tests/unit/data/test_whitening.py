@@ -1,12 +1,12 @@
-"""Scaling of measurements: the laws of `hilcal.data.whitening`."""
+"""Scaling of measurements: the laws of `hilcal.readings.whitening`."""
 
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from hilcal.data.readings import Readings, States
-from hilcal.data.whitening import (
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import (
     MANY,
     MODES,
     SCALINGS,

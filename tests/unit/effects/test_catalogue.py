@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import hilcal
-from hilcal.diagnose.effect_ranking import candidates
+from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.effects.catalogue import installed
 from hilcal.effects.failure import failure_of
 from hilcal.effects.protocol import Columns, Effect, Parameter, Role
 from hilcal.effects.spec import effect
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.model import Model
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.model.model import Model
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import NAMES
 

@@ -8,7 +8,7 @@ from scipy.integrate import quad_vec
 
 from drivers.simulated import elastic_tree
 from hilcal.effects.link_compliance import long_links
-from hilcal.model import Model
+from hilcal.model.model import Model
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
 from tests.support.arm_cases import arm_of

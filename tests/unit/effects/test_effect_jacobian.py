@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.protocol import Response
-from hilcal.model import Model
+from hilcal.model.model import Model
 from tests.support.effect_cases import (
     CELLS,
     NAMES,

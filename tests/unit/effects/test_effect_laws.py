@@ -9,9 +9,9 @@ from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.protocol import Situation
-from hilcal.model import Model
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
 from tests.support.campaigns import followed, true_parameters
 from tests.support.effect_cases import CELLS, NAMES, make, options_of, situation, some_states
 

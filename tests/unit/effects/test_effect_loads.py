@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.effects.link_mass import LinkMass
 from hilcal.errors import CannotAnswerError
-from hilcal.model import Model
+from hilcal.model.model import Model
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches

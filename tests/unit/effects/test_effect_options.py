@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.model import Model
+from hilcal.model.model import Model
 from tests.support.effect_cases import (
     CELLS,
     NAMES,

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.data.readings import Readings
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.identify.fit import fit
-from hilcal.model import Model
+from hilcal.identification.fit import fit
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings
 from hilcal.robot.statics import Load, slot_wrenches
 from tests.support.arm_cases import slope
 from tests.support.campaigns import campaign, plan

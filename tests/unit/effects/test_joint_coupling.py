@@ -9,9 +9,9 @@ import hilcal as hc
 from hilcal.config.joints import Conventions, Coupling
 from hilcal.effects.joint_coupling import JointCoupling
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import fit
-from hilcal.model import Model
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import fit
+from hilcal.model.model import Model
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
 from tests.support.campaigns import campaign

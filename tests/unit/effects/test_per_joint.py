@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from hilcal.data.records import content_hash
-from hilcal.data.revision import from_text, to_text
+from hilcal.campaign.revisions import restore_model, to_record
 from hilcal.effects.per_joint import PerJoint, joint_groups
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response
 from hilcal.errors import InputError
-from hilcal.identify.baseline import with_effects
-from hilcal.identify.fit import fit
-from hilcal.model import Model
-from hilcal.revisions import restore_model, to_record
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.fit import fit
+from hilcal.model.model import Model
+from hilcal.store.records import content_hash
+from hilcal.store.revision import from_text, to_text
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import (
     CELLS,

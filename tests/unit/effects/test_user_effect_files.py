@@ -9,7 +9,7 @@ from hilcal.effects.catalogue import BUILT_IN
 from hilcal.effects.check import check_effect
 from hilcal.effects.from_file import read_effects
 from hilcal.effects.protocol import Effect
-from hilcal.model import Model
+from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
 from tests.support.cli_cases import ok, refused

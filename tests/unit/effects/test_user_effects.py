@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import WHOLE
-from hilcal.data.readings import Readings
-from hilcal.data.table import write_table
 from hilcal.effects.catalogue import installed
-from hilcal.model import Model
+from hilcal.model.model import Model
+from hilcal.readings.covariance import WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import write_table
 from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan

@@ -7,20 +7,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.readings import Readings
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.fleet.fleet import Fleet
-from hilcal.fleet.members import Failure, Member, entries, member_of
-from hilcal.fleet.pooled import effects_seen, pooled
-from hilcal.identify import posterior_document
-from hilcal.identify.baseline import baseline
-from hilcal.identify.carried import carried_prior
-from hilcal.identify.fit import fit
-from hilcal.identify.posterior import Posterior
-from hilcal.report.charts.fleet import arms_chart
-from hilcal.report.html.fleet import page
+from hilcal.identification import posterior_document
+from hilcal.identification.baseline import baseline
+from hilcal.identification.carried import carried_prior
+from hilcal.identification.fit import fit
+from hilcal.identification.posterior import Posterior
+from hilcal.present.charts.fleet import arms_chart
+from hilcal.present.html.fleet import page
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.transfer.fleet import Fleet
+from hilcal.transfer.members import Failure, Member, entries, member_of
+from hilcal.transfer.pooled import effects_seen, pooled
 from hilcal.types import Floats
 from tests.support.calibrate_process import CELL
 from tests.support.campaigns import (

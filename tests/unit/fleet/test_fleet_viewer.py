@@ -7,14 +7,14 @@ import pytest
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from hilcal.fleet.fleet import Fleet
-from hilcal.fleet.pooled import Pooled, pooled
-from hilcal.identify.posterior import Posterior
-from hilcal.report.viewer import style
-from hilcal.report.viewer.fleet_digest import type_digest
-from hilcal.report.viewer.fleet_scene import places
-from hilcal.report.viewer.fleet_stream import record_fleet
+from hilcal.identification.posterior import Posterior
+from hilcal.present.viewer import style
+from hilcal.present.viewer.fleet_digest import type_digest
+from hilcal.present.viewer.fleet_scene import places
+from hilcal.present.viewer.fleet_stream import record_fleet
 from hilcal.robot.body import capsules
+from hilcal.transfer.fleet import Fleet
+from hilcal.transfer.pooled import Pooled, pooled
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_plan import entities, rgb, rows
 from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readings_of

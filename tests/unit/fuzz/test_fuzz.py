@@ -10,12 +10,12 @@ import pytest
 
 from hilcal.calibration.urscript import program_points
 from hilcal.config import CellConfig
-from hilcal.data.covariance import is_covariance
-from hilcal.data.mapping import load_mapping
-from hilcal.data.plan import read_plan
 from hilcal.errors import HilcalError, InputError
-from hilcal.identify import parameters_document, posterior_document
-from hilcal.identify.rigid_frames import inverse_roots
+from hilcal.identification import parameters_document, posterior_document
+from hilcal.identification.rigid_frames import inverse_roots
+from hilcal.readings.covariance import is_covariance
+from hilcal.store.plan import read_plan
+from hilcal.tables.mapping import load_mapping
 from tests.fuzz import files, harness, stored, wire
 
 FEW = {

@@ -7,7 +7,6 @@ import pytest
 import scipy.optimize as so
 
 from hilcal.cell import Cell
-from hilcal.data.readings import States
 from hilcal.effects.base_compliance import BaseCompliance
 from hilcal.effects.base_frame import BaseFrame
 from hilcal.effects.encoder_offset import EncoderOffset
@@ -20,7 +19,8 @@ from hilcal.effects.protocol import Effect
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.effects.tracker_drift import TrackerDrift
 from hilcal.errors import CannotAnswerError
-from hilcal.model import Model, Prediction
+from hilcal.model.model import Model, Prediction
+from hilcal.readings.readings import States
 from hilcal.robot import batch, chain, se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.deviation import Deviation

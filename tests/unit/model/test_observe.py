@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hilcal.effects.protocol import Columns
-from hilcal.observe import Motion, Observation, motion, observe
-from hilcal.reading_columns import ReadingColumns
+from hilcal.model.observe import Motion, Observation, motion, observe
+from hilcal.model.reading_columns import ReadingColumns
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation

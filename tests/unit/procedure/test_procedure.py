@@ -9,16 +9,16 @@ import hilcal as hc
 from hilcal.calibration.improvement import Improvement
 from hilcal.config.cell import Repeatability
 from hilcal.config.write import to_toml
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.plan import REFERENCE
-from hilcal.data.procedure_log import ProcedureLog
-from hilcal.data.purpose import purpose_of, release
-from hilcal.data.run_log import RunLog
-from hilcal.data.same_readings import already
 from hilcal.errors import InputError
-from hilcal.identify.carried import carried_prior
+from hilcal.identification.carried import carried_prior
 from hilcal.library import load_posterior
 from hilcal.procedure.state import DECIDED, FROZEN
+from hilcal.readings.same_readings import already
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import REFERENCE
+from hilcal.store.procedure_log import ProcedureLog
+from hilcal.store.purpose import purpose_of, release
+from hilcal.store.run_log import RunLog
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
 from tests.unit.test_docs import blocks

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from hilcal.identify.baseline import baseline, with_effects
-from hilcal.identify.fit import Fit, fit
-from hilcal.identify.regularisation import effective_parameters
-from hilcal.identify.validation import validate
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.regularisation import effective_parameters
+from hilcal.identification.validation import validate
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence, spent_by_groups
 from hilcal.regression.schur import eliminate
 from tests.support.campaigns import campaign, measured, noiseless, plan

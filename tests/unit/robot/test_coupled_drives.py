@@ -11,10 +11,10 @@ from drivers.simulated.ur.kinematics import GRAVITY, Kinematics
 from drivers.simulated.world import World
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.data.readings import Readings
 from hilcal.effects.protocol import Situation
-from hilcal.identify.full_covariance import joint_factors
-from hilcal.model import Model
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings
 from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate

@@ -10,16 +10,16 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.joints import Conventions, Coupling
-from hilcal.data.covariance import TrackerNoise
-from hilcal.data.readings import States
-from hilcal.data.table import read_table
+from hilcal.design.draw import draw
+from hilcal.design.feasible import Space
 from hilcal.errors import InputError
-from hilcal.model import Model
-from hilcal.plan.draw import draw
-from hilcal.plan.feasible import Space
+from hilcal.model.model import Model
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
 from hilcal.robot.urdf import arm_from_urdf
+from hilcal.tables.table import read_table
 from tests.support.effect_cases import make
 
 JOINT = """<joint name="j{k}" type="revolute"><parent link="l{k}"/><child link="l{next}"/>

@@ -17,11 +17,11 @@ from scipy.io import savemat
 from drivers.simulated.own_law import check_hash
 from hilcal import limits
 from hilcal.cli import main
-from hilcal.data.mapping import load_mapping
-from hilcal.data.mapping_sections import FileFormat
-from hilcal.data.rows import text_crc
-from hilcal.data.sheets import open_grid
 from hilcal.errors import InputError
+from hilcal.store.rows import text_crc
+from hilcal.tables.mapping import load_mapping
+from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.sheets import open_grid
 from tests.support.unguarded import unguarded
 from tests.unit.data.test_file_versions import HASHED, unpacked
 

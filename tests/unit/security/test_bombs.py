@@ -21,20 +21,20 @@ import pytest
 import hilcal as hc
 from hilcal import limits
 from hilcal.cli import main
-from hilcal.data import parquet_stream
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import INSTRUMENT
-from hilcal.data.grid import Grid, unique
-from hilcal.data.mapping_sections import FileFormat
-from hilcal.data.plan import Plan, Step, load_plan, read_plan
-from hilcal.data.propose import propose
-from hilcal.data.reading_groups import deflection_groups
-from hilcal.data.sheets import open_grid
-from hilcal.data.table import write_table
 from hilcal.errors import InputError
-from hilcal.fleet.members import LIST, entries
-from hilcal.identify import parameters_document
+from hilcal.identification import parameters_document
+from hilcal.readings.covariance import INSTRUMENT
+from hilcal.readings.reading_groups import deflection_groups
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step, load_plan, read_plan
+from hilcal.tables import parquet_stream
+from hilcal.tables.grid import Grid, unique
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.sheets import open_grid
+from hilcal.tables.table import write_table
 from hilcal.toml import parse_json, read_toml, suggest
+from hilcal.transfer.members import LIST, entries
 from tests.support.campaigns import campaign, configuration
 
 HEAD = (

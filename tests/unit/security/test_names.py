@@ -48,27 +48,27 @@ from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.template import cell_text
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.grid import read_text
-from hilcal.data.mapping_sections import FileFormat
-from hilcal.data.plan import Plan, Step, read_plan
-from hilcal.data.plan_csv import plan_csv
-from hilcal.data.proposal import Proposal
-from hilcal.data.rows import text_crc
-from hilcal.data.table import read_table, write_table
-from hilcal.data.tabular import read_parquet, write_columns
-from hilcal.discover.write_effect import source_of_form
+from hilcal.discovery.write_effect import source_of_form
 from hilcal.errors import InputError
-from hilcal.identify import posterior_document
+from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
-from hilcal.report.charts import style as chart_style
-from hilcal.report.charts.readings_drawn import escaped as in_chart
-from hilcal.report.html import page
-from hilcal.report.html.first_screen import FirstScreen
-from hilcal.report.html.parts import Items, Section, Words, chart, table
-from hilcal.report.progress import SafeConsole, counting, working
-from hilcal.report.viewer import style as viewer_style
+from hilcal.present.charts import style as chart_style
+from hilcal.present.charts.readings_drawn import escaped as in_chart
+from hilcal.present.html import page
+from hilcal.present.html.first_screen import FirstScreen
+from hilcal.present.html.parts import Items, Section, Words, chart, table
+from hilcal.present.progress import SafeConsole, counting, working
+from hilcal.present.viewer import style as viewer_style
 from hilcal.robot.catalogue import load_arm
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step, read_plan
+from hilcal.store.rows import text_crc
+from hilcal.tables.grid import read_text
+from hilcal.tables.guessing.proposal import Proposal
+from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.plan_csv import plan_csv
+from hilcal.tables.table import read_table, write_table
+from hilcal.tables.tabular import read_parquet, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, simple
@@ -531,11 +531,11 @@ CALIBRATION: list = []
 
 @pytest.fixture(scope="module", autouse=True)
 def _made(tmp_path_factory: pytest.TempPathFactory):
-    from hilcal.discover import shapes
-    from hilcal.discover.amplitudes import Factor
-    from hilcal.discover.law import Form, Part
-    from hilcal.discover.sites import sites
-    from tests.unit.discover.test_composed import example, named, product
+    from hilcal.discovery import shapes
+    from hilcal.discovery.amplitudes import Factor
+    from hilcal.discovery.law import Form, Part
+    from hilcal.discovery.sites import sites
+    from tests.unit.discovery.test_composed import example, named, product
 
     FOLDER.append(tmp_path_factory.mktemp("names"))
     linear = product(Factor(named(example())["τ_2"], shapes.LINEAR))

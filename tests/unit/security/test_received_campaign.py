@@ -12,11 +12,11 @@ import pytest
 
 from hilcal.calibration.handover import urdf
 from hilcal.config import load_config
-from hilcal.data import rows
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.data.covariance import COVERS, WHOLE
 from hilcal.errors import InputError
+from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.robot.catalogue import load_arm
+from hilcal.store import rows
+from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.cli_cases import run as run_of
 from tests.unit.data.test_campaign import REVISION

@@ -13,8 +13,8 @@ import drivers.simulated
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 
@@ -256,7 +256,7 @@ def test_a_pose_without_an_unloaded_reading_is_refused():
 
 
 def test_the_world_shares_no_physics_with_the_program():
-    allowed = {"hilcal.robot.arm", "hilcal.cell", "hilcal.data.readings", "hilcal.errors",
+    allowed = {"hilcal.robot.arm", "hilcal.cell", "hilcal.readings.readings", "hilcal.errors",
                "hilcal.types"}  # fmt: skip
     files = ("rigid", "elastic_tree", "elasticity", "conditions", "mechanics", "misreading",
              "temperatures", "tracker", "truth", "world", "draw",

@@ -10,12 +10,12 @@ from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.own_law import OwnLaw, own_law, own_names
 from drivers.simulated.rehearsal import check_choice
 from drivers.simulated.world_file import read_world, write_world
-from hilcal.diagnose.stepwise import add
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnosis.stepwise import add
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from tests.support.campaigns import cell_of, configuration, plan
 from tests.support.next_cases import SMALL, first_plan
 from tests.support.user_effect_cases import CLASS, COLUMNS

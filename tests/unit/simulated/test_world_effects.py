@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
-from hilcal.data.readings import States
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.world_cases import frames, moment_beyond

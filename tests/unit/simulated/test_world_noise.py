@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.tracker import SimulatedNoise
-from hilcal.data.readings import States
+from hilcal.readings.readings import States
 from tests.support.example_cell import ur10e_cell
 
 DRAWS = 4000

@@ -11,16 +11,16 @@ import pytest
 import scipy.linalg as sl
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.data.parquet_stream import ReadingStream, open_stream
-from hilcal.data.readings import Readings
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identify import minimise
-from hilcal.identify.fit import Fit, fit
+from hilcal.identification import minimise
+from hilcal.identification.fit import Fit, fit
+from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations
 from hilcal.regression.normal_equations import find_basis
 from hilcal.regression.triangle import Triangle, combined
 from hilcal.stream.fit import StreamFit, fit_stream
+from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats
 from tests.support.cli_cases import ok, refused
 from tests.support.stream_cases import CELL, EFFECTS, NOISE, cell, write

@@ -7,12 +7,12 @@ from drivers.simulated.injected_effects import EFFECTS
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
-from hilcal.data.whitening import MODES, Mode
-from hilcal.diagnose.misfit_breakdown import misfit_breakdown
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import InputError
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
-from hilcal.identify.linearisation import linearise
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import linearise
+from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals

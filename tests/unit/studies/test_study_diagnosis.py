@@ -7,8 +7,8 @@ from collections import Counter
 import pytest
 from rich.console import Console
 
-from hilcal.data.whitening import MODES
 from hilcal.errors import InputError
+from hilcal.readings.whitening import MODES
 from studies.diagnosis import Inside, Outcome, Sample, run_case
 from studies.diagnosis_claims import claims
 from studies.diagnosis_document import document

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from hilcal.data.whitening import whitening
-from hilcal.diagnose.diagnosis import Diagnosis
-from hilcal.diagnose.verdict import diagnose
-from hilcal.identify.baseline import baseline
-from hilcal.identify.fit import fit
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.readings.whitening import whitening
 from studies.study_more import measure_more, suspects
 from tests.unit.studies.test_study_cases import case, config
 

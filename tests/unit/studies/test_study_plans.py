@@ -11,10 +11,10 @@ from rich.console import Console
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.data.readings import Readings, States
+from hilcal.design.noise_model import reading_covariance
 from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.plan.noise_model import reading_covariance
+from hilcal.readings.readings import Readings, States
 from hilcal.types import Floats
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
 from studies.plans_command import SimulatedArm, arms, with_robot

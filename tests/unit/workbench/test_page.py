@@ -10,8 +10,8 @@ import pytest
 from nicegui import ui
 from nicegui.testing import User, user_simulation
 
-from hilcal.diagnose.diagnosis import Reason
-from hilcal.report.verdict_words import HEADLINES
+from hilcal.diagnosis.diagnosis import Reason
+from hilcal.present.verdict_words import HEADLINES
 from hilcal.workbench.page import Shared, View
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import few_effects, stored

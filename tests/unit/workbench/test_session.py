@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign import Campaign
+from hilcal.campaign.campaign import Campaign
 from hilcal.cli.prior import fitted_with
-from hilcal.data.campaign_file import CampaignFile
-from hilcal.diagnose.verdict import diagnose
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identify.carried import carried_prior
-from hilcal.report.diagnosis_document import to_json
-from hilcal.report.two_revisions import left_out_m, two_revisions, verdict_of
+from hilcal.identification.carried import carried_prior
+from hilcal.present.diagnosis_document import to_json
+from hilcal.present.two_revisions import left_out_m, two_revisions, verdict_of
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import BASE, few_effects, stored

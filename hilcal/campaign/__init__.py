@@ -1,0 +1,1 @@
+"""A campaign: its file opened, its revisions, changes of its model."""

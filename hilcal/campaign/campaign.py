@@ -1,0 +1,570 @@
+"""A campaign: its readings with their full covariance, and the fits that were stored in it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.campaign.revisions import (
+    chain,
+    chain_in_cell,
+    check_sources,
+    history,
+    is_again,
+    mode_of,
+    restore,
+    restore_model,
+    restore_predictive,
+    sound,
+    to_record,
+)
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig
+from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
+from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_covariance import (
+    CovarianceParts,
+    covariance_parts,
+    full_readings,
+    with_noise_of,
+)
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
+from hilcal.identification.posterior import Posterior, Source
+from hilcal.identification.predictive import Predictive
+from hilcal.model.model import Model
+from hilcal.names import quoted
+from hilcal.present.build_story import Chapter
+from hilcal.present.diagnosis_document import to_json
+from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode, usual_mode
+from hilcal.refinement import Refinement
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.command_line import typed_now
+from hilcal.store.purpose import refuse_fitting
+from hilcal.store.records import content_hash
+from hilcal.store.revision import CELL, STORED, RevisionRecord
+from hilcal.store.robot_file import ROBOT_FILE, check_robot
+from hilcal.store.run_log import PLAN
+from hilcal.tables.table import with_what_rounding_does, write_table
+from hilcal.types import Floats
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """An open campaign file; close it, or use it in a `with` statement.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     len(run.readings), run.cell.arm.name, run.mode()
+    (50, 'ur10e', 'deflection')
+
+    Attributes:
+        file: the SQLite file, open for appending revisions.
+        config: the cell's configuration.
+        cell: the cell.
+        readings: all readings, with the covariance of instrument, averaging and repeatability.
+        catalogue: the effects that a model of it can have.
+        changes: what is different in the cell from what it was told to be when the readings were
+            taken, see `with_cell`.
+    """
+
+    file: CampaignFile
+    config: CellConfig
+    cell: Cell
+    readings: Readings
+    catalogue: Catalogue
+    changes: Changes
+
+    @classmethod
+    def open(
+        cls, path: str | Path, catalogue: Catalogue | None = None, *, read_only: bool = False
+    ) -> Self:
+        """Open a campaign file; its cell is that of the revision in use.
+
+        Args:
+            path: the file.
+            catalogue: the effects that a model can have; the installed ones unless given.
+            read_only: write nothing to the file, nor beside it.
+
+        Raises:
+            InputError: not a sound campaign, or without readings.
+        """
+        file = CampaignFile.open(path, read_only=read_only)
+        try:
+            number, records = file.accepted(), file.revisions()
+            used = records[-1:] if number is None else records[number - 1 : number]
+            changes = used[0].cell if used else {}
+            return cls._of(file, catalogue or installed(), changes)
+        except BaseException:
+            file.close()
+            raise
+
+    @classmethod
+    def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:
+        config = CellConfig.from_json(file.config_json)
+        try:
+            config = changed(config, changes)
+        except InputError as error:
+            raise InputError(f"{file.path}: a revision is damaged ({error})") from None
+        check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
+        cell = cell_from_config(config, None, file.about(ROBOT_FILE))
+        readings, covers, noise = file.readings(), file.about(COVERS), file.about(NOISE)
+        if _restates(file, changes):
+            readings, covers, noise = with_noise_of(config.tracker, readings), INSTRUMENT, None
+        readings = full_readings(readings, covers, cell, config)
+        readings = replace(readings, noise_stated=noise is None)
+        return cls(file, config, cell, readings, catalogue, changes)
+
+    def at(self, changes: Changes) -> Self:
+        """Return the campaign with what a revision changed in the cell, on the same open file.
+
+        Args:
+            changes: see `RevisionRecord.cell`.
+        """
+        return self if changes == self.changes else self._of(self.file, self.catalogue, changes)
+
+    def with_cell(self, changes: Changes) -> Self:
+        """Return the campaign with a cell that is changed further; the file keeps what it has.
+
+        The noise of the tracker makes the covariances of readings whose table states none, as
+        importing it again would; no other number of a reading changes.
+
+        Args:
+            changes: values by key, by section, of the keys of `config.changes.CHANGEABLE`; None
+                leaves a key out.
+
+        Raises:
+            InputError: a key or a value that is not valid, or one that these readings do not use.
+        """
+        merged = {
+            section: {**self.changes.get(section, {}), **changes.get(section, {})}
+            for section in sorted(self.changes.keys() | changes.keys())
+        }
+        for (section, key), why in self.unchangeable(merged).items():
+            if key in changes.get(section, {}):
+                raise InputError(f"the cell: [{section}] {key} cannot be changed: {why}")
+        changed(self.config, changes)
+        return self.at(merged)
+
+    def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:
+        """Return sections and keys of the cell that these readings do not let change, and why.
+
+        Args:
+            changes: in the cell with all of which they are asked for; those of now where None.
+        """
+        found: dict[tuple[str, str], str] = {}
+        noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
+        if noise is None and self.file.about(FROM) != TRACKER:
+            why = "the covariances of these readings are those that were measured, or of the table"
+            found |= {("tracker", key): why for key in INSTRUMENT_NOISE}
+        covers = INSTRUMENT if _restates(self.file, changes) else self.file.about(COVERS)
+        if covers != INSTRUMENT:
+            more = "; state the noise in [tracker], too" if noise is not None else ""
+            why = f"the covariances of these readings include the arm's scatter already{more}"
+            old = "an older version of hilcal imported these readings; import the table again"
+            found["repeatability", "joint_std_rad"] = why if covers == WHOLE else old
+        if self.file.about(PLAN) is not None and self.config.force_sensor is not None:
+            found["tool", "load_point_m"] = "the force sensor's moments are stored about it"
+        return found
+
+    @property
+    def path(self) -> Path:
+        """The file."""
+        return self.file.path
+
+    @property
+    def covariance_parts(self) -> CovarianceParts:
+        """What the covariance of its readings consists of."""
+        return covariance_parts(self._stated_covers, self.config)
+
+    @property
+    def noise(self) -> NoiseEstimate | None:
+        """The noise as it was estimated at import; None where the table or the cell states it."""
+        if _restates(self.file, self.changes):
+            return None
+        return NoiseEstimate.from_json(self.file.about(NOISE))
+
+    @property
+    def _stated_covers(self) -> str | None:
+        return INSTRUMENT if _restates(self.file, self.changes) else self.file.about(COVERS)
+
+    @property
+    def covers(self) -> str:
+        """What the covariance of `readings` covers, as an exchange table states it."""
+        return INSTRUMENT if self.covariance_parts in ("instrument", "as imported") else WHOLE
+
+    @property
+    def stored_covers(self) -> str:
+        """What the covariance of the file's readings covers, as an exchange table states it.
+
+        A file that does not say is read as it is: where importing would add the arm's scatter, its
+        table says that it is in it.
+        """
+        stored = self._stated_covers
+        if stored is not None:
+            return stored
+        added = covariance_parts(INSTRUMENT, self.config) != "instrument"
+        return WHOLE if added else INSTRUMENT
+
+    @property
+    def data_hash(self) -> str:
+        """SHA-256 of its readings as the file stores them, without those appended since."""
+        return self.file.data_hash(len(self.readings))
+
+    def save_table(self, path: Path, *, as_stored: bool = False) -> None:
+        """Write the readings as an exchange table, CSV or Parquet by the file's name.
+
+        Args:
+            path: the file; one that is there is replaced.
+            as_stored: without the arm's scatter where it was added to their covariance.
+
+        Raises:
+            InputError: the file cannot be written.
+        """
+        about = {"campaign": self.path.name, "source": self.file.source}
+        about["robot"] = self.cell.arm.name
+        readings, covers = self.readings, self.covers
+        if as_stored:
+            readings, covers = self.file.readings(), self.stored_covers
+            about["readings_sha256"] = content_hash(readings)
+            if _restates(self.file, self.changes):
+                readings = with_noise_of(self.config.tracker, readings)
+        write_table(readings, path, with_what_rounding_does(covers, readings), about)
+
+    def close(self) -> None:
+        """Close the file."""
+        self.file.close()
+
+    def __enter__(self) -> Self:
+        """Return the campaign."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file."""
+        self.close()
+
+    def latest(self) -> RevisionRecord | None:
+        """Return the latest revision, if there is any."""
+        records = self.file.revisions()
+        return records[-1] if records else None
+
+    def in_use(self, revision: int | None = None) -> RevisionRecord | None:
+        """Return the revision that is used: as asked, else the accepted, else the latest one.
+
+        Args:
+            revision: its number, where one is asked for.
+
+        Raises:
+            InputError: no such revision.
+        """
+        number = self.file.accepted() if revision is None else revision
+        return self.latest() if number is None else self.file.revision(number)
+
+    def accept(self, revision: int | None) -> None:
+        """Make a revision the one that is used unless another is asked for; None: the latest.
+
+        Raises:
+            InputError: no such revision.
+        """
+        self.file.accept(revision)
+
+    def mode(self) -> Mode:
+        """Kind of readings: that of the revision in use, else as planned and the readings allow."""
+        record = self.in_use()
+        if record is not None:
+            return mode_of(record)
+        return usual_mode(self.readings, self.config.planning.readings)
+
+    def fit(self, revision: int | None = None) -> Fit:
+        """Return a stored fit, found again from its stored parameters.
+
+        Args:
+            revision: its number; the one in use where None, see `in_use`.
+
+        Raises:
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
+        """
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; fit a model and append it first")
+        return self.restore(record)
+
+    def restore(self, record: RevisionRecord) -> Fit:
+        """Return the fit of a stored revision; raises as `fit` does."""
+        check_sources(record, self.path, self.catalogue)
+        self._require_its_cell(record)
+        try:
+            return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
+        except InputError as error:
+            raise InputError(f"{error}{self._until_used(record.number)}") from None
+
+    def _require_its_cell(self, record: RevisionRecord) -> None:
+        if record.cell != self.changes:
+            raise InputError(
+                f"revision {record.number} was fitted in a cell that was changed otherwise than "
+                f"that of the revision in use; use it first: hilcal accept {quoted(self.path)} "
+                f"{record.number}"
+            )
+
+    def require_gc(self, number: int | None, scaling: str, what: str) -> None:
+        """Refuse a fit whose residual is not whitened.
+
+        Args:
+            number: of its revision; None for a baseline that is not kept.
+            scaling: of the fit.
+            what: is to be done with it.
+
+        Raises:
+            InputError: another scaling than gc; says how to get one.
+        """
+        if scaling != "gc":
+            raise InputError(
+                f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
+                f"again{self._until_used(number)}"
+            )
+
+    def _until_used(self, number: int | None) -> str:
+        """Return what a new fit lacks until commands use it in the place of a revision.
+
+        Args:
+            number: of the revision that will not do.
+
+        Returns:
+            Words to go after "run hilcal identify again"; nothing where the latest one is used.
+        """
+        if number is None or number != self.file.accepted():
+            return ""
+        return (
+            f"; revision {number} is accepted: release it, and the latest one is used: "
+            f"hilcal accept {quoted(self.path)} --release"
+        )
+
+    def fitted_readings(self, record: RevisionRecord) -> Readings:
+        """Return the readings that a revision was fitted to; later ones come after them."""
+        self._require_its_cell(record)
+        with sound(record):
+            return self.readings[: int(record.result_json["identify"]["n_readings"])]
+
+    def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
+        """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
+        check_sources(record, self.path, self.catalogue)
+        return restore_model(record, self.cell, self.fitted_readings(record), self.catalogue)
+
+    def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
+        """Return what a stored revision knows of readings that it has not seen."""
+        return restore_predictive(record, model, theta, self.fitted_readings(record))
+
+    def calibration(self, revision: int | None = None) -> Calibration:
+        """Return a stored fit ready for use, see `Calibration`.
+
+        Args:
+            revision: its number; the one in use where None, see `in_use`.
+
+        Raises:
+            InputError: no such revision, or see `fit`.
+        """
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        judged: Mapping[str, Any] = record.result_json.get("diagnose", {})
+        return Calibration.of(
+            self.restore(record),
+            {
+                "campaign": self.path.name,
+                "revision": record.number,
+                "effects": list(record.effects),
+                "verdict": judged.get("verdict"),
+                "readings_sha256": record.data_hash,
+            },
+        )
+
+    def posterior(self, revision: int | None = None) -> Posterior:
+        """Return what a stored fit taught of the arm, which is the prior of another campaign.
+
+        Args:
+            revision: its number; the one in use where None, see `in_use`.
+
+        Raises:
+            InputError: no such revision, see `fit`, or one that is not fitted with scaling gc.
+            CannotAnswerError: its model has no effect of the arm.
+        """
+        record = self.in_use(revision)
+        if record is None:
+            raise InputError(f"{self.path}: no revision yet; run hilcal identify or refine first")
+        source = Source(self.path.name, record.number, record.created)
+        return Posterior.of(self.restore(record), source)
+
+    def history(self, revision: int | None = None) -> History:
+        """Return how the model of a revision was reached, which `diagnose` takes.
+
+        Args:
+            revision: its number; the one in use where None.
+        """
+        record = self.in_use(revision)
+        return history(() if record is None else chain(self.file.revisions(), record.number))
+
+    def append(self, found: Fit | Diagnosis | Refinement) -> int:
+        """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
+
+        What the latest revision, or those that led to it, are already is not stored again.
+
+        Returns:
+            The number of the (last) revision.
+
+        Raises:
+            InputError: it was fitted to other readings than those of this campaign.
+        """
+        if isinstance(found, Refinement):
+            steps = found.steps
+            return self.append_records(
+                [self.record(s.fit, s.diagnosis, s.added, s.removed) for s in steps]
+            )[-1]
+        if isinstance(found, Diagnosis):
+            return self.append_records([self.record(found.fit, found)])[-1]
+        return self.append_records([self.record(found)])[-1]
+
+    def append_records(
+        self, records: Sequence[RevisionRecord], parent: int | None = None
+    ) -> tuple[int, ...]:
+        """Store revisions of which each is made from the one before; returns their numbers.
+
+        Args:
+            records: from `record`; none of them is stored where the latest revision, and those
+                that led to it, are these already.
+            parent: number of the revision that the first one is made from; None for a first model.
+        """
+        if not records:
+            return ()
+        last = chain(self.file.revisions())[-len(records) :]
+        there = last and last[0].made_from == parent and len(last) == len(records)
+        if there and all(map(is_again, records, last)):
+            return tuple(r.number for r in last)
+        numbers: list[int] = []
+        for record in records:
+            before = numbers[-1] if numbers else parent
+            numbers.append(self.file.append_revision(replace(record, parent=before)))
+        return tuple(numbers)
+
+    def store(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None = None,
+        added: str | None = None,
+        removed: str | None = None,
+        parent: int | None = None,
+    ) -> int:
+        """Store a fit, with what was changed in the model since the revision before.
+
+        Args:
+            found: the fit.
+            diagnosis: of it.
+            added: the effect that was added.
+            removed: the effect that was taken out.
+            parent: number of the revision that was changed; the one before where None.
+
+        Returns:
+            The number of the revision.
+
+        Raises:
+            InputError: it was fitted to other readings than those of this campaign, or these are
+                of a validation campaign (`store.purpose`).
+        """
+        return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
+
+    def record(
+        self,
+        found: Fit,
+        diagnosis: Diagnosis | None = None,
+        added: str | None = None,
+        removed: str | None = None,
+        parent: int | None = None,
+    ) -> RevisionRecord:
+        """Return what `store` stores, without storing it; raises as `store` does."""
+        refuse_fitting(self.file)
+        hashed = content_hash(found.readings)
+        if hashed != content_hash(self.readings):
+            raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
+        document = None if diagnosis is None else to_json(diagnosis)
+        record = to_record(found, document, added, hashed, removed, parent)
+        own: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
+        if self.changes:
+            own[CELL] = self.changes
+        return replace(record, options={**record.options, **own})
+
+    def fit_in_use(
+        self, say: Say = lambda text: None, revision: int | None = None
+    ) -> tuple[int | None, Fit]:
+        """Return number and fit of the revision in use; without any, fit the baseline.
+
+        Nothing is stored; the number is None where the baseline was fitted.
+
+        Args:
+            say: takes progress, one line each.
+            revision: number of the revision; see `in_use`.
+
+        Raises:
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
+            CannotAnswerError: the readings do not determine the baseline.
+        """
+        record = self.in_use(revision)
+        if record is not None:
+            say(f"restoring revision {record.number}")
+            return record.number, self.restore(record)
+        refuse_fitting(self.file)
+        model = baseline(self.cell, self.readings, self.mode(), self.catalogue)
+        say(f"fitting {' + '.join(model.names) or 'the nominal arm'}")
+        return None, with_serial_noise(fit(model, self.readings, self.mode()))
+
+    def chapters(self, say: Say = lambda text: None, revision: int | None = None) -> list[Chapter]:
+        """Return the revision in use and those that it was made from, diagnosed; see `view`.
+
+        Without any revision it is the baseline, which is not stored.
+
+        Args:
+            say: takes progress, one line each.
+            revision: number of the revision; see `in_use`.
+
+        Raises:
+            InputError: no such revision, or its readings or effects are not at hand as they were
+                when it was stored.
+        """
+        out = []
+        last = self.in_use(revision)
+        if last is None:
+            _, found = self.fit_in_use(say)
+            say("diagnosing it")
+            return [Chapter(1, None, found, diagnose(found, say=say))]
+        for record in chain_in_cell(self.file.revisions(), last.number):
+            say(f"restoring revision {record.number}")
+            found = self.restore(record)
+            judged = None
+            if found.scaling == "gc":
+                say(f"diagnosing revision {record.number}")
+                judged = diagnose(found, self.history(record.number), say)
+            out.append(Chapter(record.number, record.added, found, judged, record.removed))
+        return out
+
+
+def _restates(file: CampaignFile, changes: Changes) -> bool:
+    """Whether the covariances of readings are made anew of what changed in [tracker]."""
+    keys = changes.get("tracker", {}).keys()
+    if file.about(NOISE) is not None:
+        return not keys.isdisjoint(INSTRUMENT_NOISE)
+    return file.about(FROM) == TRACKER and not keys.isdisjoint((*INSTRUMENT_NOISE, "station_m"))

@@ -1,0 +1,398 @@
+"""Fits as revisions of a campaign file: what is stored, and how the fit comes back."""
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import __version__
+from hilcal.cell import Cell
+from hilcal.diagnosis.diagnosis import History
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.protocol import Effect
+from hilcal.errors import InputError
+from hilcal.identification import fit_document
+from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.predictive import Predictive, predictive
+from hilcal.model.model import Model
+from hilcal.names import quoted
+from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import Readings
+from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
+from hilcal.store.command_line import COMMAND
+from hilcal.store.records import content_hash
+from hilcal.store.revision import STORED, RevisionRecord, to_text
+from hilcal.store.stored_priors import CARRIED
+from hilcal.types import Floats
+
+_LARGEST = 1e9
+"""No parameter and no length of a frame is as large, in SI units."""
+_WIDEST = 1e100
+"""No prior is as wide: its square, times those of whitened rows, is within double precision."""
+SERIAL = "serial_noise"
+"""Key among the parameters of a revision: how its noise is correlated along the order."""
+RANDOM = "random"
+"""Key among the parameters of a revision: its random effects; those that are not among the effects
+of the revision are its background."""
+SOURCES = "effects_from"
+"""Key among the options of a revision: the files that its effects are from."""
+
+
+def to_record(
+    found: Fit,
+    diagnosis: Mapping[str, object] | None,
+    added: str | None,
+    data_hash: str,
+    removed: str | None = None,
+    parent: int | None = None,
+) -> RevisionRecord:
+    """Store a fit: enough to find it again, and what was reported of it.
+
+    Args:
+        found: the fit.
+        diagnosis: its document, see `present.diagnosis_document`, where it was diagnosed.
+        added: the effect that made it from the revision before; without any change a new chain
+            starts.
+        data_hash: `content_hash` of its readings.
+        removed: the effect that was taken out of the revision before.
+        parent: number of the revision that it was made from, where that is not the one before.
+    """
+    effects, cell = found.model.effects, found.model.cell
+    scatter, serial = found.readings.arm_scatter, found.readings.serial
+    result: dict[str, object] = {"identify": fit_document.to_json(found)}
+    if diagnosis is not None:
+        result["diagnose"] = fit_document.plain(diagnosis)
+    return RevisionRecord(
+        effects=found.model.named,
+        added=added,
+        removed=removed,
+        parent=parent,
+        options={
+            "readings": found.mode,
+            "scaling": found.scaling,
+            "effects": {e.name: dict(e.options) for e in effects},
+            **_sources(found.model),
+        },
+        data_hash=data_hash,
+        program_version=__version__,
+        parameters_json={
+            "names": [f"{e.name}.{p.name}" for e in effects for p in e.parameters],
+            "theta": found.theta.tolist(),
+            "std": [fit_document.finite(s) for s in found.uncertainty.std],
+            "prior": [fit_document.finite(s) for s in found.solution.prior],
+            "registration": cell.registration.tolist(),
+            "target": cell.target.tolist(),
+            **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
+            "outliers": np.flatnonzero(found.outlier).tolist(),
+            **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
+            **({} if serial is None else {SERIAL: serial.to_json()}),
+            **({} if found.model.prior is None else {CARRIED: found.model.prior.to_json()}),
+            **_random_to_json(found.model),
+        },
+        result_json=result,
+    )
+
+
+def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
+    """Whether a stored revision holds all of a new one but the time and the command.
+
+    That is the same model, readings, options, program and numbers, exactly; the stored one may be
+    diagnosed where the new one is not.
+    """
+
+    def plain(r: RevisionRecord) -> dict[str, Any]:
+        told = {key: r.result_json.get(key) for key in new.result_json}
+        options = {key: value for key, value in r.options.items() if key != COMMAND}
+        alike = replace(r, options=options, result_json=told, created="", parent=None)
+        return dict(json.loads(to_text(alike)))
+
+    return plain(new) == plain(stored)
+
+
+def _random_to_json(model: Model) -> dict[str, object]:
+    """Key `random`: all effects in order, and the standard deviations of the random ones, SI."""
+    if not model.random:
+        return {}
+    std = {name: values.tolist() for name, values in model.random.items()}
+    return {RANDOM: {"effects": list(model.names), "std": std}}
+
+
+def restore(
+    record: RevisionRecord,
+    cell: Cell,
+    readings: Readings,
+    catalogue: Catalogue | None = None,
+    stored: str | None = None,
+) -> Fit:
+    """Find a stored fit again: the same model from the stored parameters, quickly.
+
+    Args:
+        record: the revision.
+        cell: the cell of the campaign's configuration.
+        readings: all readings of the campaign.
+        catalogue: has its effects; the installed ones unless given.
+        stored: hash of the readings as the file stores them, where there is a file.
+
+    Raises:
+        InputError: readings were appended since, or the record is of another model.
+    """
+    if not _fitted_to(record, readings, stored):
+        raise InputError(
+            f"revision {record.number} was fitted before readings were appended; "
+            "run hilcal identify again"
+        )
+    model, theta = restore_model(record, cell, readings, catalogue)
+    with sound(record):
+        prior = _prior(record)
+        mode, scaling = mode_of(record), scaling_of(record)
+        scatter = record.parameters_json.get("arm_scatter")
+        if scatter is not None:
+            readings = with_arm_scatter(model.cell, readings, ArmScatter.from_json(scatter))
+        serial = record.parameters_json.get(SERIAL)
+        if serial is not None:
+            readings = readings.with_serial(SerialNoise.from_json(serial))
+    return fit(model, readings, mode, scaling, theta, prior)
+
+
+def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -> bool:
+    """Whether a revision was fitted to these readings.
+
+    Revisions of programs before `STORED` have the hash of computed covariances alone, whose last
+    bits are those of the machine that fitted; elsewhere their number of readings has to do. Stored
+    readings cannot be changed, only appended, and each has a checksum.
+    """
+    reported = record.result_json.get("identify")
+    told = reported.get("n_readings") if isinstance(reported, Mapping) else None
+    if told is not None and told != len(readings):
+        return False
+    if stored is not None and stored == record.options.get(STORED):
+        return True
+    if record.data_hash == content_hash(readings):
+        return True
+    return STORED not in record.options and told is not None
+
+
+@contextmanager
+def sound(record: RevisionRecord) -> Iterator[None]:
+    """Say that a revision is damaged where its entries are not what this program stores.
+
+    Raises:
+        InputError: names the revision.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        words = " ".join(str(error).split())[:80]
+        raise InputError(f"revision {record.number} is damaged ({words})") from error
+
+
+def _prior(record: RevisionRecord) -> Floats:
+    """Standard deviations (P,) of the priors of a stored fit; infinite for none."""
+    stored = record.parameters_json["prior"]
+    prior = np.array([np.inf if s is None else float(s) for s in stored], dtype=float)
+    possible = (prior >= 0.0) & ((prior <= _WIDEST) | np.isinf(prior))
+    if len(prior) != len(record.parameters_json["theta"]) or not np.all(possible):
+        raise ValueError("priors that are no standard deviations of its parameters")
+    return prior
+
+
+def restore_model(
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
+) -> tuple[Model, Floats]:
+    """Model and parameters (P,) of a revision, in the cell as it was registered then.
+
+    Args:
+        record: the revision.
+        cell: the cell of the campaign's configuration.
+        readings: the readings that it was fitted to.
+        catalogue: has its effects; the installed ones unless given.
+
+    Raises:
+        InputError: the parameters are not those of the model.
+    """
+    with sound(record):
+        return _restored(record, cell, readings, catalogue)
+
+
+def _restored(
+    record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None
+) -> tuple[Model, Floats]:
+    """Do so; other errors than its own tell of a damaged record."""
+    stored: Mapping[str, Any] = record.parameters_json
+    targets = np.array(stored.get("targets", [stored["target"]]), dtype=float)
+    registration = np.array(stored["registration"], dtype=float)
+    if registration.shape != (4, 4) or targets.shape[1:] != (4, 4):
+        raise ValueError("frames that are none")
+    if not all(_is_frame(frame) for frame in (registration, *targets)):
+        raise ValueError("frames that are none")
+    if len(targets) != len(cell.known_targets):
+        raise InputError(
+            f"revision {record.number} is of {len(targets)} targets, the cell has "
+            f"{len(cell.known_targets)}; run hilcal identify again"
+        )
+    cell = replace(cell.with_targets(targets), registration=registration)
+    options, known = record.options["effects"], catalogue or installed()
+    of_random = stored.get(RANDOM, {"effects": record.effects, "std": {}})
+    names = tuple(of_random["effects"])
+    effects = tuple(known.make(e, cell, readings.states, options.get(e)) for e in names)
+    random = _random(of_random["std"], effects)
+    background = frozenset(names) - frozenset(record.effects)
+    if not background <= random.keys() or not set(record.effects) <= set(names):
+        raise ValueError("a background that is not random")
+    model = Model(cell, effects, known, readings, carried_of(record), random, background)
+    parameters = [f"{e.name}.{p.name}" for e in model.effects for p in e.parameters]
+    if parameters != stored["names"]:
+        raise InputError(
+            f"revision {record.number} was made by hilcal {record.program_version}, whose effects "
+            "have other parameters; run hilcal identify again"
+        )
+    theta = np.array(stored["theta"], dtype=float)
+    if theta.shape != (len(parameters),) or not np.all(np.abs(theta) < _LARGEST):
+        raise ValueError("parameters that are none")
+    return model, theta
+
+
+def _random(stored: Mapping[str, Any], effects: tuple[Effect, ...]) -> dict[str, Floats]:
+    """Standard deviations of the random effects."""
+    size = {e.name: len(e.magnitudes) for e in effects}
+    found = {name: np.array(values, dtype=float) for name, values in stored.items()}
+    for name, std in found.items():
+        if std.shape != (size.get(name),) or not np.all((std > 0) & (std < _LARGEST)):
+            raise ValueError("random effects with standard deviations that are none")
+    return found
+
+
+def _is_frame(frame: Floats) -> bool:
+    """Whether a matrix is a rotation and a translation, to rounding."""
+    turn = frame[:3, :3]
+    return bool(
+        np.all(np.abs(frame) < _LARGEST)
+        and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+        and np.array_equal(frame[3], [0.0, 0.0, 0.0, 1.0])
+    )
+
+
+def carried_of(record: RevisionRecord) -> CarriedPrior | None:
+    """Return the prior of another campaign that a revision was fitted with; None without."""
+    carried = record.parameters_json.get(CARRIED)
+    return None if carried is None else CarriedPrior.from_json(carried)
+
+
+def restore_predictive(
+    record: RevisionRecord, model: Model, theta: Floats, readings: Readings
+) -> Predictive:
+    """Return what a stored fit knows of readings that it has not seen.
+
+    Args:
+        record: the revision.
+        model: its model.
+        theta: (P,) its parameters.
+        readings: all readings that it was fitted to.
+    """
+    stored: Mapping[str, Any] = record.parameters_json
+    with sound(record):
+        prior, mode = _prior(record), mode_of(record)
+        used = np.delete(np.arange(len(readings)), np.array(stored["outliers"], dtype=int))
+        sigma = float(record.result_json["identify"]["error"]["holdout"]["rms_sigma"])
+    return predictive(model, theta, prior, readings[used], mode, sigma)
+
+
+def has_background(record: RevisionRecord) -> bool:
+    """Whether effects that are not named predict with the model of a revision."""
+    every = record.parameters_json.get(RANDOM, {}).get("effects", ())
+    return not set(every) <= set(record.effects)
+
+
+def mode_of(record: RevisionRecord) -> Mode:
+    """Kind of readings of a revision."""
+    return MODES[MODES.index(record.options["readings"])]
+
+
+def scaling_of(record: RevisionRecord) -> Scaling:
+    """Scaling of a revision."""
+    return SCALINGS[SCALINGS.index(record.options["scaling"])]
+
+
+def chain(
+    records: tuple[RevisionRecord, ...], last: int | None = None
+) -> tuple[RevisionRecord, ...]:
+    """Return a revision and those that it was made from, oldest first.
+
+    Args:
+        records: all revisions of a campaign.
+        last: number of the revision; the latest where None.
+    """
+    by_number = {r.number: r for r in records}
+    found: list[RevisionRecord] = []
+    number = max(by_number, default=None) if last is None else last
+    while number in by_number:
+        found.append(by_number[number])
+        number = by_number[number].made_from
+    return tuple(reversed(found))
+
+
+def chain_in_cell(records: tuple[RevisionRecord, ...], last: int) -> tuple[RevisionRecord, ...]:
+    """Return those revisions of a chain that were fitted in the cell of the last one."""
+    found = chain(records, last)
+    return tuple(r for r in found if r.cell == found[-1].cell)
+
+
+def history(records: tuple[RevisionRecord, ...]) -> History:
+    """Return how the model of the last of these revisions was reached.
+
+    Args:
+        records: revisions that were made from each other, oldest first; see `chain`.
+    """
+    if not records:
+        return History()
+    last = records[-1]
+    added = {r.added for r in records}
+    stored: Mapping[str, Any] = last.result_json.get("diagnose", {})
+    return History(
+        added=tuple(name for name in last.effects if name in added),
+        removed=tuple(r.removed for r in records if r.removed is not None),
+        rejected=tuple(stored.get("rejected", ())),
+    )
+
+
+def _sources(model: Model) -> dict[str, dict[str, dict[str, str]]]:
+    """File and hash of those effects that are from files; nothing where none is."""
+    files = {name: model.catalogue.file_of(name) for name in model.names}
+    own = {n: {"file": f.path, "sha256": f.sha256} for n, f in files.items() if f is not None}
+    return {SOURCES: own} if own else {}
+
+
+def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> None:
+    """Refuse a revision whose effects are not at hand as they were when it was fitted.
+
+    Raises:
+        InputError: an effect is not in the catalogue, or its file has changed since.
+    """
+    stored = record.options.get(SOURCES, {})
+    every = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
+    for name in every:
+        then, now = stored.get(name), catalogue.file_of(name)
+        if name not in catalogue.names:
+            where, known = "FILE.py", ""
+            if isinstance(then, dict) and {"file", "sha256"} <= set(then):
+                where = str(then["file"])
+                known = (
+                    f" (SHA-256 {str(then['sha256'])[:16]}…; it is a program, and is run: read it "
+                    "first where somebody sent it)"
+                )
+            raise InputError(
+                f"{run}: revision {record.number} has the effect {name}, which is not in the "
+                f"catalogue{known}; give the file that defines it: --effects-from {quoted(where)}"
+            )
+        if then and now and then["sha256"] != now.sha256:
+            raise InputError(
+                f"{run}: revision {record.number} was fitted with another {name}: {now.path} has "
+                "changed since then; fit again: hilcal identify or refine"
+            )

@@ -1,1 +1,0 @@
-"""States and readings, covariances, the exchange table and the campaign file."""

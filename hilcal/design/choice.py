@@ -1,0 +1,234 @@
+"""Criteria by name, the choice of units, and of the loads that are worth their change."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
+from hilcal.design.candidate_set import CandidateSet
+from hilcal.design.criteria import A, D, MeanVariance
+from hilcal.design.criterion import Criterion
+from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
+from hilcal.design.eigenvalue_criteria import E, K
+from hilcal.design.information import Problem
+from hilcal.design.optimum import Design, best
+from hilcal.design.prediction_poses import PredictionPoses
+from hilcal.design.t_optimality import Separate, condensed
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.types import Bools, Floats, Ints
+
+CRITERIA = ("D", "A", "E", "K", "I", "separate")
+LOOSE = 3e-3
+"""Relative gap at which sets of loads are compared. A choice."""
+EFFORT = 200
+"""Of the exchange search. Read from the demo's plan: 98 % of the bound in a second; more effort
+gains a part per thousand."""
+SAMPLE = 150
+"""Poses by which sets of loads are compared. A choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Objective:
+    """A design problem with its criterion.
+
+    D, A and I are of all parameters, the potential terms with their priors among them; in A and I
+    these are nuisance parameters. E and K are of the model's parameters alone, as the
+    observability indices of the literature are, without those that have a prior.
+
+    Attributes:
+        criterion: φ.
+        units: the units by the parameters that φ is of.
+        prior: (P, P) prior information of these.
+        names: of the parameters; none where they are combinations.
+        apart: the pairs of effects that "separate" is of; None of other criteria.
+    """
+
+    criterion: Criterion
+    units: CandidateSet
+    prior: Floats
+    names: tuple[str, ...]
+    apart: DiscriminatedPairs | None = None
+
+
+def canonical(name: str) -> str:
+    """Return the name of a criterion: I-optimality was called "test" before."""
+    return "I" if name == "test" else name
+
+
+def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> Objective:
+    """Return a design problem with a criterion.
+
+    Args:
+        problem: the design problem.
+        name: one of `CRITERIA`, or "test", the former name of "I".
+        work: the prediction poses, for "I".
+
+    Raises:
+        InputError: an unknown name, or "I" without prediction poses.
+    """
+    name = canonical(name)
+    names = tuple(t.name for t in problem.terms)
+    size = problem.model_size
+    whole = Objective(D(), problem.units, problem.prior, names)
+    if name == "D":
+        return whole
+    if name == "A":
+        return replace(whole, criterion=A(np.arange(size)))
+    if name == "I":
+        if work is None:
+            raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
+        return replace(whole, criterion=MeanVariance(work.matrix(len(names))))
+    if name == "separate":
+        apart = discriminated_pairs(problem)
+        units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)
+        return Objective(Separate(pairs), units, prior, (), apart)
+    if name == "E":
+        return replace(whole, criterion=E(unknown(problem)))
+    if name == "K":  # of the model alone: more information, also of the others, may make it worse
+        free = unknown(problem)
+        own = CandidateSet(np.ascontiguousarray(problem.units.rows[:, :, free]), problem.units.cost)
+        known = problem.measured[np.ix_(free, free)]
+        return Objective(K(), own, known, tuple(names[k] for k in free))
+    raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
+
+
+def unknown(problem: Problem) -> Ints:
+    """Return the indices of the model's parameters that have no prior."""
+    live = problem.nominal.live
+    return np.flatnonzero(np.isinf(problem.nominal.prior_std[live]))
+
+
+def choose(
+    asked: Objective,
+    budget: float,
+    rng: np.random.Generator,
+    effort: int = EFFORT,
+    relaxed: ApproximateDesign | None = None,
+) -> Design:
+    """Return the exact design; see `optimum.best`."""
+    return best(
+        asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort,
+        relaxed=relaxed,
+    )  # fmt: skip
+
+
+def choose_poses(
+    asked: Objective,
+    problem: Problem,
+    usable: Bools,
+    poses: int,
+    rng: np.random.Generator,
+    effort: int = EFFORT,
+) -> Design:
+    """Return the exact design of so many poses, each read once under all that it bears.
+
+    Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
+    readings at any number of poses, under any loads.
+
+    Args:
+        asked: the question, of all units.
+        problem: the design problem.
+        usable: (K,) which units there are to choose from.
+        poses: how many.
+        rng: generator.
+        effort: of the search.
+    """
+    free, index = only(asked, usable), np.flatnonzero(usable)
+    of: dict[int, list[int]] = {}
+    for k, unit in enumerate(index):  # a deflection's unit with all loads holds the others
+        pose, loads = problem.what[unit]
+        mine = of.setdefault(pose, [])
+        if problem.mode == "deflection" and mine:
+            if len(loads) <= len(problem.what[index[mine[0]]][1]):
+                continue
+            mine.clear()
+        mine.append(k)
+    members = list(of.values())
+    height = max(map(len, members)) * free.units.rows.shape[1]
+    rows = np.zeros((len(members), height, free.units.rows.shape[2]))
+    for out, mine in zip(rows, members, strict=True):
+        stacked = free.units.rows[mine].reshape(-1, rows.shape[2])
+        out[: len(stacked)] = stacked
+    units = CandidateSet(rows, np.ones(len(members)))
+    found = best(
+        units, asked.criterion, float(poses), asked.prior, rng,
+        most=-(-poses // max(len(members), 1)), names=asked.names, effort=effort,
+    )  # fmt: skip
+    counts = np.zeros(len(index), dtype=np.int64)
+    for mine, count in zip(members, found.counts.tolist(), strict=True):
+        counts[mine] = count
+    cost = float(counts @ free.units.cost)
+    relaxed = relax(
+        free.units, asked.criterion, cost, asked.prior, names=asked.names, tolerance=LOOSE
+    )
+    bound = max(relaxed.bound, found.value)
+    return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
+
+
+def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
+    """Return the units that a plan is likely to be made of, those of the best prices, and why."""
+    tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
+    found = relax(
+        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=tolerance
+    )
+    count = min(2 * len(found.index), len(asked.units))
+    best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
+    return np.union1d(found.index, best_first[:count]), found
+
+
+def costly_loads(
+    asked: Objective, problem: Problem, budget: float, change: float, rng: np.random.Generator
+) -> tuple[tuple[str, float], ...]:
+    """Return loads without which the same time buys more, with the gain as a share of φ.
+
+    Hanging a load costs as much time as so many readings; a plan without it takes these
+    instead. Compared are the continuous optima over some of the poses, one load after the other.
+
+    Args:
+        asked: the question.
+        problem: the design problem.
+        budget: readings of the plan with all loads.
+        change: readings that fit into the time of one load change.
+        rng: generator.
+    """
+    poses = np.array([pose for pose, _ in problem.what])
+    few = rng.permutation(len(problem.candidates))[:SAMPLE]
+    sample = np.isin(poses, few)
+    used = {name for _, names in problem.what for name in names}
+    keep = tuple(name for name in problem.candidates.loads[1:] if name in used)
+    costly: list[tuple[str, float]] = []
+    if len(keep) < 2 or change <= 0:
+        return ()
+    now = _value(asked, problem, sample, keep, budget)
+    while len(keep) > 1 and now > 0:
+        tried = [
+            (_value(asked, problem, sample, tuple(k for k in keep if k != name), budget + change),
+             name)
+            for name in keep
+        ]  # fmt: skip
+        value, name = max(tried)
+        if not value > now * (1.0 + LOOSE):
+            break
+        costly.append((name, value / now - 1.0))
+        keep, now, budget = tuple(k for k in keep if k != name), value, budget + change
+    return tuple(costly)
+
+
+def only(asked: Objective, wanted: Bools) -> Objective:
+    """Return the question with some of the units."""
+    return replace(asked, units=CandidateSet(asked.units.rows[wanted], asked.units.cost[wanted]))
+
+
+def _value(
+    asked: Objective, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
+) -> float:
+    """φ of the continuous optimum; 0 where these loads do not determine everything."""
+    allowed = {*loads, problem.candidates.loads[0]}
+    some = only(asked, sample & np.array([set(names) <= allowed for _, names in problem.what]))
+    try:
+        found = relax(
+            some.units, some.criterion, budget, some.prior, names=some.names, tolerance=LOOSE
+        )
+    except (CannotAnswerError, InputError):
+        return 0.0
+    return float(found.value)

@@ -1,0 +1,200 @@
+"""The protocol of a design criterion: concave in the information, with a smooth surrogate."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from hilcal.design.candidate_set import CandidateSet
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.regression.schur import DETERMINED
+from hilcal.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Root:
+    """A semidefinite matrix L Lᵀ (P, P), where its root is known.
+
+    Attributes:
+        matrix: (P, r) L.
+    """
+
+    matrix: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smooth:
+    """A smooth concave function f near a monotone function of the criterion φ, at one M.
+
+    With H_k = A_kᵀ A_k, the second derivative by the weights of units k and l is
+
+        Σ c · tr(X H_k Y H_l) over products (c, X, Y) + Σ c · tr(V H_k) tr(V H_l) over squares
+
+    Attributes:
+        value: f(M).
+        gradient: (P, P) of f.
+        products: terms of its curvature.
+        squares: terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a
+            stands for Σ C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l).
+        above: (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
+        below: or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N).
+    """
+
+    value: float
+    gradient: Floats
+    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]
+    squares: tuple[tuple[float | Floats, Floats], ...]
+    above: Floats
+    below: Floats | None = None
+
+
+class Criterion(Protocol):
+    """φ(M) of an information matrix M (P, P): more is better.
+
+    Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only
+    the ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
+    """
+
+    @property
+    def name(self) -> str:
+        """Name by which a configuration calls it."""
+
+    @property
+    def monotone(self) -> bool:
+        """Whether more information is never worse."""
+
+    @property
+    def kinked(self) -> bool:
+        """Whether φ has kinks, so that the surrogate depends on its order."""
+
+    def value(self, m: Floats) -> Floats:
+        """Return φ of (..., P, P) information matrices; 0 where they are singular."""
+
+    def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
+        """Return f near M = m, which tends to a function of φ alone as `order` tends to 0.
+
+        It is near φ / φ(m), or log φ, so that its changes are relative. It returns None for
+        an M at which it does not exist.
+        """
+
+    def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Criterion":
+        """Return φ without what is decided: equal near the optimum of the plans of a budget."""
+        return self
+
+    def require(self, m: Floats, names: Sequence[str] | None) -> None:
+        """Refuse an M, the information of all candidates, that does not determine φ.
+
+        Raises:
+            CannotAnswerError: names the parameters that no candidate determines.
+        """
+        require_determined(m, names)
+
+
+def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
+    """Refuse a singular information matrix, and name what is not determined.
+
+    Args:
+        m: (P, P) of all candidates, and of what is known before.
+        names: of the P parameters; numbers from 1 by default.
+
+    Raises:
+        CannotAnswerError: a direction of parameters that no candidate determines.
+    """
+    label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
+    diagonal = np.diag(m)
+    blind = np.flatnonzero(diagonal <= 0.0)
+    if len(blind):
+        raise CannotAnswerError(
+            f"no candidate changes with {_listed([label[int(k)] for k in blind])}; allow "
+            "other poses or loads, or leave it out of the model"
+        )
+    root = np.sqrt(diagonal)
+    values, vectors = np.linalg.eigh(m / np.outer(root, root))
+    if values[0] > DETERMINED:
+        return
+    share = np.abs(vectors[:, 0])
+    inside = np.flatnonzero(share > 0.1 * share.max())
+    raise CannotAnswerError(
+        "no candidate separates "
+        f"{_listed([label[int(k)] for k in inside[np.argsort(-share[inside])]])}; allow other "
+        "poses or loads, or leave one of them out of the model"
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    """Return the first few names."""
+    more = f" and {len(names) - 6} more" if len(names) > 6 else ""
+    return ", ".join(names[:6]) + more
+
+
+def inverse(m: Floats) -> tuple[Floats, float] | None:
+    """Return the inverse of M and log det M; None where M is not positive definite."""
+    try:
+        factor = np.linalg.cholesky(m)
+    except np.linalg.LinAlgError:
+        return None
+    part = np.linalg.inv(factor)
+    found = part.T @ part
+    if not np.isfinite(found).all():
+        return None
+    return found, float(2.0 * np.log(np.diag(factor)).sum())
+
+
+def factors(m: Floats) -> tuple[Floats, Bools]:
+    """Return Cholesky factors of (N, P, P) matrices, and which (N,) of them are regular.
+
+    A pivot is what is left of a parameter's information when those before it are unknown; in
+    place of zero, rounding leaves about 1e-16 P of it.
+    """
+    try:
+        factor = np.linalg.cholesky(m)
+    except np.linalg.LinAlgError:
+        if len(m) == 1:
+            return np.eye(m.shape[-1])[None], np.zeros(1, dtype=np.bool_)
+        parts = [factors(one[None]) for one in m]
+        return np.concatenate([f for f, _ in parts]), np.concatenate([good for _, good in parts])
+    pivots = np.diagonal(factor, axis1=1, axis2=2) ** 2
+    left = 0.1 * DETERMINED * np.diagonal(m, axis1=1, axis2=2)
+    good = np.all(pivots > left, axis=1) & np.isfinite(factor).all(axis=(1, 2))
+    return np.asarray(factor, dtype=np.float64), np.asarray(good, dtype=np.bool_)
+
+
+def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
+    """Smooth least of numbers s: F = max over t of t + μ Σ log((s_i − t) / μ).
+
+    Its derivatives p_i = μ / (s_i − t) are over 0 and sum to 1, so that min s' ≤ Σ p_i s'_i for
+    any other numbers s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
+
+    Returns:
+        F, and (n,) p.
+    """
+    least = float(values.min())
+    gap = values - least
+    # d = least − t lies in [μ, n μ]; 1/Σ 1/(gap + d) is concave in d: Newton goes up to its root
+    d = width
+    for _ in range(60):
+        inverse_gap = 1.0 / (gap + d)
+        total = float(inverse_gap.sum())
+        step = (width * total - 1.0) * total / float(inverse_gap @ inverse_gap)
+        d = min(d + step, len(values) * width)
+        if abs(step) <= 1e-14 * d:
+            break
+    p = width / (gap + d)
+    value = least - d - width * float(np.log(p).sum())
+    return value, np.asarray(p / p.sum())
+
+
+def square(m: Floats, what: str, size: int | None = None) -> Floats:
+    """Return a finite symmetric (P, P) matrix.
+
+    Raises:
+        InputError: it is not one.
+    """
+    m = np.asarray(m, dtype=float)
+    p = m.shape[-1] if size is None and m.ndim else size
+    if m.shape != (p, p) or not np.isfinite(m).all():
+        raise InputError(f"{what} of shape {m.shape}; valid: a finite ({p}, {p}) matrix")
+    if not np.allclose(m, m.T, rtol=1e-8, atol=1e-12 * float(np.abs(m).max(initial=0.0))):
+        raise InputError(f"{what} is not symmetric")
+    return 0.5 * (m + m.T)

@@ -1,0 +1,197 @@
+"""Pairs of effects that a campaign is to discriminate, and the power of doing so.
+
+An effect e with the parameters β is there; the model and a rival f are fitted. The test of e beyond
+both follows a noncentral χ² of non-centrality
+
+    λ = βᵀ S β,   S = M_ee − M_en M_nn⁻ M_ne,   n: the model and f
+
+with as many degrees of freedom as S has visible directions (`regression.power`). S at the readings
+so far is the one that a diagnosis tests e with, with f in its model.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.design.approximate_design import relax
+from hilcal.design.effect_estimate import estimate
+from hilcal.design.information import Problem
+from hilcal.design.t_optimality import Pair, Separate
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.linearisation import linearise
+from hilcal.regression.power import family_power
+from hilcal.regression.schur import schur_complement
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Floats
+
+LEVEL = 0.01
+"""Chance of a false alarm of the test."""
+DRAWS = 3
+MANY = 100
+"""Readings by which a pair counts as not separable ..."""
+LEAST_POWER = 0.2
+"""... where the best plan of so many has less power than this. Guesses, both."""
+_LOOSE = 0.05
+_SEED = 20240609
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DiscriminatedPairs:
+    """Pairs of effects to discriminate.
+
+    Attributes:
+        pairs: as the criterion takes them.
+        names: (effect that is there, rival that is fitted) of each pair.
+        prior: (P, P) information before, without the priors of potential terms: neither must
+            an effect be found by what was supposed of it, nor a rival be held small.
+        not_separable: names of the pairs that no measurement separates; they are left out.
+    """
+
+    pairs: tuple[Pair, ...]
+    names: tuple[tuple[str, str], ...]
+    prior: Floats
+    not_separable: tuple[tuple[str, str], ...] = ()
+
+
+def discriminated_pairs(
+    problem: Problem,
+    suspects: Sequence[str] | None = None,
+    fitted: Mapping[str, Floats] | None = None,
+) -> DiscriminatedPairs:
+    """Return the pairs of suspects, both ways round, that some measurement separates.
+
+    None does where the best of all plans of `MANY` readings, with the prior information, has a
+    power below `LEAST_POWER`: for the first of the parameters of the effect that is there.
+
+    Args:
+        problem: with all suspects among its potential terms.
+        suspects: at least two effects; all families of the problem by default.
+        fitted: parameters (D, E) of suspects, SI: D possible values; one vector (E,) will do. By
+            default those that the readings so far support, see `supported_parameters`. Of the
+            others a few directions are drawn (always the same), each of an RMS strength of 1 σ of
+            a measured element over all units.
+
+    Raises:
+        InputError: fewer than two suspects, or one that is not among the potential terms.
+        CannotAnswerError: no pair can be separated.
+    """
+    known = tuple(e.name for e in problem.families)
+    names = known if suspects is None else tuple(dict.fromkeys(suspects))
+    for name in names:
+        if name not in known:
+            valid = ", ".join(known) or "none"
+            raise InputError(f"{name} is not among the potential terms; valid: {valid}")
+    if len(names) < 2:
+        raise InputError(f"{len(names)} effects to tell apart; valid: two or more")
+    given = dict(supported_parameters(problem, DRAWS) if fitted is None else fitted)
+    pairs, both = [], []
+    for e in names:
+        where = problem.of_effect(e)
+        betas = _directions(problem, e)
+        if e in given:
+            betas = [x / problem.scale[where] for x in np.atleast_2d(given[e])]
+        for f in names:
+            if f != e:
+                pairs += [pair_of(problem, (e, f), beta) for beta in betas]
+                both += [(e, f)] * len(betas)
+    prior, size = problem.measured.copy(), problem.model_size
+    prior[:size, :size] = problem.prior[:size, :size]
+    return _separable(problem, DiscriminatedPairs(tuple(pairs), tuple(both), prior))
+
+
+def pair_of(problem: Problem, names: tuple[str, str], beta: Floats) -> Pair:
+    """Return a pair of an effect with the parameters β, in the problem's units, and a rival."""
+    effect, rival = names
+    nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(rival)])
+    return Pair(problem.of_effect(effect), beta, nuisance, f"{effect} from {rival}")
+
+
+def supported_parameters(problem: Problem, count: int) -> dict[str, Floats]:
+    """Return (count, E) parameters of the families that the readings so far support, SI.
+
+    Draws from their posterior, its mean first; see `effect_estimate`.
+    """
+    fit, out = problem.nominal.fit, {}
+    if fit is None:
+        return {}
+    linear = linearise(fit)
+    for family in problem.families:
+        found = estimate(linear, family)
+        if found is not None and found.supported:
+            out[family.name] = found.draws(count, np.random.default_rng(_SEED))
+    return out
+
+
+def _separable(problem: Problem, of: DiscriminatedPairs) -> DiscriminatedPairs:
+    """Leave out the pairs that no measurement separates."""
+    spread = of.prior + problem.units.information(
+        np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
+    )
+    not_separable = []
+    for names in dict.fromkeys(of.names):
+        pair = of.pairs[of.names.index(names)]
+        if power(pair, spread) < LEAST_POWER and _best_power(problem, of, pair) < LEAST_POWER:
+            not_separable.append(names)
+    keep = [k for k, names in enumerate(of.names) if names not in not_separable]
+    if not keep:
+        raise CannotAnswerError(not_separable_message(not_separable))
+    pairs, both = tuple(of.pairs[k] for k in keep), tuple(of.names[k] for k in keep)
+    return DiscriminatedPairs(pairs, both, of.prior, tuple(not_separable))
+
+
+def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
+    """Name the pairs that no measurement separates."""
+    named: dict[str, list[str]] = {}
+    for e, f in pairs:
+        if e not in named.get(f, ()):
+            named.setdefault(e, []).append(f)
+    each = [f"{e} from {' or '.join(fs)}" for e, fs in named.items()]
+    return f"no measurement in this cell separates {', nor '.join(each)}"
+
+
+def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
+    """Say of pairs (effect that is there, rival) that no measurement rules out the rival."""
+    named: dict[str, list[str]] = {}
+    for e, f in pairs:
+        named.setdefault(e, []).append(f)
+    each = [f"{' or '.join(fs)} where {e} is there" for e, fs in named.items()]
+    return (
+        f"no measurement in this cell rules out {', nor '.join(each)}: {MANY} of the best readings "
+        f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
+    )
+
+
+def _best_power(problem: Problem, of: DiscriminatedPairs, pair: Pair) -> float:
+    """Power of the best plan of `MANY` readings for one pair."""
+    try:
+        found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
+    except CannotAnswerError:
+        return LEVEL
+    return power(pair, found.information)
+
+
+def power(pair: Pair, information: Floats) -> float:
+    """Return the power of the test at 1 % of the effect beyond model and rival.
+
+    Args:
+        pair: the effect, and what is fitted.
+        information: (P, P) of a plan, with `DiscriminatedPairs.prior`.
+    """
+    s = schur_complement(information, pair.effect, pair.nuisance)
+    return family_power(s, pair.beta, LEVEL)
+
+
+def _directions(problem: Problem, effect: str) -> list[Floats]:
+    """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
+    where = problem.of_effect(effect)
+    rows = problem.units.rows[:, :, where]
+    elements = problem.nominal.elements * sum(
+        len([name for name in loads if name != UNLOADED or problem.mode == "absolute"])
+        for _, loads in problem.what
+    )
+    flat = rows.reshape(-1, len(where))
+    gram = flat.T @ flat / elements
+    rng = np.random.default_rng(_SEED)
+    drawn = rng.standard_normal((DRAWS, len(where)))
+    return [d / np.sqrt(float(d @ gram @ d)) for d in drawn]

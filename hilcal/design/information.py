@@ -1,0 +1,264 @@
+"""The design problem: information and cost of each unit of measurement."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.design.candidate_set import CandidateSet
+from hilcal.design.candidates import (
+    Candidates,
+    ReadingDerivatives,
+    absolute_rows,
+    candidates,
+    deflection_rows,
+    reading_derivatives,
+)
+from hilcal.design.nominal_model import NominalModel
+from hilcal.design.potential import Potential, potential
+from hilcal.design.prior_information import information_of
+from hilcal.effects.protocol import Effect
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.readings.whitening import Mode
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Bools, Floats, Ints
+
+PAIRS_UP_TO = 4
+"""Pairs of loads are units of their own where there are no more loads than this. A choice."""
+MOST_BYTES = 600_000_000
+"""Memory that the rows of all units may take. A choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A parameter of the problem.
+
+    Attributes:
+        effect: canonical name of its effect.
+        name: as identification prints it, e.g. "joint_compliance.j1".
+        unit: physical unit, SI.
+        scale: what one unit of the problem's parameter is, SI: an ordinary magnitude, or τ of
+            a potential term.
+        value: at which it is assumed, SI.
+        potential: whether it belongs to an effect that is not in the model.
+    """
+
+    effect: str
+    name: str
+    unit: str
+    scale: float
+    value: float
+    potential: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Problem:
+    """Everything that a plan is chosen by.
+
+    Attributes:
+        nominal: the model that is planned for.
+        mode: "deflection" or "absolute".
+        candidates: the states.
+        units: K units; their parameters are those of the model, then potential terms.
+        what: pose and loads of each unit; "none" is the unloaded reading of absolute positions,
+            that of deflections goes without saying.
+        terms: the P parameters.
+        families: effects of the potential terms.
+        prior: (P, P) what is known before: priors, and what was measured already.
+        measured: (P, P) the part of it that was measured already.
+        notes: what was assumed and left out, one line each.
+    """
+
+    nominal: NominalModel
+    mode: Mode
+    candidates: Candidates
+    units: CandidateSet
+    what: tuple[tuple[int, tuple[str, ...]], ...]
+    terms: tuple[Term, ...]
+    families: tuple[Effect, ...]
+    prior: Floats
+    measured: Floats
+    notes: tuple[str, ...]
+
+    @property
+    def model_size(self) -> int:
+        """Number of the model's parameters, which come first."""
+        return sum(not t.potential for t in self.terms)
+
+    @property
+    def scale(self) -> Floats:
+        """(P,) what one unit of each parameter is, SI."""
+        return np.array([t.scale for t in self.terms])
+
+    def of_effect(self, name: str) -> Ints:
+        """Indices of an effect's parameters."""
+        return np.flatnonzero([t.effect == name for t in self.terms])
+
+    def information(self, counts: Floats) -> Floats:
+        """(P, P) information of a plan that takes unit k counts[k] times, prior included."""
+        taken = np.flatnonzero(counts)
+        weight = np.asarray(counts, dtype=float)[taken]
+        return np.asarray(self.prior + self.units.information(weight, taken))
+
+
+def problem(
+    nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
+) -> Problem:
+    """Return the design problem of candidate poses under the loads of a cell.
+
+    A unit of absolute positions is one reading. A unit of deflections is a pose with its
+    unloaded reading and some loads: each by itself, all that the pose bears, and pairs where
+    there are few loads. It costs as many readings as it takes, the unloaded one included.
+
+    Args:
+        nominal: the model.
+        config: loads, noise, and `[planning]`: kind of readings, potential terms.
+        q: (N, n) candidate poses, rad.
+        allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.
+
+    Raises:
+        InputError: an unknown effect; deflections without any load; too many candidates.
+        CannotAnswerError: no state is allowed.
+    """
+    mode = config.planning.readings
+    if mode == "deflection" and not config.loads:
+        raise InputError(
+            '[planning] readings = "deflection" needs [[loads]]; give one, or readings = "absolute"'
+        )
+    of = candidates(nominal, config, q, allowed)
+    against = potential(nominal, config, of) if len(of) else Potential((), (), ())
+    terms = _terms(nominal, against)
+    scale = np.array([t.scale for t in terms])
+    layout = _layout(of, mode, nominal.elements, len(terms))
+    rows = np.zeros((len(layout.what), layout.height, len(terms)))
+    for part in reading_derivatives(nominal, config, of, against.effects, scale):
+        for place, block in _blocks(part, layout, mode):
+            rows[place, : block.shape[1]] = block
+    measured = information_of(nominal, against.effects, scale)
+    count = len(nominal.live)
+    precision = np.ones(len(terms))
+    precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
+    return Problem(
+        nominal=nominal,
+        mode=mode,
+        candidates=of,
+        units=CandidateSet(rows, layout.cost),
+        what=layout.what,
+        terms=terms,
+        families=against.effects,
+        prior=measured + np.diag(precision),
+        measured=measured,
+        notes=(*nominal.notes, *against.notes, *layout.notes),
+    )
+
+
+def _terms(nominal: NominalModel, against: Potential) -> tuple[Term, ...]:
+    model = [(e.name, p) for e in nominal.model.effects for p in e.parameters]
+    known = [
+        Term(effect, f"{effect}.{p.name}", p.unit, p.scale, float(nominal.theta[k]), False)
+        for k, (effect, p) in enumerate(model)
+        if k in set(nominal.live.tolist())
+    ]
+    extra = [(e.name, p) for e in against.effects for p in e.parameters]
+    return tuple(known) + tuple(
+        Term(effect, f"{effect}.{p.name}", p.unit, float(tau), 0.0, True)
+        for (effect, p), tau in zip(extra, against.scale, strict=True)
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Layout:
+    """Where the units lie: pose by pose, those of one pose in the order of `subsets`.
+
+    Attributes:
+        first: (N,) index of a pose's first unit.
+        pattern: (N,) index into `subsets`.
+        subsets: per pattern, the loads of each unit, as indices from 0.
+        height: most rows of a unit.
+    """
+
+    first: Ints
+    pattern: Ints
+    subsets: tuple[tuple[tuple[int, ...], ...], ...]
+    height: int
+    what: tuple[tuple[int, tuple[str, ...]], ...]
+    cost: Floats
+    notes: tuple[str, ...]
+
+
+def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
+    """Decide on the units; fewer kinds of them where memory would not do.
+
+    Raises:
+        CannotAnswerError: no unit is left.
+        InputError: too many candidates.
+    """
+    patterns, pattern = np.unique(of.allowed, axis=0, return_inverse=True)
+    pattern = pattern.reshape(-1)
+    tally = np.bincount(pattern, minlength=len(patterns))
+    notes: tuple[str, ...] = ()
+    kinds = (
+        ({"each"},) if mode == "absolute" else ({"each", "pairs", "all"}, {"each", "all"}, {"all"})
+    )
+    for wanted in kinds:
+        subsets = tuple(tuple(_subsets(np.flatnonzero(p), mode, wanted)) for p in patterns)
+        height = m * max((len(s) for some in subsets for s in some), default=0)
+        count = sum(int(n) * len(some) for n, some in zip(tally, subsets, strict=True))
+        need = 8 * count * height * size
+        if need <= MOST_BYTES:
+            break
+        notes = (f"{len(of)} candidates: loads are not combined in every way, for memory",)
+    else:
+        raise InputError(
+            f"{len(of)} candidate poses with {size} parameters need {need / 1e9:.1f} GB; lower "
+            "[planning] candidates, or plan against fewer effects"
+        )
+    if not count:
+        raise CannotAnswerError(
+            "no candidate pose may be taken"
+            + (" both unloaded and under a load" if mode == "deflection" else "")
+        )
+    per_pose = np.array([len(some) for some in subsets])[pattern]
+    of_pose = [subsets[k] for k in pattern]
+    what = tuple(
+        (pose, tuple(of.loads[k] for k in s)) for pose, some in enumerate(of_pose) for s in some
+    )
+    unloaded = 1.0 if mode == "deflection" else 0.0
+    cost = np.array([len(loads) + unloaded for _, loads in what])
+    return _Layout(np.cumsum(per_pose) - per_pose, pattern, subsets, height, what, cost, notes)
+
+
+def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, ...]]:
+    """Yield the loads of each unit of a pose; `allowed` are indices of loads, 0 is unloaded."""
+    if mode == "absolute":
+        yield from ((int(k),) for k in allowed)
+        return
+    if 0 not in allowed:
+        return
+    loads = [int(k) for k in allowed if k > 0]
+    if "each" in kinds:
+        yield from ((k,) for k in loads)
+    if "pairs" in kinds and 2 < len(loads) <= PAIRS_UP_TO:
+        yield from combinations(loads, 2)
+    if len(loads) > 1 or (loads and "each" not in kinds):
+        yield tuple(loads)
+
+
+def _blocks(part: ReadingDerivatives, layout: _Layout, mode: Mode) -> Iterator[tuple[Ints, Floats]]:
+    """Yield units of a chunk of poses and their rows."""
+    pattern, first = layout.pattern[part.rows], layout.first[part.rows]
+    single = absolute_rows(part) if mode == "absolute" else np.empty(0)
+    for p in np.unique(pattern):
+        mine = np.flatnonzero(pattern == p)
+        for k, loads in enumerate(layout.subsets[p]):
+            if mode == "absolute":
+                yield first[mine] + k, single[mine, loads[0]]
+            else:
+                yield first[mine] + k, deflection_rows(part, mine, loads)
+
+
+def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...]:
+    """Loads of all readings of a unit, the unloaded one of a deflection included."""
+    return what[1] if mode == "absolute" else (UNLOADED, *what[1])

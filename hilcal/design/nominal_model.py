@@ -1,0 +1,332 @@
+"""The nominal model of a plan: what will be fitted, at ordinary parameters."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell, tracker_place
+from hilcal.config import CellConfig
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.options import Options
+from hilcal.effects.protocol import Effect
+from hilcal.effects.written import read_effects_text
+from hilcal.errors import InputError
+from hilcal.identification.carried import CarriedPrior, check_arm
+from hilcal.identification.coordinates import coordinates_of
+from hilcal.identification.drift import least
+from hilcal.identification.fit import Fit
+from hilcal.identification.priors import prior_of
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
+from hilcal.types import Floats, Ints
+
+DISTANCE = 2.0
+"""Reaches from the base to a tracker whose place is not given. A choice."""
+FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
+"""In deflections the frames act only by turning them; they are known from the positions, about
+as well as the arm's elastic sag lets them be."""
+DURATION_S = 3600.0
+LOAD_TIMES_S = (5.0, 100.0)
+TEMPERATURES = (25.0, 35.0)
+"""Of joints that warm up while they are measured, °C."""
+_SEED = 20240607
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NominalModel:
+    """The model that is planned for.
+
+    Attributes:
+        model: frames where unknown, and effects; its cell has a tracker in its place.
+        theta: (P,) parameters, SI.
+        live: (L,) indices of the parameters that are not held at zero.
+        prior_std: (P,) prior standard deviations, infinite where nothing is known, SI.
+        station: (3,) where the beam starts, sensor axes, m.
+        m: elements of a reading: 3 or 6.
+        fit: of what has been measured already; None at first.
+        notes: what was assumed, one line each.
+        carried: (L, L) information of a prior that is carried over from another campaign, 1/SI²;
+            None without one. Those parameters have no other prior.
+    """
+
+    model: Model
+    theta: Floats
+    live: Ints
+    prior_std: Floats
+    station: Floats
+    m: int
+    fit: Fit | None
+    notes: tuple[str, ...]
+    carried: Floats | None = None
+
+    @property
+    def elements(self) -> int:
+        """Elements that are read in one arrival: m of each target."""
+        return self.m * len(self.cell.all_targets)
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, registered."""
+        return self.model.cell
+
+
+def nominal_model(
+    cell: Cell,
+    config: CellConfig,
+    m: int = 3,
+    catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
+) -> NominalModel:
+    """Return the model of `[planning]` with ordinary parameters.
+
+    What is planned hardly depends on the parameters: deflections are linear in them to about
+    1e-3. Those of the baseline's effects are ordinary, all others zero.
+
+    Args:
+        cell: the cell as configured.
+        config: its configuration.
+        m: 3 for positions, 6 for poses.
+        catalogue: the effects that a model can have; the installed ones unless given.
+        prior: what another campaign taught. Its effects are in the model, too, but for families
+            that share a prior, which a plan is not made for unless they are named, and those that
+            need what a plan does not fix.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones), or a prior of another arm.
+    """
+    known = catalogue or installed()
+    place, given = nominal_tracker_place(cell, config)
+    notes = []
+    if not given:
+        notes.append(
+            f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
+            "(give [sight] tracker_m)"
+        )
+    registered, station = _registered(cell, config, place)
+    frames = known.unknown_frames(cell)
+    wanted = {name: dict[str, object]() for name in frames} | planned_effects(config, known)
+    learnt = {} if prior is None else _learnt(prior, registered, known, m)
+    wanted = {name: options or learnt.get(name, {}) for name, options in wanted.items()}
+    wanted |= {name: o for name, o in learnt.items() if name not in wanted}
+    framed = FRAME_PRIOR if config.planning.readings == "deflection" else {}
+    effects = tuple(
+        build(known, name, registered, m, {**(framed if name in frames else {}), **options})
+        for name, options in wanted.items()
+    )
+    model = Model(registered, effects, known, prior=prior)
+    parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
+    notes += random_columns(effects)
+    theta = np.concatenate(parts)
+    prior_std = _prior_std(model)
+    if prior is not None:
+        s = prior.posterior.source
+        called = f"{s.campaign}: " if s.campaign else ""
+        notes.append(f"planned with what is known already ({called}{s.n_readings} readings)")
+    live = np.arange(model.size)
+    carried = carried_information(model, live)
+    return NominalModel(model, theta, live, prior_std, station, m, None, tuple(notes), carried)
+
+
+def _learnt(
+    prior: CarriedPrior, cell: Cell, catalogue: Catalogue, m: int
+) -> dict[str, dict[str, object]]:
+    """Return the effects of a prior that a plan takes in, with their options."""
+    check_arm(prior, cell.arm)
+    plain = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
+    found = {}
+    for e in prior.posterior.effects:
+        if catalogue[e.name].computable(plain):
+            options = dict(e.options)
+            if build(catalogue, e.name, cell, m, options).groups() is None:
+                found[e.name] = options
+    return found
+
+
+def carried_information(model: Model, live: Ints) -> Floats | None:
+    """Return the information (L, L) of a model's carried prior on its live parameters, 1/SI²."""
+    if model.prior is None:
+        return None
+    if model.prior.drift is None:
+        model = replace(model, prior=model.prior.with_drift(least(model.prior)))
+    of = coordinates_of(model)
+    known = of.inverse[of.std == 1.0]
+    whole = np.zeros((model.size, model.size))
+    whole[np.ix_(of.index, of.index)] = known.T @ known
+    return whole[np.ix_(live, live)]
+
+
+def after(fit: Fit, config: CellConfig) -> NominalModel:
+    """Return the model and the parameters of what has been measured already.
+
+    Args:
+        fit: the newest revision of the campaign.
+        config: the configuration of the cell that is planned for.
+
+    Raises:
+        InputError: a fit whose residual is not whitened, or an effect that needs what a plan
+            does not determine, as a temperature.
+    """
+    if fit.scaling != "gc":
+        raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
+    cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
+    _, station = _registered(cell, config, nominal_tracker_place(cell, config)[0])
+    # The fit weighs its priors against the noise factor β.
+    std = np.where(np.isinf(prior), np.inf, prior / np.sqrt(fit.solution.beta))
+    std[fit.solution.space.index] = np.inf
+    names = " + ".join(fit.model.names)
+    count = len(fit.readings) - int(fit.outlier.sum())
+    notes = (
+        f"planned on from {count} readings, fitted with {names}",
+        *random_columns(fit.model.effects),
+    )
+    live = np.flatnonzero(fit.solution.estimated)
+    carried = carried_information(fit.model, live)
+    m = fit.readings.m
+    return NominalModel(fit.model, fit.theta, live, std, station, m, fit, notes, carried)
+
+
+def build(
+    catalogue: Catalogue, name: str, cell: Cell, m: int, options: Options | None = None
+) -> Effect:
+    """Make an effect for a plan: set up for the first and the last reading, in one pose."""
+    once = nominal_states(np.zeros((1, cell.arm.n)), np.zeros((1, 6)))
+    states = replace(once[np.zeros(2, dtype=int)], time=np.array([0.0, DURATION_S]))
+    return catalogue.make(name, cell, states, options, m)
+
+
+def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
+    """Say of which effects a plan has to guess what they need, one line each.
+
+    Raises:
+        InputError: an effect that needs what a plan does not determine, as a temperature.
+    """
+    known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
+    for e in effects:
+        if not type(e).computable(known):
+            raise InputError(
+                f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not fix; leave "
+                "it out"
+            )
+    return tuple(
+        f"{e.name}: {', '.join(e.needs)} of the readings taken at random, as a shuffled order "
+        "would give them"
+        for e in effects
+        if e.needs
+    )
+
+
+def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[str, object]]:
+    """Return the effects of `[planning] model`, by name, with the options written behind them.
+
+    Each is written as for `identify --effects`, e.g. "joint_compliance(joints=2-6)".
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones), or options that cannot be read.
+    """
+    try:
+        return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
+    except InputError as error:
+        raise InputError(f"[planning] model: {error}") from None
+
+
+def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
+    """Return the names of effects, each once.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones).
+    """
+    for name in names:
+        try:
+            catalogue[name]
+        except InputError as error:
+            raise InputError(f"[planning] {key}: {error}") from None
+    return tuple(dict.fromkeys(names))
+
+
+def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
+    """Refuse effects of a configuration that cannot be planned with, before anything is done.
+
+    Raises:
+        InputError: an unknown effect in `[planning] model` or `against` or in `[plausible]` (lists
+            the valid ones), options that cannot be read, or an effect that needs what a plan does
+            not fix.
+    """
+    try:
+        model = nominal_model(cell, config, catalogue=catalogue).model
+    except InputError as error:
+        words = str(error)
+        known = words.startswith("[planning]")
+        raise InputError(words if known else f"[planning] model: {words}") from None
+    potential_names(config, model)
+    for name in config.plausible:
+        try:
+            catalogue[name]
+        except InputError as error:
+            raise InputError(f"[plausible]: {error}") from None
+
+
+def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
+    """Names of the effects of `[planning] against`, without those of the model.
+
+    Of the whole catalogue those are left out that need what only the order of a plan determines, as
+    the time or the side of approach.
+
+    Raises:
+        InputError: an unknown effect (lists the valid ones).
+    """
+    asked = config.planning.against
+    if asked == "catalogue":
+        names = tuple(kind.name for kind in model.catalogue.effects if not kind.needs)
+    else:
+        names = checked(asked, "against", model.catalogue)
+    return tuple(name for name in names if name not in model.names)
+
+
+def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]:
+    """Return where the tracker stands, (3,) base axes in m, and whether that is configured."""
+    place, reach = tracker_place(cell, config), cell.arm.reach
+    if place is not None:
+        return place, True
+    return np.array([DISTANCE * reach, 0.0, 0.5 * reach]), False
+
+
+def nominal_states(q: Floats, wrench: Floats) -> States:
+    """Return states (N) with times, temperatures and sides, as a shuffled order would have them.
+
+    Args:
+        q: (N, n) joint angles, rad.
+        wrench: (N, 6) at the load point, base axes, N and N·m.
+    """
+    rng = np.random.default_rng(_SEED)
+    time = rng.uniform(0.0, DURATION_S, len(q))
+    approach = rng.choice([-1.0, 1.0], q.shape)
+    return States(
+        q=q,
+        wrench=wrench,
+        time=time,
+        load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
+        joint_temperature=rng.uniform(*TEMPERATURES, q.shape),
+        approach=approach,
+    )
+
+
+def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:
+    """Cell with a registration, and the beam's start (3,) in sensor axes."""
+    if config.tracker.frame == "base":
+        return cell, place
+    if cell.registration_known:
+        return cell, np.zeros(3)
+    registration = np.eye(4)
+    registration[:3, 3] = -place
+    return replace(cell, registration=registration), np.zeros(3)
+
+
+def _prior_std(model: Model) -> Floats:
+    """(P,) what effects know of their parameters; a shrunk family is ordinary."""
+    prior, groups = prior_of(model)
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    return np.asarray(np.where(groups >= 0, scale, prior))
+
+
+def _metres(x: Floats) -> str:
+    return "[" + ", ".join(f"{v:.2g}" for v in x) + "] m"

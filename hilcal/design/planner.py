@@ -1,0 +1,287 @@
+"""From a cell to a plan: candidates, loads, the optimum with its certificate, and the order."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.design.choice import (
+    EFFORT,
+    Objective,
+    canonical,
+    choose,
+    choose_poses,
+    costly_loads,
+    only,
+    promising,
+)
+from hilcal.design.compound_criteria import compound_objective
+from hilcal.design.draw import Drawn, draw
+from hilcal.design.feasible import Space
+from hilcal.design.information import Problem, problem, readings_of
+from hilcal.design.noise_model import reading_covariance
+from hilcal.design.nominal_model import after, nominal_model
+from hilcal.design.optimum import Design
+from hilcal.design.predicted import Predicted, predicted
+from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
+from hilcal.design.timing import pace
+from hilcal.design.undetermined import Undetermined, without_undetermined
+from hilcal.effects.catalogue import Catalogue
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.fit import Fit
+from hilcal.identification.registration import MIN_POSES
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Bools, Floats, Ints
+
+HOMES = 4
+"""Central poses of which one becomes the reference. A choice."""
+PROBES = 60
+"""Poses by which the reference is judged. A choice."""
+SAMPLE = 50
+"""Poses by which the noise of a reading is judged. A choice."""
+ROUNDS = 6
+"""How often poses that are not reached from the reference may be replaced. A choice."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Size and criterion of a plan.
+
+    Attributes:
+        poses: just so many, each read once unloaded and under every load that it bears.
+        readings: or this many readings, those at the reference and repeats not counted, spread
+            over as many poses, and under those loads, as determine most.
+        criterion: of `[planning]` where None.
+        effort: of the search for whole numbers.
+        unloaded: "around" or "first", see `Ordering`.
+    """
+
+    poses: int = 20
+    readings: int | None = None
+    criterion: str | None = None
+    effort: int = EFFORT
+    unloaded: Literal["around", "first"] = "around"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned:
+    """A plan with its design problem.
+
+    Attributes:
+        ordered: the plan in order, with what the order costs.
+        design: the units that were chosen, with the certificate.
+        costly: loads that cost more than they tell, with what leaving each out would gain.
+        problem: the design problem.
+        asked: the design problem with its criterion.
+        usable: (K,) which units were to choose from.
+        work: the prediction poses.
+        drawn: the candidates.
+        budget: readings of the design.
+        criterion: name of the criterion.
+        predicted: standard uncertainties that a fit to the readings will have.
+        undetermined: parameters of the model that no reading of the cell determines.
+        asked_poses: poses that were asked for, see `Request`; None where readings were.
+    """
+
+    ordered: Ordered
+    design: Design
+    costly: tuple[tuple[str, float], ...]
+    problem: Problem
+    asked: Objective
+    usable: Bools
+    work: PredictionPoses
+    drawn: Drawn
+    budget: float
+    criterion: str
+    predicted: Predicted
+    undetermined: tuple[Undetermined, ...]
+    asked_poses: int | None
+
+    @property
+    def counts(self) -> Floats:
+        """(K,) how often each unit of the problem is taken."""
+        out = np.zeros(len(self.problem.units))
+        out[np.flatnonzero(self.usable)] = self.design.counts
+        return out
+
+
+def make(
+    cell: Cell,
+    config: CellConfig,
+    request: Request,
+    rng: np.random.Generator,
+    known: Fit | None = None,
+    say: Say = lambda words: None,
+    catalogue: Catalogue | None = None,
+    prior: CarriedPrior | None = None,
+) -> Planned:
+    """Return the plan.
+
+    Args:
+        cell: the cell.
+        config: limits, loads, noise, and `[planning]`: what it is for.
+        request: how many readings, and the criterion.
+        rng: generator.
+        known: fit of what has been measured already.
+        say: progress callback.
+        catalogue: the effects that a model can have; the installed ones unless given, or those
+            of `known`.
+        prior: what another campaign taught, where nothing has been measured yet.
+
+    Raises:
+        InputError: numbers or names that cannot be.
+        CannotAnswerError: the cell leaves too few states, its readings determine nothing of the
+            model, or they are too few; names the constraint or the parameter.
+    """
+    criterion = canonical(request.criterion or config.planning.criterion)
+    say("drawing candidate poses")
+    space = Space(cell, config)
+    drawn = draw(space, config.planning.candidates, rng, least=2)
+    home, poses = _reference(space, drawn, rng)
+    drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
+    say("computing the information of each pose")
+    if known is None:
+        model = nominal_model(cell, config, 3, catalogue, prior)
+    else:
+        model = after(known, config)
+    of, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
+    work = prediction_poses(of.nominal, config, drawn.q, space.clear)
+    budget = _budget(request, of)
+    asked = compound_objective(of, criterion, work, budget, rng)
+    whole = request.readings is None
+    costly: tuple[tuple[str, float], ...] = ()
+    if whole:
+        say("weighing what each load costs")
+        seconds = pace(config)
+        costly = costly_loads(asked, of, budget, seconds.change_s / seconds.reading_s, rng)
+    say(f"choosing poses by criterion {criterion}")
+    pose_of = np.array([pose for pose, _ in of.what])
+    first, relaxed = promising(asked, budget)
+    usable = ~np.isin(pose_of, _unreachable(space, of, home, first))
+    reached: set[int] = set()
+    for left in reversed(range(ROUNDS)):
+        if not left:  # of those that were chosen before, enough are reached
+            usable &= np.isin(pose_of, [*reached])
+        if whole:
+            design = choose_poses(asked, of, usable, request.poses, rng, request.effort)
+        else:
+            optimum = relaxed.among(usable)
+            design = choose(only(asked, usable), budget, rng, request.effort, optimum)
+        units = np.flatnonzero(usable)[np.flatnonzero(design.counts)]
+        lost = _unreachable(space, of, home, units)
+        if not len(lost):
+            break
+        usable &= ~np.isin(pose_of, lost)
+        reached |= {of.what[k][0] for k in units} - set(lost.tolist())
+    else:
+        raise CannotAnswerError(
+            f"after {ROUNDS} rounds there are still poses that no clear straight motion from the "
+            "reference pose reaches; widen the workspace"
+        )
+    visited = len({of.what[k][0] for k in units}) + 1
+    if not cell.registration_known and known is None and visited < MIN_POSES:
+        raise CannotAnswerError(
+            f"the plan has {visited} poses, the reference among them; an unknown registration "
+            f"needs at least {MIN_POSES}: ask for more {'poses' if whole else 'readings'}"
+        )
+    say("ordering the readings")
+    counts = np.zeros(len(usable), dtype=np.int64)
+    counts[np.flatnonzero(usable)] = design.counts
+    ordered = _ordered(space, of, home, counts, rng, request.unloaded)
+    knows = predicted(of, counts.astype(float), work=work)
+    return Planned(
+        ordered, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
+        undetermined, request.poses if whole else None,
+    )  # fmt: skip
+
+
+def _budget(request: Request, of: Problem) -> float:
+    """Readings that are to be taken."""
+    if request.readings is not None:
+        if request.readings < 1:
+            raise InputError(f"{request.readings} readings; valid: a whole number from 1")
+        return float(request.readings)
+    if request.poses < 1:
+        raise InputError(f"{request.poses} poses; valid: a whole number from 1")
+    return float(request.poses * len(of.candidates.loads))
+
+
+def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Floats, Ints]:
+    """Return the reference (n,), where every load can hang, and which other poses are left.
+
+    It is central, and of some such poses the one from which most others are reached.
+    """
+    every = np.asarray(drawn.allowed.any(axis=0))  # loads that are of use at all
+    bears = np.flatnonzero(drawn.allowed[:, every].all(axis=1))
+    if not len(bears):
+        raise CannotAnswerError(
+            "no pose bears every load, so there is none to change them at; leave out a load "
+            "or widen [limits]"
+        )
+    q = drawn.q[bears]
+    nearest = bears[np.argsort(np.linalg.norm(q - np.median(drawn.q, axis=0), axis=1))]
+    usable = [name for name, used in zip(drawn.loads, every, strict=True) if used]
+    begins = (k for k in nearest if space.begins(drawn.q[k], usable))
+    central = list(islice(begins, HOMES))
+    if not central:
+        raise CannotAnswerError(
+            "no pose that bears every load can be approached; widen [limits] or the room around"
+        )
+    probes = drawn.q[rng.permutation(len(drawn.q))[:PROBES]]
+    reached = [int(space.passable(drawn.q[k], probes, UNLOADED).sum()) for k in central]
+    home = int(central[int(np.argmax(reached))])
+    return drawn.q[home], np.delete(np.arange(len(drawn.q)), home)
+
+
+def _unreachable(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+    """Return the poses among the chosen units that the arm cannot go to straight from home."""
+    wanted: dict[str, set[int]] = {}
+    for k in units:
+        pose, loads = of.what[k]
+        for load in readings_of((pose, loads), of.mode):
+            wanted.setdefault(load, set()).add(pose)
+    lost: set[int] = set()
+    for load, poses in wanted.items():
+        which = np.array(sorted(poses))
+        good = space.passable(home, of.candidates.q[which], load)
+        lost |= set(which[~good].tolist())
+    return np.array(sorted(lost), dtype=np.int64)
+
+
+def _ordered(
+    space: Space,
+    of: Problem,
+    home: Floats,
+    counts: Ints,
+    rng: np.random.Generator,
+    unloaded: Literal["around", "first"],
+) -> Ordered:
+    """Name the chosen poses, and put their readings in order."""
+    taken = np.flatnonzero(counts)
+    poses = sorted({of.what[k][0] for k in taken})
+    name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
+    chosen = [
+        Chosen(name[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k])) for k in taken
+    ]
+    repeats = max(2, len(poses) // 10)
+    how = Ordering(unloaded=unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    q = of.candidates.q[poses]
+    return order_plan(
+        space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how
+    )
+
+
+def _reading_std(space: Space, of: Problem) -> float:
+    """Typical standard uncertainty of a reading in one coordinate, m."""
+    model, theta = of.nominal.model, of.nominal.theta
+    some = of.candidates[slice(0, SAMPLE)].states()
+    covariance = reading_covariance(of.nominal, space.config, model.predict(some, theta))
+    return float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))

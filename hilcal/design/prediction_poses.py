@@ -1,0 +1,155 @@
+"""Prediction poses, where the robot will work, and the derivative of its position there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.design.nominal_model import NominalModel, nominal_states
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.robot.chain import evaluate
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Bools, Floats
+
+COUNT = 100
+"""Prediction poses that are drawn where the configuration names none. A choice."""
+_DRAWN = 4096
+_ROUNDS = 60
+_SEED = 20240608
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PredictionPoses:
+    """T states at which the position, or the deflection, is predicted.
+
+    Attributes:
+        q: (T, n) joint angles, rad.
+        derivative: (T, 3, L) V, by the model's live parameters in their scales, m.
+        what: in words, e.g. "deflection under 5kg at 100 poses".
+    """
+
+    q: Floats
+    derivative: Floats
+    what: str
+
+    def matrix(self, size: int) -> Floats:
+        """Return C (size, size), the mean of VᵀV, m²; zero for parameters beyond the model's.
+
+        tr(C Cov) is the mean square of the error of the predicted position.
+        """
+        live = self.derivative.shape[2]
+        v = self.derivative.reshape(-1, live)
+        out = np.zeros((size, size))
+        out[:live, :live] = v.T @ v / len(self.q)
+        return out
+
+    def std(self, covariance: Floats) -> Floats:
+        """Return (T,) standard deviations of the position, sqrt(tr(V Cov Vᵀ)), m.
+
+        Args:
+            covariance: (L, L) of the model's live parameters, in their scales.
+        """
+        variance = np.einsum("tip,pq,tiq->t", self.derivative, covariance, self.derivative)
+        return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def prediction_poses(
+    nominal: NominalModel,
+    config: CellConfig,
+    feasible: Floats,
+    may: Callable[[Floats], Bools] | None = None,
+) -> PredictionPoses:
+    """Return the test poses of `[planning]`: named, within a box, or of the candidates.
+
+    In deflections it is the deflection under `work_load` that is predicted; under "none" there
+    is no deflection, and it is that under each of the loads in turn.
+
+    Args:
+        nominal: the model that is planned for.
+        config: `[planning] work_*`, loads.
+        feasible: (N, n) states that are feasible, rad; test poses are drawn from them.
+        may: predicate of feasible states (N, n), for a box that needs more of them.
+
+    Raises:
+        InputError: joint vectors of the wrong length; no load to work under.
+        CannotAnswerError: no feasible pose with the target in the box; no feasible state.
+    """
+    q, where = _poses(nominal, config, feasible, may)
+    cell, planning = nominal.cell, config.planning
+    pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+    deflection = planning.readings == "deflection"
+    if planning.work_load == UNLOADED:
+        wanted = pulls if deflection else {UNLOADED: np.zeros(6)}
+        under = "each load" if deflection else ""
+    elif planning.work_load in pulls:
+        wanted, under = {planning.work_load: pulls[planning.work_load]}, planning.work_load
+    else:
+        valid = ", ".join((UNLOADED, *pulls))
+        raise InputError(f"[planning] work_load = {planning.work_load!r}; valid: {valid}")
+    if not wanted:
+        raise InputError('[planning] readings = "deflection" needs [[loads]]')
+    unloaded = _positions(nominal, q, np.zeros(6)) if deflection else np.zeros(1)
+    derivative = [_positions(nominal, q, pull) - unloaded for pull in wanted.values()]
+    what = ("deflection" if deflection else "position") + (f" under {under}" if under else "")
+    return PredictionPoses(
+        np.tile(q, (len(wanted), 1)), np.concatenate(derivative), f"{what} {where}"
+    )
+
+
+def _positions(nominal: NominalModel, q: Floats, pull: Floats) -> Floats:
+    """Derivative (T, 3, L) of the target's position under a wrench (6,)."""
+    model, theta, live = nominal.model, nominal.theta, nominal.live
+    states = nominal_states(q, np.broadcast_to(pull, (len(q), 6)))
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])[live]
+    return np.asarray(model.jacobian(model.predict(states, theta), theta, 3, live) * scale)
+
+
+def _poses(
+    nominal: NominalModel,
+    config: CellConfig,
+    feasible: Floats,
+    may: Callable[[Floats], Bools] | None,
+) -> tuple[Floats, str]:
+    """Test poses (T, n), and where they are in words."""
+    planning, cell = config.planning, nominal.cell
+    n = cell.arm.n
+    if planning.work_q_rad:
+        q = np.array(planning.work_q_rad, dtype=float)
+        if q.shape[1] != n:
+            raise InputError(
+                f"[planning] work_q_rad has joint vectors of {q.shape[1]} values; {cell.arm.name} "
+                f"has {n} joints"
+            )
+        return q, f"at {len(q)} named poses"
+    rng = np.random.default_rng(_SEED)
+    if planning.work_min_m is None or planning.work_max_m is None:
+        if not len(feasible):
+            raise CannotAnswerError("no feasible state to test a plan at")
+        chosen = rng.permutation(len(feasible))[:COUNT]
+        return feasible[np.sort(chosen)], f"at {len(chosen)} feasible poses"
+    box = np.array(planning.work_min_m), np.array(planning.work_max_m)
+    found = _inside(nominal, feasible, *box)
+    low = np.maximum(cell.arm.q_min, -np.pi) + config.limits.joint_margin_rad
+    high = np.minimum(cell.arm.q_max, np.pi) - config.limits.joint_margin_rad
+    for _ in range(_ROUNDS if may is not None else 0):
+        if len(found) >= COUNT:
+            break
+        drawn = cell.arm.complete(rng.uniform(low, high, (_DRAWN, n)))
+        drawn = _inside(nominal, drawn, *box)
+        if may is not None and len(drawn):
+            found = np.concatenate([found, drawn[may(drawn)]])
+    if not len(found):
+        raise CannotAnswerError(
+            f"no feasible pose holds the target between work_min_m = {box[0].tolist()} and "
+            f"work_max_m = {box[1].tolist()}; widen the box or move it within reach"
+        )
+    chosen = rng.permutation(len(found))[:COUNT]
+    return found[np.sort(chosen)], f"at {len(chosen)} poses in the work box"
+
+
+def _inside(nominal: NominalModel, q: Floats, low: Floats, high: Floats) -> Floats:
+    """Those of the states (N, n) whose target lies in a box, base axes."""
+    cell = nominal.cell
+    at = evaluate(cell.arm, q).point(cell.target[:3, 3])
+    return np.asarray(q[np.all((at >= low) & (at <= high), axis=1)])

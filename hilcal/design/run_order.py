@@ -1,0 +1,359 @@
+"""The order in which chosen readings are taken: short, and little correlated with drift."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.design import tour
+from hilcal.design.confounding import Confounding, confounding
+from hilcal.design.load_blocks import Block, Stop, assembled, load_order
+from hilcal.design.passages import Passable, Ways, ways
+from hilcal.design.timing import Duration, Pace, pace, timeline
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan
+from hilcal.types import Floats
+
+_SHRINK = 0.75  # of the time given to the walks, where a draw became too long; a choice
+_TRIES = 10  # draws of one order that may become too long; a choice
+_MOVES = 30  # steps of a random walk per stop; a choice: each stop is moved many times
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Readings to take at a pose.
+
+    Attributes:
+        pose: its name.
+        loads: under which loads, "none" among them where it is measured unloaded.
+        count: how often all of it; each time is a cycle of its own.
+    """
+
+    pose: str
+    loads: tuple[str, ...]
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Ordering:
+    """How to order.
+
+    Attributes:
+        slack: share of the shortest campaign that may be spent on a random order; 0 for the
+            shortest order. With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and
+            no further for 30 %.
+        unloaded: "around" takes half of the unloaded readings before the loads and half after,
+            "first" all before: deflections are then known while the loads are measured.
+        reference_every_s: longest time between two readings at the reference pose, s.
+        repeats: poses that are measured unloaded a second time, for the arm's repeatability.
+        draws: random orders of which the least confounded is taken.
+        drift: rate of the drift that figures are stated for, in one coordinate, m/s. There is
+            no figure for all cells; 20 µm/h is a tenth of the drift that the effect
+            `tracker_drift` takes as ordinary in a campaign of an hour.
+        reading_std: standard uncertainty of a reading in one coordinate, m.
+    """
+
+    slack: float = 0.05
+    unloaded: Literal["around", "first"] = "around"
+    reference_every_s: float = 900.0
+    repeats: int = 2
+    draws: int = 16
+    drift: float = 20e-6 / 3600
+    reading_std: float = 15e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ordered:
+    """A plan and what its order costs and loses.
+
+    Attributes:
+        plan: the plan; `about` holds these figures too.
+        duration: of the plan.
+        shortest: of the shortest order with the same readings.
+        confounding: of the plan.
+        confounding_shortest: of the shortest order.
+    """
+
+    plan: Plan
+    duration: Duration
+    shortest: Duration
+    confounding: Confounding
+    confounding_shortest: Confounding
+
+    @property
+    def longer(self) -> float:
+        """Share of time lost to the random order."""
+        return self.duration.total / self.shortest.total - 1.0
+
+
+def order_plan(
+    cell: Cell,
+    config: CellConfig,
+    names: Sequence[str],
+    q: Floats,
+    reference: Floats,
+    chosen: Sequence[Chosen],
+    passable: Passable,
+    rng: np.random.Generator,
+    how: Ordering | None = None,
+) -> Ordered:
+    """Put chosen readings in order.
+
+    Time. Every load is hung once. Under a load the arm goes along a short tour in the metric of
+    the leading joint's time, cut into loops from the reference pose so that this is read every
+    so many minutes, also loaded, and before and after each load; where no straight motion is
+    clear it goes by the reference, which then counts as a return.
+
+    Loss. Readings of a pose under different loads are far apart in time, so that a drift looks
+    like a load, or like a pose. What is lost is stated as ρ², see `Confounding`: the share of
+    its information that the parameter hit hardest loses where the drift has to be estimated as
+    well; and as the error of a deflection where it is not. Three things keep it small:
+    - half of the unloaded readings, drawn at random, come after the loads: lags of both signs,
+      at no cost but a second tour;
+    - loads in the order that is least correlated with time, which costs nothing, since every
+      load begins and ends at the reference;
+    - orders drawn at random among those whose campaign is at most 1 + slack times the shortest:
+      walks through the orders, loops in random order and direction. Of some draws the one with
+      the least ρ is taken (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263): the
+      order stays random towards everything that is no regressor, such as temperatures.
+
+    Args:
+        cell: the cell.
+        config: its loads, motion and acquisition.
+        names: (P) names of poses.
+        q: (P, n) their joint angles, rad.
+        reference: (n,) joint angles of the reference pose, rad.
+        chosen: what to measure.
+        passable: which motions are clear.
+        rng: generator.
+        how: settings.
+
+    Raises:
+        InputError: nothing is chosen, or a name is unknown.
+        CannotAnswerError: a pose cannot be reached from the reference under a load.
+    """
+    how = how or Ordering()
+    _check(config, names, chosen, how)
+    used = [name for name in names if any(c.pose == name for c in chosen)]
+    at = np.array([names.index(name) for name in used])
+    draws = OrderDraws(cell, config, tuple(used), np.vstack([reference, q[at]]), how, rng)
+    draws.prepare(stops_of(used, chosen, how.repeats, rng), passable)
+    plain = draws.shortest()
+    plain_time, plain_loss = draws.figures(plain)
+    best = (plain_loss.correlation, plain, plain_time, plain_loss)
+    spare = how.slack * plain_time.total
+    for _ in range(how.draws if how.slack > 0 else 0):
+        extra = spare * rng.random()
+        for _ in range(_TRIES):
+            plan = draws.draw(extra)
+            time, loss = draws.figures(plan)
+            if time.total <= plain_time.total + spare:
+                if loss.correlation < best[0]:
+                    best = loss.correlation, plan, time, loss
+                break
+            extra *= _SHRINK
+    _, plan, time, loss = best
+    about = {
+        "duration_s": time.about(),
+        "order": {
+            **loss.about(),
+            "reference_every_s": how.reference_every_s,
+            "shortest_s": round(plain_time.total, 1),
+            "longer": round(time.total / plain_time.total - 1.0, 4),
+            "correlation_shortest": round(plain_loss.correlation, 4),
+        },
+    }
+    made = Plan(plan.pose_names, plan.q, plan.steps, about)
+    return Ordered(made, time, plain_time, loss, plain_loss)
+
+
+def _check(
+    config: CellConfig, names: Sequence[str], chosen: Sequence[Chosen], how: Ordering
+) -> None:
+    """Refuse what cannot be."""
+    if not chosen:
+        raise InputError("no reading is chosen; a plan needs at least one")
+    if how.slack < 0 or how.reference_every_s <= 0 or how.repeats < 0:
+        raise InputError(
+            f"slack {how.slack:g}, a reference every {how.reference_every_s:g} s, {how.repeats} "
+            "repeats; valid: 0 or more, over 0, 0 or more"
+        )
+    known = {UNLOADED, *(load.name for load in config.loads)}
+    for c in chosen:
+        if c.pose not in names or c.pose == REFERENCE:
+            raise InputError(f"there is no pose {c.pose!r} to measure")
+        if not c.loads or not set(c.loads) <= known or len(set(c.loads)) < len(c.loads):
+            raise InputError(f"pose {c.pose!r}: loads {c.loads}; valid: {', '.join(sorted(known))}")
+        if c.count < 1:
+            raise InputError(f"pose {c.pose!r}: count {c.count}; valid: 1 or more")
+
+
+def stops_of(
+    used: Sequence[str], chosen: Sequence[Chosen], repeats: int, rng: np.random.Generator
+) -> dict[str, list[Stop]]:
+    """Return the stops by load; each taking gets the first cycle that has none of its loads."""
+    taken: dict[tuple[int, str], set[int]] = {}
+    for c in chosen:
+        pose = used.index(c.pose) + 1
+        for _ in range(c.count):
+            full = [taken.setdefault((pose, load), set()) for load in c.loads]
+            cycle = next(k for k in range(10**9) if not any(k in cycles for cycles in full))
+            for cycles in full:
+                cycles.add(cycle)
+    once = [p for (p, load), cycles in taken.items() if load == UNLOADED and len(cycles) == 1]
+    again = sum(load == UNLOADED and len(cycles) > 1 for (_, load), cycles in taken.items())
+    more = min(max(repeats - again, 0), len(once))
+    for pose in rng.choice(once, more, replace=False) if more else ():
+        mine = [cycles for (p, _), cycles in taken.items() if p == pose]
+        taken[int(pose), UNLOADED].add(max(max(cycles) for cycles in mine) + 1)
+    out: dict[str, list[Stop]] = {}
+    for (pose, load), cycles in taken.items():
+        out.setdefault(load, []).extend(Stop(pose, cycle) for cycle in sorted(cycles))
+    return out
+
+
+@dataclass(slots=True)
+class OrderDraws:
+    """Plans of the same readings in different orders: short ones and random ones.
+
+    Attributes:
+        cell: the cell.
+        config: its loads, motion and acquisition.
+        names: (P) names of the poses that are measured.
+        q: (P + 1, n) joint angles of the reference and of these, rad.
+        how: settings.
+        rng: generator.
+        stops: by load.
+        ways: between the stops under each load.
+        short: shortest order of the stops under each load, counted from 1.
+    """
+
+    cell: Cell
+    config: CellConfig
+    names: tuple[str, ...]
+    q: Floats
+    how: Ordering
+    rng: np.random.Generator
+    stops: dict[str, list[Stop]] = field(default_factory=dict)
+    ways: dict[str, Ways] = field(default_factory=dict)
+    short: dict[str, list[int]] = field(default_factory=dict)
+
+    @property
+    def pace(self) -> Pace:
+        """Seconds of motions, readings and load changes."""
+        return pace(self.config)
+
+    @property
+    def wrenches(self) -> Mapping[str, Floats]:
+        """(6,) wrench at the load point by load, base axes, N and N·m."""
+        return {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
+
+    def prepare(self, stops: dict[str, list[Stop]], passable: Passable) -> None:
+        """Find the ways and the shortest tour under each load."""
+        self.stops = stops
+        for load, here in stops.items():
+            poses = np.array([s.pose for s in here])
+            every = np.unique(poses)
+            found = ways(self.q[[0, *every]], load, passable, self.pace)
+            self.ways[load] = found.among(np.searchsorted(every, poses) + 1)
+            self.short[load] = tour.shortest(self.ways[load].seconds, self.rng)
+            way = [0, *self.short[load], 0]
+            legs = self.ways[load].seconds[way[:-1], way[1:]]
+            if legs.max() >= tour.NEVER:
+                k = int(np.argmax(legs >= tour.NEVER))
+                pose = self.names[here[max(way[k], way[k + 1]) - 1].pose - 1]
+                raise CannotAnswerError(
+                    f"pose {pose} is not reached from the reference pose along clear straight "
+                    f"motions under {load}; leave it out or move the reference"
+                )
+
+    def shortest(self) -> Plan:
+        """Return the plan of the shortest tours, all unloaded readings before the loads."""
+        return self._plan(self.short, half=False, mixed=False)
+
+    def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
+        """Return the plan for an order of the stops under each load.
+
+        Args:
+            orders: by load.
+            half: whether the second half of the unloaded order comes after the loads.
+            mixed: whether loops come in random order and direction.
+        """
+        loads = [load for load in self.stops if load != UNLOADED]
+        free = list(orders.get(UNLOADED, ()))
+        cut = (len(free) + 1) // 2 if half else len(free)
+        before = self._block(UNLOADED, free[:cut], mixed)
+        after = self._block(UNLOADED, free[cut:], mixed)
+        loaded = [self._block(load, orders[load], mixed) for load in loads]
+        turn = load_order(before, loaded, after, self.wrenches, self.pace)
+        steps = assembled(self.names, before, [loaded[k] for k in turn], after)
+        return Plan((REFERENCE, *self.names), self.q, steps)
+
+    def draw(self, extra: float) -> Plan:
+        """Return a random plan that takes about so many seconds longer than the shortest."""
+        total = sum(len(here) for here in self.stops.values())
+        half = self.how.unloaded == "around"
+        orders = {}
+        for load, short in self.short.items():
+            seconds = self.ways[load].seconds
+            spare = extra * len(short) / total
+            if load != UNLOADED or not half or len(short) < 2:
+                orders[load] = self._walk(seconds, short, spare)
+                continue
+            first = set(self.rng.permutation(short)[: (len(short) + 1) // 2].tolist())
+            parts = [
+                self._part(seconds, [k for k in short if (k in first) == own])
+                for own in (True, False)
+            ]
+            now = [tour.length(seconds, part) for part in parts]
+            if max(now) >= tour.NEVER:  # a pose was parted from the only one that leads to it
+                half, orders[load] = False, self._walk(seconds, short, spare)
+                continue
+            spare -= sum(now) - tour.length(seconds, short)
+            orders[load] = [k for part in parts for k in self._walk(seconds, part, spare / 2)]
+        return self._plan(orders, half=half, mixed=True)
+
+    def _part(self, seconds: Floats, part: list[int]) -> list[int]:
+        """Return a short tour of some of the stops."""
+        at = [0, *part]
+        return [at[k] for k in tour.improved(seconds[np.ix_(at, at)], range(1, len(at)))]
+
+    def _walk(self, seconds: Floats, order: Sequence[int], spare: float) -> list[int]:
+        """Return a random tour of some stops, at most so many seconds longer than this one."""
+        budget = tour.length(seconds, order) + max(spare, 0.0)
+        at = [0, *order]
+        grid = seconds[np.ix_(at, at)]
+        moves = _MOVES * len(order)
+        walked = tour.shaken(grid, range(1, len(at)), budget, self.rng, moves)
+        return [at[k] for k in walked]
+
+    def _block(self, load: str, order: Sequence[int], mixed: bool) -> Block:
+        """Cut an order into loops; mixed ones come in random order and direction."""
+        if not order:
+            return Block(load, (), 0.0)
+        direct, pace = self.ways[load].direct, self.pace
+        parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
+        if parts is None:  # a pose that is reached by another one only, and takes too long
+            parts = tour.loops(direct, order, pace.reading_s, np.inf)
+        assert parts is not None  # noqa: S101 - every way of the order exists
+        if mixed:
+            parts = [parts[int(k)] for k in self.rng.permutation(len(parts))]
+            back = self.rng.random(len(parts)) < 0.5
+            parts = [
+                p[::-1] if turn and tour.length(direct, p[::-1]) < tour.NEVER else p
+                for p, turn in zip(parts, back, strict=True)
+            ]
+        seconds = sum(tour.length(direct, p) + pace.reading_s * (len(p) + 1) for p in parts)
+        here = self.stops.get(load, [])
+        stops = tuple(tuple(here[k - 1] for k in part) for part in parts)
+        return Block(load, stops, seconds)
+
+    def figures(self, plan: Plan) -> tuple[Duration, Confounding]:
+        """Return duration and confounding of a plan."""
+        margin = self.config.limits.joint_margin_rad
+        time, times = timeline(plan, self.cell.arm, margin, self.pace)
+        how = self.how
+        return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)

@@ -1,0 +1,371 @@
+"""The summary of a plan: predicted precision, criterion comparison, sample-size curve, cost.
+
+One value, computed once; terminal, JSON and viewer read it directly, the plan's file holds `about`.
+"""
+
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.design.approximate_design import relax
+from hilcal.design.choice import choose, choose_poses, only, unknown
+from hilcal.design.compound_criteria import compound_objective
+from hilcal.design.confounding import Confounding
+from hilcal.design.detectable import DetectableEffect, detectable_effects
+from hilcal.design.information import Problem
+from hilcal.design.planner import Planned, Say
+from hilcal.design.predicted import Predicted, predicted
+from hilcal.design.timing import Duration
+from hilcal.effects.protocol import FRAME_ROLES, Role
+from hilcal.errors import CannotAnswerError
+from hilcal.regression.schur import schur_complement
+from hilcal.store.plan import REFERENCE
+from hilcal.types import Floats
+
+COMPARED = ("D", "A", "E", "K", "I")
+"""Criteria of the comparison: all but T-optimality, which needs suspects."""
+SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
+"""Budgets of the sample-size curve by the plan's own. A choice."""
+WORTH = 0.9
+"""Efficiency of a plan below which it is said what another one would give; a choice."""
+LOOSE = 3e-3
+"""Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
+_LEFT_OUT = {
+    "deflection": "geometry, registration, repeatability and effects outside of the model",
+    "position": "repeatability and effects outside of the model",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedParameter:
+    """Predicted standard uncertainty of a parameter.
+
+    Attributes:
+        name: e.g. "joint_compliance.j2".
+        std: in `unit`, SI; infinite where the readings do not determine it.
+        value: estimated or ordinary magnitude, SI; None where there is none.
+        unit: SI.
+    """
+
+    name: str
+    std: float
+    value: float | None
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class CriterionResult:
+    """The design that a criterion chooses for the same number of readings.
+
+    The observability indices are those of Sun & Hollerbach (2008), of the whitened Jacobian by
+    the parameters in ordinary magnitudes with the singular values σ.
+
+    Attributes:
+        criterion: its name.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        position_open_m: the same with all potential terms estimated as well.
+        joint_share: largest relative standard uncertainty of a joint compliance; None without.
+        o1: (Π σ)^(1/P) / √N, which D maximises; σ² are the eigenvalues of the Schur complement
+            of the model's parameters without prior.
+        o2: σ_min / σ_max, which K maximises; of the model alone.
+        o3: σ_min, which E maximises.
+        efficiency: certified lower bound of the efficiency by its own criterion; None without.
+    """
+
+    criterion: str
+    position_std_m: float | None
+    position_open_m: float | None
+    joint_share: float | None
+    o1: float
+    o2: float
+    o3: float
+    efficiency: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class CurvePoint:
+    """A point of the sample-size curve.
+
+    Attributes:
+        poses: number of poses beside the reference.
+        position_std_m: standard uncertainty of the position at the prediction poses, m.
+        efficiency: certified efficiency with so many poses; None without.
+    """
+
+    poses: int
+    position_std_m: float
+    efficiency: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlanSummary:
+    """Cost, predicted precision and efficiency of a plan.
+
+    Attributes:
+        poses: number of poses beside the reference.
+        readings: of all, those at the reference included.
+        loads: readings by load, "none" among them, in the order in which they are hung.
+        duration: of the campaign.
+        criterion: name of the criterion.
+        efficiency: certified lower bound of the efficiency; None without a certificate.
+        parameters: predicted precision by parameter.
+        position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None
+            without. It is not the accuracy of the robot, see `position_note`.
+        position: what is predicted there, e.g. "deflection under 5kg at 100 poses".
+        criteria: criterion comparison, the plan's own among them.
+        curve: sample-size curve, fewest poses first.
+        detectable: minimum detectable effects.
+        longer: share of time beyond the shortest order.
+        confounding: of the plan's order with a linear drift; None where it is not known.
+        shortest: confounding of the shortest order.
+        remarks: assumptions and omissions, one sentence each.
+        asked_poses: poses that were asked for, see `planner.Request`; None where readings were.
+    """
+
+    poses: int
+    readings: int
+    loads: dict[str, int]
+    duration: Duration
+    criterion: str
+    efficiency: float | None
+    parameters: tuple[PredictedParameter, ...]
+    position_std_m: float | None
+    position: str = ""
+    criteria: tuple[CriterionResult, ...] = ()
+    curve: tuple[CurvePoint, ...] = ()
+    detectable: tuple[DetectableEffect, ...] = ()
+    longer: float = 0.0
+    confounding: Confounding | None = None
+    shortest: Confounding | None = None
+    remarks: tuple[str, ...] = ()
+    asked_poses: int | None = None
+
+    @property
+    def quantity(self) -> str:
+        """What is predicted at the prediction poses: "deflection" or "position"."""
+        return self.position.split(" ")[0] or "position"
+
+    @property
+    def position_note(self) -> str:
+        """What `position_std_m` is, and what it leaves out, in a sentence."""
+        return position_note(self.quantity)
+
+    @property
+    def load_changes(self) -> int:
+        """How often a load is changed by hand, the removal of the last one included."""
+        return len(self.loads) if len(self.loads) > 1 else 0
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON document."""
+        known, own, shortest = asdict(self), self.confounding, self.shortest
+        order = None
+        if own is not None and shortest is not None:
+            order = {
+                "longer": self.longer,
+                "lost": own.correlation**2,
+                "lost_shortest": shortest.correlation**2,
+                **{key: getattr(own, key) for key in ("drift", "error_m", "bias_m")},
+                "told": own.drift_std,
+            }
+        same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
+        return {
+            **{key: known[key] for key in same},
+            "asked_poses": self.asked_poses,
+            "position": self.position,
+            "position_note": self.position_note,
+            "predicted_std": {p.name: p.std for p in self.parameters},
+            "readings_by_load": self.loads,
+            "criteria": known["criteria"],
+            "curve": known["curve"],
+            "detectable": known["detectable"],
+            "order": order,
+            "remarks": list(self.remarks),
+        }
+
+
+def summarise(
+    planned: Planned,
+    config: CellConfig,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+    *,
+    compare: bool = True,
+    curve: bool = True,
+) -> PlanSummary:
+    """Return the summary of a plan.
+
+    Args:
+        planned: the plan.
+        config: the cell's configuration.
+        rng: generator, for the designs of the other criteria.
+        say: progress callback.
+        compare: whether to compute the criterion comparison.
+        curve: whether to compute the sample-size curve.
+    """
+    plan, knows = planned.ordered.plan, planned.predicted
+    if compare or curve:
+        say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")
+    return PlanSummary(
+        poses=len({s.pose for s in plan.steps} - {REFERENCE}),
+        readings=len(plan.steps),
+        loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
+        duration=planned.ordered.duration,
+        criterion=planned.criterion,
+        efficiency=planned.design.efficiency,
+        parameters=_parameters(planned),
+        position_std_m=_finite(knows.position),
+        position=planned.work.what,
+        criteria=tuple(_criteria(planned, rng)) if compare else (),
+        curve=tuple(_curve(planned)) if curve else (),
+        detectable=tuple(detectable_effects(planned, config)),
+        longer=planned.ordered.longer,
+        confounding=planned.ordered.confounding,
+        shortest=planned.ordered.confounding_shortest,
+        remarks=remarks(planned),
+        asked_poses=planned.asked_poses,
+    )
+
+
+def position_note(quantity: str) -> str:
+    """Return what the uncertainty of a predicted "deflection" or "position" leaves out."""
+    return (
+        f"standard uncertainty (rms) of the {quantity} that the fitted model predicts; it is not "
+        f"the accuracy of the robot: {_LEFT_OUT[quantity]} are not in it"
+    )
+
+
+def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
+    """Return the predicted precision of each parameter, in the order of the model."""
+    knows, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
+    known = {
+        name: PredictedParameter(name, float(std), float(value) or None, unit)
+        for name, std, value, unit in zip(
+            knows.names, knows.std, knows.values, knows.units, strict=True
+        )
+        # deflections do not determine where a frame is
+        if np.isfinite(std) or not name.startswith(frames)
+    }
+    for u in planned.undetermined:
+        known[u.name] = PredictedParameter(u.name, np.inf, u.value or None, u.unit)
+    effects = planned.problem.nominal.model.effects
+    names = (f"{e.name}.{p.name}" for e in effects for p in e.parameters)
+    return tuple(known[name] for name in names if name in known)
+
+
+def remarks(planned: Planned) -> tuple[str, ...]:
+    """Return assumptions and omissions of a plan, one sentence each."""
+    omitted = tuple(
+        f'load "{name}" costs more than it tells: without it the same time would make the plan '
+        f"{100 * gain:.0f} % more efficient"
+        for name, gain in planned.costly
+    )
+    if planned.asked_poses is not None and planned.design.efficiency < WORTH:
+        readings = int(planned.design.cost)
+        omitted += (
+            f"as many readings, spread over as many poses and loads as tell most (--readings "
+            f"{readings}), are up to {100 / planned.design.efficiency - 100:.0f} % more efficient",
+        )
+    without = tuple(u.remark for u in planned.undetermined)
+    notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
+    return tuple(dict.fromkeys(notes))
+
+
+def about(planned: Planned) -> dict[str, object]:
+    """Return what a plan's file holds of its origin."""
+    knows = planned.predicted
+    return {
+        **planned.ordered.plan.about,
+        "made_by": "optimal design",
+        "criterion": planned.criterion,
+        "efficiency": round(planned.design.efficiency, 6),
+        "predicted_std": {n: _finite(s) for n, s in knows.by_name().items()}
+        | {u.name: None for u in planned.undetermined},
+        "position_std_m": _finite(knows.position),
+        "position": planned.work.what,
+        "position_note": position_note(planned.work.what.split(" ")[0]),
+        "candidates": len(planned.drawn.q),
+    }
+
+
+def _finite(value: float | None) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionResult]:
+    """Yield the design of each criterion with as many readings."""
+    of = planned.problem
+    for name in dict.fromkeys((*COMPARED, planned.criterion)):
+        if name == planned.criterion:
+            yield _result(planned, name, planned.counts, planned.design.efficiency)
+            continue
+        try:
+            asked = compound_objective(of, name, planned.work, planned.budget, rng)
+            if planned.asked_poses is not None:
+                design = choose_poses(asked, of, planned.usable, planned.asked_poses, rng, 1)
+            else:
+                design = choose(only(asked, planned.usable), planned.budget, rng, 1)
+        except CannotAnswerError:
+            continue
+        counts = np.zeros(len(of.units))
+        counts[np.flatnonzero(planned.usable)] = design.counts
+        yield _result(planned, name, counts, design.efficiency)
+
+
+def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> CriterionResult:
+    of, free = planned.problem, unknown(planned.problem)
+    knows = predicted(of, counts, work=planned.work)
+    taken = np.flatnonzero(counts)
+    known = of.units.information(counts[taken], taken)
+    left = schur_complement(of.prior + known, free)
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
+    alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
+    readings = float(counts @ of.units.cost)
+    volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
+    return CriterionResult(
+        criterion=name,
+        position_std_m=_finite(knows.position),
+        position_open_m=_finite(knows.position_open),
+        joint_share=_joint_share(knows, _prefixes(of, "baseline")),
+        o1=volume / np.sqrt(readings),
+        o2=float(alone[0] / alone[-1]),
+        o3=float(sigma[0]),
+        efficiency=efficiency,
+    )
+
+
+def _prefixes(of: Problem, *roles: Role) -> tuple[str, ...]:
+    """Return what the names of the parameters of some roles begin with."""
+    return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
+
+
+def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
+    """Largest relative standard uncertainty of a joint compliance."""
+    shares = [
+        std / abs(value)
+        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
+        if name.startswith(joints) and value
+    ]
+    return _finite(max(shares)) if shares else None
+
+
+def _curve(planned: Planned) -> Iterator[CurvePoint]:
+    """Yield the sample-size curve, of continuous optima."""
+    of = planned.problem
+    asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
+    own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})
+    last, before = None, 0
+    for share in SHARES:
+        budget, poses = share * planned.budget, max(1, round(share * own))
+        if budget < asked.units.cost.max() or poses == before:
+            continue
+        before = poses
+        last = relax(
+            asked.units, asked.criterion, budget, asked.prior, names=asked.names,
+            tolerance=LOOSE, start=last,
+        )  # fmt: skip
+        whole = of.prior + of.units.information(last.weight, usable[last.index])
+        position = _finite(predicted(of, information=whole, work=planned.work).position)
+        if position is not None:
+            yield CurvePoint(poses, position)

@@ -1,0 +1,198 @@
+"""Which effects of a model's background the readings prove, each beside all others.
+
+The test of an effect is the restricted likelihood ratio against its standard deviation being zero,
+with those of all others estimated anew (see `mixed.evidence`).
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+
+import numpy as np
+
+from hilcal.diagnosis.effect_ranking import Detection, LeftOut, Suspect
+from hilcal.diagnosis.minimum_detectable_effect import Strength
+from hilcal.identification.fit import Fit, all_left_out
+from hilcal.identification.linearisation import HeldOut
+from hilcal.identification.mixed_fit import linearised_problem, mixed_fit_at, with_all_effects
+from hilcal.mixed.equations import Equations
+from hilcal.mixed.evidence import evidence
+from hilcal.regression.evidence import FamilyScore
+from hilcal.types import Floats, Ints
+
+PROVED = 0.01
+"""Chance of naming any effect of the background where none is there, over all that are tested; a
+choice: that something is there has been shown by poses left out."""
+WORTH = 0.05
+"""Share by which the rms error on poses left out must fall for a background; a choice: it has
+hundreds of parameters, and those that name an effect alone are easier to understand."""
+MUCH = 0.25
+"""The same of few readings that do not prove other effects: named ones that are fitted flat to so
+few predict far worse than all together. A choice: of 30 poses of arms with one effect and nothing
+but scatter it fell by 2 to 15 %."""
+UNSURE = 2.0
+"""Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
+choice."""
+TOGETHER = 0.05
+"""Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
+there; a choice: the error on poses left out has to fall, too."""
+LIKELY = 0.1
+"""p-value below which an effect of the background is named as one that may be there; a choice."""
+SEED = 0
+"""Of the simulated ratios, so that equal fits give equal p-values."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BackgroundEffect:
+    """One effect of the background.
+
+    Attributes:
+        effect: its name.
+        p_value: of the test against its absence.
+        ratio: the restricted likelihood ratio.
+        rank: number of its directions that the others do not span.
+        std: root of the mean square of its standard deviations, in ordinary magnitudes.
+        rms_m: root of the mean square of what it moves the measured positions by, m.
+        share: of the misfit that the background explains, in whitened squares.
+        step: (q,) its parameters, in ordinary magnitudes.
+    """
+
+    effect: str
+    p_value: float
+    ratio: float
+    rank: int
+    std: float
+    rms_m: float
+    share: float
+    step: Floats
+
+
+def p_value_of_others(of: Fit) -> float:
+    """p-value of all other effects of the catalogue together, beside a noise of any size.
+
+    They are tested at the fit of the named ones, by one multiple of their ordinary sizes.
+    """
+    named = of.model.names
+    kept = of.readings[~of.outlier].as_stated()
+    model = with_all_effects(of.model, kept.states)
+    known = {
+        (e.name, p.name): value
+        for e, mine in zip(of.model.effects, of.model.slices(), strict=True)
+        for p, value in zip(e.parameters, of.theta[mine], strict=True)
+    }
+    theta = np.array(
+        [known.get((e.name, p.name), 0.0) for e in model.effects for p in e.parameters]
+    )
+    problem = linearised_problem(model, kept, of.mode, theta)
+    families = problem.families.random
+    numbers = [k for k, f in enumerate(families) if f.effect not in named]
+    return evidence(problem, numbers, np.random.default_rng(SEED)).p_value
+
+
+def background_is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
+    """Whether a background belongs to the model.
+
+    The error on poses left out must fall by a share, both weighted by the noise of the latter, and
+    all effects that were not named before be of plausible size (`Effect.most`): those that would
+    have to be larger stand in for one that the catalogue lacks.
+
+    Args:
+        before: the fit of the named effects alone.
+        after: the fit of all, each with its standard deviation.
+        worth: the share.
+    """
+    random, known = after.model.random, before.model.named
+    new = (e for e in after.model.effects if e.name in random and e.name not in known)
+    plausible = all(np.all(random[e.name] <= UNSURE * e.most() * e.magnitudes) for e in new)
+    if not plausible:
+        return False
+    raw, w = all_left_out(after)
+    one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
+    return other <= (1 - worth) ** 2 * one
+
+
+def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
+    """Test the effects of a background that the readings show; smallest p-values first."""
+    model = fit.model
+    if not model.background:
+        return ()
+    kept = fit.readings[~fit.outlier].as_stated()
+    found = mixed_fit_at(model, kept, fit.mode, fit.theta)
+    problem, log_std = found.equations.problem, found.log_std
+    rng, families = np.random.default_rng(SEED), problem.families.random
+    moves = _motion(fit)
+    tested = []
+    numbered = [(k, f) for k, f in enumerate(families) if f.effect in model.background]
+    for name, own in groupby(numbered, lambda kf: kf[1].effect):
+        mine = list(own)
+        test = evidence(problem, [k for k, _ in mine], rng, log_std)
+        if not test.rank:
+            continue
+        index = np.concatenate([f.parameters for _, f in mine])
+        magnitude = np.concatenate([f.magnitude for _, f in mine])
+        std = np.concatenate([np.full(len(f.parameters), np.exp(log_std[k])) for k, f in mine])
+        tested.append(
+            BackgroundEffect(
+                name,
+                test.p_value,
+                test.ratio,
+                test.rank,
+                float(np.sqrt(np.mean(std**2))),
+                _moved(moves, fit.theta, index),
+                _white(found.equations, [k for k, _ in mine]),
+                fit.theta[index] / magnitude,
+            )
+        )
+    total = sum(b.share for b in tested) or 1.0
+    shares = [replace(b, share=b.share / total) for b in tested]
+    return tuple(sorted(shares, key=lambda b: (b.p_value, -b.rms_m)))
+
+
+def _motion(fit: Fit) -> Floats:
+    """(D, 3, P) derivatives of the measured positions, not whitened."""
+    jacobian = fit.model.jacobian(fit.solution.prediction, fit.theta, 3)
+    return fit.whitening.raw(jacobian)
+
+
+def _moved(moves: Floats, theta: Floats, index: Ints) -> float:
+    by = moves[:, :, index] @ theta[index]
+    return float(np.sqrt(np.mean(np.sum(by**2, axis=1))))
+
+
+def _white(e: Equations, numbers: list[int]) -> float:
+    p = e.problem
+    own = np.flatnonzero(np.isin(p.family, numbers)) + p.flat
+    return float(np.sum((p.x[:, own] @ e.coordinates[own]) ** 2))
+
+
+def proved(found: tuple[BackgroundEffect, ...]) -> tuple[str, ...]:
+    """Names of those that are proved, the strongest evidence first."""
+    return tuple(b.effect for b in found if b.p_value * len(found) < PROVED)
+
+
+def as_suspects(found: tuple[BackgroundEffect, ...]) -> Iterator[Suspect]:
+    """Yield the effects of a background as suspects: none is proved, each may be there."""
+    likely = [b.effect for b in found if b.p_value < LIKELY]
+    for b in found:
+        score = FamilyScore(
+            p_value=b.p_value,
+            log_evidence=0.5 * b.ratio,
+            strength=b.std,
+            ridge=np.inf if b.std == 0 else b.std**-2.0,
+            rank=b.rank,
+            effective=float(b.rank),
+            gain=b.share,
+            delta_bic=-b.ratio,
+            step=b.step,
+            spectrum=None,
+            noise=1.0,
+        )
+        yield Suspect(
+            effect=b.effect,
+            score=score,
+            share=b.share,
+            left_out=LeftOut(lambda: HeldOut(0.0, False)),
+            explains=False,
+            detection=Detection(lambda: Strength(np.inf, ())),
+            same_as=tuple(n for n in likely if n != b.effect) if b.effect in likely else (),
+        )

@@ -1,0 +1,175 @@
+"""The judgement of a fit: one frozen value that commands, `refine`, plans, studies and files carry.
+
+It holds data only; `hilcal.present.verdict_words` writes its sentence, and
+`hilcal.present.diagnosis_document` its JSON.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+from hilcal.diagnosis.background_evidence import BackgroundEffect
+from hilcal.diagnosis.catalogue_sufficiency import Insufficiency
+from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.misfit_breakdown import MisfitShare
+from hilcal.diagnosis.noise import PureError
+from hilcal.diagnosis.noise_verdict import NoiseVerdict
+from hilcal.diagnosis.pose_alone import PoseAlone
+from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.diagnosis.separability import Separability
+from hilcal.diagnosis.stepwise_alternatives import Alternative
+from hilcal.diagnosis.wrong_figures import WrongFigure
+from hilcal.identification.fit import Fit
+from hilcal.readings.arm_scatter import ArmScatter
+
+Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
+Reason = Literal[
+    "residual_is_noise",
+    "one_suspect",
+    "inseparable_suspects",
+    "inseparable_addition",
+    "insufficient_catalogue",
+    "no_suspect",
+    "misjudged_noise",
+    "arm_scatter",
+    "pose_alone",
+    "readings_disagree",
+    "serial_or_effect",
+    "background",
+    "wrong_figure",
+]
+VERDICTS: dict[Reason, Verdict] = {
+    "residual_is_noise": "adequate",
+    "one_suspect": "missing_effect",
+    "inseparable_suspects": "ambiguous",
+    "inseparable_addition": "ambiguous",
+    "insufficient_catalogue": "unknown_effect",
+    "no_suspect": "unknown_effect",
+    "misjudged_noise": "noise_misjudged",
+    "arm_scatter": "adequate",
+    "pose_alone": "ambiguous",
+    "readings_disagree": "unknown_effect",
+    "serial_or_effect": "ambiguous",
+    "background": "ambiguous",
+    "wrong_figure": "ambiguous",
+}
+"""The verdict that each reason leads to."""
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """How a model was reached, as far as the judgement depends on it.
+
+    Attributes:
+        added: effects of the model that earlier diagnoses chose; another may fit as well.
+        removed: effects that were taken out of the model because others explain more.
+        rejected: effects whose addition was tried by a refit and did not lower the error on
+            poses left out.
+    """
+
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+    rejected: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Diagnosis:
+    """What is wrong with a fitted model.
+
+    Attributes:
+        fit: the fit.
+        history: how its model was reached.
+        reason: which rule of `verdict.judge` decided.
+        suspects: effects that are not in the model: first those that pass all tests, then those
+            that explain the misfit but do not surely lower the error on poses left out, then
+            the others; by decreasing evidence in each of these three groups.
+        misfit_breakdown: variables that the misfit follows, largest share first.
+        predictable_share: largest share of the misfit that anything predicts on poses left out: a
+            generic regression, one variable, or one effect; 0 where there is no misfit.
+        dependences: variables that carry what is predictable, with the curve of each; those of
+            the residual after the refit where the catalogue is insufficient.
+        follows: names of at most two variables that the unexplained misfit follows.
+        pure_error: the scatter of repeated readings, or None without repeats.
+        noise: whether the stated covariance is to blame; None where a suspect passes all tests.
+        redundant: effects of the model without which the readings are explained as well.
+        separability: how each rival of the first suspect differs from it, where one of them is
+            missing.
+        insufficiency: what all effects of the catalogue together leave of the misfit, where
+            that is not noise.
+        alternatives: for each effect of `history.added`, the effects that could replace it.
+        scatter: the arm's scatter as estimated: where nothing else explains the residual, or in the
+            covariance of the fit.
+        pose_alone: the misfit where it is the same under every load of a pose, nothing predicts it
+            on poses left out, and more poses would tell what it is.
+        background: the effects of the model's background, those with the smallest p-values first.
+        wrong_figures: figures of the cell that seem to be entered wrongly: any one of them explains
+            the misfit. No effect is a suspect then.
+    """
+
+    fit: Fit
+    history: History
+    reason: Reason
+    suspects: tuple[Suspect, ...]
+    misfit_breakdown: tuple[MisfitShare, ...]
+    predictable_share: float
+    dependences: tuple[Dependence, ...]
+    follows: tuple[str, ...]
+    pure_error: PureError | None
+    noise: NoiseVerdict | None
+    redundant: tuple[str, ...]
+    separability: tuple[Separability, ...]
+    insufficiency: Insufficiency | None
+    alternatives: tuple[Alternative, ...]
+    scatter: ArmScatter | None = None
+    pose_alone: PoseAlone | None = None
+    background: tuple[BackgroundEffect, ...] = ()
+    wrong_figures: tuple[WrongFigure, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict."""
+        return VERDICTS[self.reason]
+
+    @property
+    def significant(self) -> tuple[str, ...]:
+        """Names of the suspects that pass all tests, best first."""
+        return tuple(s.effect for s in self.suspects if s.passes)
+
+    @property
+    def not_shown(self) -> tuple[str, ...]:
+        """Names of the effects that these readings would reveal at no plausible size.
+
+        Of deflections these are errors that are the same under every load, as those of geometry.
+        """
+        predicted = {b.effect for b in self.background}
+        rest = (s for s in self.suspects if not s.passes and s.effect not in predicted)
+        return tuple(s.effect for s in rest if not s.shown)
+
+    @property
+    def tested(self) -> int:
+        """Number of effects that were tested; the level of the test is shared by them."""
+        return sum(s.score.rank > 0 for s in self.suspects)
+
+    @property
+    def lead(self) -> Suspect | None:
+        """The first suspect, where it passes all tests."""
+        return self.suspects[0] if self.suspects and self.suspects[0].passes else None
+
+    @property
+    def repeated_share(self) -> float:
+        """Share of the misfit that repeats of a state have in common; 0 without repeats."""
+        excess = self.fit.variance_factor - 1
+        if self.pure_error is None or excess <= 0:
+            return 0.0
+        return min(max(1 - (self.pure_error.factor - 1) / excess, 0.0), 1.0)
+
+    @property
+    def residual_is_noise(self) -> bool:
+        """Whether the stated noise explains the residual."""
+        return self.reason in ("residual_is_noise", "inseparable_addition")
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
+        # The one import upwards: words are written in `report`, and a script has only this value.
+        from hilcal.present.diagnosis_document import to_json
+
+        return to_json(self)

@@ -1,0 +1,113 @@
+"""What sets some readings apart from the others: the recorded variables in which they differ.
+
+This describes and tests nothing: readings that somebody picked because they err, or because they
+are of one pose, are no random choice, so no p-value would be one.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.diagnosis.recorded import recorded
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import linearise
+from hilcal.types import Bools, Floats
+
+CLEAR = 0.85
+"""Chance from which a difference is named: that one of the picked readings, drawn at random, has
+the larger value (or the smaller one) than one of the others. A choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Recorded:
+    """A recorded variable of all readings.
+
+    Attributes:
+        name: e.g. "joint 2 torque".
+        unit: SI; "" for a pure number.
+        values: (N,) of all readings; NaN where a reading was set aside.
+        labels: names of the values 0, 1, ... where they are not numbers.
+    """
+
+    name: str
+    unit: str
+    values: Floats
+    labels: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """How the picked readings differ from the others in one variable.
+
+    Attributes:
+        variable: e.g. "joint 2 torque"; "load 5 kg" for one of several names.
+        unit: SI; "" for a share.
+        picked: median of the picked readings; the share of that name among them.
+        others: the same of the others.
+        larger: probability that a picked reading has the larger value than one of the others,
+            ties counted half.
+    """
+
+    variable: str
+    unit: str
+    picked: float
+    others: float
+    larger: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the difference is worth naming, see `CLEAR`."""
+        return max(self.larger, 1 - self.larger) >= CLEAR
+
+
+def recorded_values(fit: Fit) -> tuple[Recorded, ...]:
+    """Return what was recorded of the readings of a fit and varies, and where the target was."""
+    used = ~fit.outlier
+    out: dict[str, Recorded] = {}
+
+    def put(name: str, unit: str, values: Floats, labels: tuple[str, ...] = ()) -> None:
+        everywhere = np.full(len(used), np.nan)
+        everywhere[used] = values
+        out.setdefault(name, Recorded(name, unit, everywhere, labels))
+
+    for v in recorded(linearise(fit)):
+        if v.other is None and (v.name != "load" or v.labels):
+            put(v.name, v.unit, v.values, v.labels)
+    at = fit.solution.prediction.observation.base_position
+    put("distance from the base axis", "m", np.hypot(at[:, 0], at[:, 1]))
+    put("height above the base", "m", at[:, 2])
+    return tuple(out.values())
+
+
+def distinguish(fit: Fit, picked: Bools) -> tuple[Difference, ...]:
+    """Compare readings with the others in every recorded variable; the clearest difference first.
+
+    Args:
+        fit: the fit.
+        picked: (N,) which of its readings; measurements alone are compared, so that the unloaded
+            readings of deflections do not count as others.
+    """
+    measured = np.zeros(len(picked), dtype=bool)
+    measured[np.flatnonzero(~fit.outlier)[fit.whitening.reading]] = True
+    mine, others = picked & measured, ~picked & measured
+    if not (mine.any() and others.any()):
+        return ()
+    found = []
+    for v in recorded_values(fit):
+        kinds = [(f"{v.name} {name}", float(k)) for k, name in enumerate(v.labels)]
+        columns = [(name, (v.values == k).astype(float)) for name, k in kinds]
+        for name, x in columns or [(v.name, v.values)]:
+            middle = np.mean if columns else np.median
+            a, b = x[mine], x[others]
+            found.append(
+                Difference(name, v.unit, float(middle(a)), float(middle(b)), _larger(a, b))
+            )
+    return tuple(sorted(found, key=lambda d: -abs(d.larger - 0.5)))
+
+
+def _larger(a: Floats, b: Floats) -> float:
+    """Probability that a value of a (K,) is larger than one of b (L,), ties counted half."""
+    from scipy.stats import rankdata  # slow to import
+
+    ranks = rankdata(np.concatenate([a, b]))[: len(a)]
+    return float((ranks.sum() - len(a) * (len(a) + 1) / 2) / (len(a) * len(b)))

@@ -1,0 +1,465 @@
+"""Whether the noise of a fit's readings is correlated along their order, and how far.
+
+The law is that of `readings.serial_noise`. A misfit looks alike where neighbours in the order are
+neighbours in joint space, so it is estimated beside all that could be missing. With L the whitening
+of the measurements by the covariance without correlation, B the columns of the model and y their
+residual,
+
+    L y ~ N(L B θ, σ² Σ),    Σ = 1 + φ (K(τ) − K(0)) + Σ_f v_f K_f
+
+K(τ) = A (C(τ) ⊗ 1) Aᵀ that of the serial noise, A = L D S with D the differences that measurements
+are of readings. K_f, scaled to a mean variance of 1, is that
+
+- of each effect of the catalogue that is not in the model, Z_f Z_fᵀ;
+- of joints and target that move as powers of the time, of which the catalogue knows few laws;
+- of a smooth field over joint angles and torques, and of poses, A (C_f ⊗ 1) Aᵀ, C_f their
+  neighbourhood: what the catalogue lacks.
+
+φ, τ and v_f maximise the restricted likelihood, σ² profiled: tests do not depend on a noise that is
+misjudged as a whole. Little but the stated covariance tells a long correlation of large noise from
+a short one of small noise: the estimate is that with σ² = 1, unless the readings speak against it.
+
+All this is computed where the slope of ℓ by φ at white noise speaks for it, and no K_f alone
+explains the readings far better: that is to be in the model first.
+
+The serial noise is proved where it gains more than chance beside all K_f, or alone, and is then
+better than all K_f by 20 : 1. Where these are better by as much, they explain the readings, as a
+drift does; else it stays in doubt. Campaigns of more than `MOST_ROWS` are judged by some of their
+runs, those of more than `MOST_READINGS` not at all.
+
+Source: Patterson and Thompson, Biometrika 58 (1971) 545-554.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import block_diag, lapack, solve_triangular
+
+from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, candidates
+from hilcal.identification.effect_columns import columns_of_each
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.wide_suspects import WideColumns
+from hilcal.model.observe import motion
+from hilcal.readings.reading_groups import Group, arrival_groups, deflection_groups, runs
+from hilcal.readings.serial_noise import Clock, SerialNoise
+from hilcal.regression.schur import inverse_root
+from hilcal.types import Floats, Ints
+
+CHANCE = 8.0
+"""Gain of the restricted log likelihood that is more than chance, p = 0.0002 by the mixture of χ²
+with one and two degrees of freedom (Self and Liang, JASA 82 (1987) 605), on two clocks."""
+AGAINST = 6.0
+"""Gain of the restricted log likelihood by another σ² than 1 that speaks against it: that of
+`noise_verdict.MISFIT_ALARM`."""
+SUSPECT = 0.5 * CHANCE
+"""Gain that slope and curvature at white noise must promise for more to be computed; a choice: it
+is as rough as a third."""
+SIZES = (1.0, 10.0, 100.0)
+"""Variances of a rival that are tried, in that of the noise, and ..."""
+LEAD = 2.0
+"""... factor by which its gain exceeds that of serial noise at `STARTS` where it explains the
+readings far better; choices, rough but for little computing."""
+FEWEST = 12
+"""Readings below which nothing is estimated; a choice."""
+MOST_READINGS = 600
+"""Measurements above which nothing is estimated; a choice by timing: effects with over a thousand
+columns, as a transmission error, are kept by factors (`wide_suspects`) where noise is white."""
+POSITION = 3
+"""Elements of a reading by which it is estimated: an attitude follows its position."""
+MOST_ROWS = 450
+"""Rows that are used at most, for speed; a choice: ρ of 150 readings is known to 0.05."""
+PIECE = 50
+"""Measurements in each of the runs that are used of a large campaign; a choice."""
+LEAST, MOST = np.exp(-12.0), np.exp(12.0)
+"""Bounds of v_f: none, and far more than noise."""
+MOST_SHARE = 0.999
+"""Bound of φ; with it every covariance has an inverse."""
+ROUNDING = 1e-9
+"""Least variance, in units of the noise, and least information, as a share of the mean."""
+MOST_NAMED = 2
+"""Rivals that are named."""
+SOME = 0.01
+"""Mean variance, in that of the noise, from which on a rival is named; a choice."""
+SHARE_STEP, LENGTH_STEP = 0.02, 0.05
+"""Steps of φ and log τ by which the curvature is taken."""
+STARTS = (0.3, 0.8, 0.97)
+"""Values of ρ from which the likelihood is climbed."""
+
+
+def with_serial_noise(white: Fit, prior: Floats | None = None) -> Fit:
+    """Return a fit with the correlation of its noise in the covariance, where there is some.
+
+    Args:
+        white: a fit; as it is where its covariance has the correlation.
+        prior: standard deviations (P,) that it was given.
+    """
+    noise = serial_noise(white) if white.readings.serial is None else None
+    if noise is None:
+        return white
+    readings = white.readings.with_serial(noise)
+    found = fit(white.model, readings, white.mode, white.scaling, white.theta, prior)
+    noise = replace(noise, wider=_wider(white, found))
+    return replace(found, readings=readings.with_serial(noise))
+
+
+def _wider(white: Fit, serial: Fit) -> tuple[float, float]:
+    """Least and largest ratio of the formal uncertainties of parameters that both determine."""
+    a, b = white.uncertainty, serial.uncertainty
+    both = a.identifiable & b.identifiable & (a.formal > 0)
+    if not both.any():
+        return 1.0, 1.0
+    ratio = b.formal[both] / a.formal[both]
+    return float(ratio.min()), float(ratio.max())
+
+
+def serial_noise(found: Fit) -> SerialNoise | None:
+    """Estimate the serial noise of a gc-scaled fit with white noise; None where there is none.
+
+    It is returned with `proved` False where effects explain the readings as well as it does.
+    """
+    if found.scaling != "gc" or not FEWEST <= len(found.raw) <= MOST_READINGS:
+        return None
+    by_order = _problem(found, "order")
+    if by_order is None or by_order.promise() < SUSPECT:
+        return None
+    names, rivals = by_order.rivals()
+    if by_order.outdone(rivals):
+        return None
+    problem, alone = by_order, by_order.climbed(by_order.none(), serial=True)
+    timed = None if found.readings.states.time is None else _problem(found, "time")
+    if timed is not None:
+        other = timed.climbed(timed.none(), serial=True)
+        if other.value >= alone.value:
+            problem, alone = timed, other
+            names, rivals = problem.rivals()
+    if alone.value - problem.climbed(problem.none(), serial=False).value < CHANCE:
+        return None
+    effects = problem.climbed(rivals, serial=False)
+    both = problem.climbed(rivals, serial=True, start=effects)
+    gain = both.value - effects.value
+    if gain >= CHANCE or alone.value - effects.value >= SAME_EVIDENCE:
+        # Variances that are not needed take some of the noise for their own.
+        needed = both.value - alone.value >= SAME_EVIDENCE
+        return problem.noise(*((both, rivals) if needed else (alone, problem.none())), gain)
+    if effects.value - alone.value >= SAME_EVIDENCE:
+        return None
+    worst = np.argsort(-effects.v)[:MOST_NAMED]
+    instead = tuple(names[k] for k in worst if effects.v[k] > SOME)
+    return replace(problem.noise(alone, problem.none(), gain), proved=False, instead=instead)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Point:
+    """φ, τ, v_f and the restricted log likelihood there."""
+
+    share: float
+    length: float
+    v: Floats
+    value: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Problem:
+    """What the likelihood is of, R rows of N readings.
+
+    Attributes:
+        fit: the fit.
+        clock: what t is.
+        rows: (N,) readings that are used, of those that were fitted.
+        y: (R,) whitened residual, at the parameters' prior mean.
+        columns: (R, K) of the model, whitened.
+        ridge: (K,) of their priors.
+        factor: (R, N, m) A.
+        difference: (R, N·m) L D.
+        t: (N,) positions.
+        own: (R, R) K(0).
+    """
+
+    fit: Fit
+    clock: Clock
+    rows: Ints
+    y: Floats
+    columns: Floats
+    ridge: Floats
+    factor: Floats
+    difference: Floats
+    t: Floats
+    own: Floats
+
+    @property
+    def step(self) -> float:
+        """Median distance of consecutive readings."""
+        gaps = np.diff(np.sort(self.t))
+        return float(np.median(gaps[gaps > 0])) if (gaps > 0).any() else 1.0
+
+    def correlated(self, c: Floats) -> Floats:
+        """A (C ⊗ 1) Aᵀ (R, R) of a correlation (N, N)."""
+        moved = np.tensordot(self.factor, c, axes=(1, 0))  # (R, m, N)
+        flat = np.swapaxes(self.factor, 1, 2).reshape(len(self.y), -1)
+        return np.asarray(moved.reshape(len(self.y), -1) @ flat.T)
+
+    def none(self) -> Floats:
+        """No K_f (0, R, R)."""
+        return np.zeros((0, len(self.y), len(self.y)))
+
+    def rivals(self) -> tuple[list[str], Floats]:
+        """Names and K_f (F, R, R) of all."""
+        found = [(name, k * (len(k) / t)) for name, k in self._rivals() if (t := np.trace(k)) > 0]
+        return [name for name, _ in found], np.stack([k for _, k in found])
+
+    def _rivals(self) -> Iterator[tuple[str, Floats]]:
+        kept = self.fit.readings[~self.fit.outlier]
+        s = self.fit.solution.prediction.situation
+
+        def of_columns(x: Floats) -> Floats:
+            white = self.difference @ x[:, :POSITION].reshape(-1, x.shape[2])
+            return np.asarray(white @ white.T)
+
+        for of in columns_of_each(self.fit, candidates(self.fit)):
+            moved = of.of_readings
+            if isinstance(moved, WideColumns):
+                moved = moved.readings(slice(None))
+            yield of.effect.name, of_columns(moved[self.rows])
+        time = kept.states.time
+        t = np.arange(len(kept), dtype=float) if time is None else time
+        scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1
+        p = self.fit.solution.prediction
+        cell, m = self.fit.model.cell, POSITION
+        moves = motion(cell, p.observation, p.situation.chain, p.deviation, m)
+        for motions in (moves.drives, p.observation.axes):
+            powers = [motions * scaled[:, None, None] ** k for k in (1, 2, 3)]
+            yield "the time", of_columns(np.concatenate(powers, axis=2)[self.rows])
+        pose = kept.pose[self.rows]
+        yield "the pose", self.correlated((pose[:, None] == pose).astype(float))
+        torque = s.torque[self.rows] / np.maximum(np.abs(s.torque).max(axis=0), 1e-300)
+        angle = s.angle[self.rows]
+        x = np.concatenate([np.cos(angle), np.sin(angle), torque], axis=1)
+        square = np.sum((x[:, None] - x) ** 2, axis=2)
+        yield "angles and torques", self.correlated(np.exp(-0.5 * square))
+
+    def climbed(
+        self,
+        rivals: Floats,
+        *,
+        serial: bool,
+        start: _Point | None = None,
+        stated: bool = False,
+    ) -> _Point:
+        """Maximise the restricted likelihood, with or without serial noise.
+
+        Args:
+            rivals: the K_f.
+            serial: whether φ may be more than zero.
+            start: where to begin with v_f, and to begin at all where that has serial noise.
+            stated: whether σ² = 1.
+        """
+        from scipy.optimize import minimize  # slow to import
+
+        step, count = self.step, len(rivals)
+        span = max(float(np.ptp(self.t)), step)
+
+        def climb(x: Floats) -> tuple[float, Floats]:
+            length, v = float(np.exp(x[1])), np.exp(x[2:])
+            value, slope = self._likelihood(rivals, float(x[0]), length, v, stated)
+            return -value, -slope * np.concatenate([[1.0, length], v])
+
+        begin = [(0.0, np.log(step))]
+        if start is not None and start.share > 0:
+            begin = [(start.share, np.log(start.length))]
+        elif serial:
+            begin = [(0.5, np.log(-step / np.log(rho))) for rho in STARTS]
+        v = np.full(count, -2.0) if start is None else np.log(start.v)
+        x = min((np.array([*s, *v]) for s in begin), key=lambda x: climb(x)[0])
+        bounds = [
+            (0.0, MOST_SHARE if serial else 0.0),
+            (np.log(0.2 * step), np.log(2.0 * span)),
+            *[(np.log(LEAST), np.log(MOST))] * count,
+        ]
+        found = minimize(climb, x, jac=True, bounds=bounds, method="L-BFGS-B")
+        share, length = found.x[:2]
+        return _Point(float(share), float(np.exp(length)), np.exp(found.x[2:]), -float(found.fun))
+
+    def _likelihood(
+        self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
+    ) -> tuple[float, Floats]:
+        """ℓ and its slope by φ, τ and v (2 + F,)."""
+        away = np.abs(self.t[:, None] - self.t)
+        c = np.exp(-away / length)
+        serial = self.correlated(c) - self.own if share > 0 else None
+        sigma = np.eye(len(self.y))
+        if serial is not None:
+            sigma += share * serial
+        sigma += np.tensordot(v, rivals, axes=1)
+        lower = np.asarray(np.linalg.cholesky(sigma + ROUNDING * np.eye(len(sigma))), dtype=float)
+        inverse = _inverse(lower)
+        b = inverse @ self.columns
+        h = self.columns.T @ b + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        lifted = b @ inverse_root(h).T
+        p = inverse - lifted @ lifted.T
+        py = p @ self.y
+        free = len(self.y) - int(np.sum(self.ridge == 0))
+        square = float(self.y @ py)
+        log_h = np.linalg.slogdet(h)[1]
+        log_det = 2 * float(np.log(np.diag(lower)).sum()) + float(log_h)
+        noise = 1.0 if stated else square / free
+        value = -0.5 * (free * np.log(noise) + square / noise + log_det)
+        slope = -0.5 * (p - np.outer(py, py) / noise)
+        by_share = by_length = 0.0
+        if serial is not None:
+            by_share = float(np.vdot(slope, serial))
+            by_length = float(np.vdot(slope, share * self.correlated(c * away / length**2)))
+        by_v = np.tensordot(rivals, slope, axes=2)
+        return value, np.concatenate([[by_share, by_length], by_v])
+
+    def _white(self) -> tuple[Floats, Floats, float, int]:
+        """P (R, R) and P y of white noise, σ² there, and degrees of freedom."""
+        h = self.columns.T @ self.columns + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        q = self.columns @ inverse_root(h).T
+        p = np.eye(len(self.y)) - q @ q.T
+        py = p @ self.y
+        free = len(self.y) - int(np.sum(self.ridge == 0))
+        return p, py, max(float(self.y @ py) / free, 1e-300), free
+
+    def promise(self) -> float:
+        """Gain of ℓ by serial noise as its slope and curvature at white noise let expect."""
+        p, py, noise, free = self._white()
+        away, found = np.abs(self.t[:, None] - self.t), 0.0
+        for rho in STARTS:
+            k = self.correlated(rho ** (away / self.step)) - self.own
+            pk = p @ k
+            trace = float(np.trace(pk))
+            slope = 0.5 * (float(py @ k @ py) / noise - trace)
+            curvature = 0.5 * (float(np.sum(pk * pk.T)) - trace**2 / free)
+            if slope > 0 and curvature > 0:
+                found = max(found, 0.5 * slope**2 / curvature)
+        return found
+
+    def outdone(self, rivals: Floats) -> bool:
+        """Whether that of the rivals which ℓ rises most for explains far more than serial noise."""
+        p, py, noise, free = self._white()
+        trace = np.tensordot(rivals, p, axes=2)
+        slope = 0.5 * (np.tensordot(rivals, np.outer(py, py), axes=2) / noise - trace)
+        curvature = 0.5 * (np.sum(rivals**2, axis=(1, 2)) - trace**2 / free)
+        k = int(np.argmax(np.maximum(slope, 0.0) ** 2 / np.maximum(curvature, ROUNDING)))
+        away, white = np.abs(self.t[:, None] - self.t) / self.step, self._value(None)
+        serial = max(self._value(0.5 * (self.correlated(r**away) - self.own)) for r in STARTS)
+        other = max(self._value(x * rivals[k]) for x in SIZES)
+        return other - white >= LEAD * max(serial - white, 0.0) + CHANCE + SAME_EVIDENCE
+
+    def _value(self, more: Floats | None) -> float:
+        """ℓ with Σ = 1 and more (R, R); see `_likelihood`."""
+        both = np.column_stack([self.columns, self.y])
+        log_det = 0.0
+        if more is not None:
+            lower = np.linalg.cholesky((1.0 + ROUNDING) * np.eye(len(more)) + more)
+            both = solve_triangular(lower, both, lower=True)
+            log_det = 2 * float(np.log(np.diag(lower)).sum())
+        b, y = both[:, :-1], both[:, -1]
+        h = b.T @ b + np.diag(self.ridge)
+        h += ROUNDING * float(np.trace(h)) / len(h) * np.eye(len(h))
+        free = len(y) - int(np.sum(self.ridge == 0))
+        square = float(y @ y) - float(np.sum((inverse_root(h) @ (b.T @ y)) ** 2))
+        log_det += float(np.linalg.slogdet(h)[1])
+        return -0.5 * (free * float(np.log(square / free)) + free + log_det)
+
+    def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
+        """Return the estimate; its uncertainties are by the curvature of ℓ."""
+        at = self.climbed(rivals, serial=True, start=free, stated=True)
+        stated = free.value - at.value < AGAINST
+        at = at if stated else free
+        share = min(at.share, MOST_SHARE - SHARE_STEP)
+
+        def slopes(a: float, b: float) -> Floats:
+            length = at.length * float(np.exp(b))
+            g = self._likelihood(rivals, max(share + a, 0.0), length, at.v, stated)[1]
+            return np.array([g[0], g[1] * length])
+
+        def curvature(a: float, b: float) -> Floats:
+            return (slopes(-a, -b) - slopes(a, b)) / (2 * (a + b))
+
+        h = np.stack([curvature(SHARE_STEP, 0.0), curvature(0.0, LENGTH_STEP)])
+        both = share == at.share and float(np.linalg.det(h)) > 0 and h[0, 0] > 0
+        c = np.linalg.inv(h) if both else np.diag(1.0 / np.maximum(np.diag(h), 1.0))
+        rho = float(np.exp(-self.step / at.length))
+        return SerialNoise(
+            clock=self.clock,
+            share=at.share,
+            share_error=float(min(c[0, 0] ** 0.5, 1.0)),
+            length=at.length,
+            rho=rho,
+            rho_error=float(min(rho * self.step / at.length * c[1, 1] ** 0.5, 1.0)),
+            log_likelihood_ratio=gain,
+        )
+
+
+def _problem(found: Fit, clock: Clock) -> _Problem | None:
+    """Form the likelihood's rows along a clock; None where it stands still, or V has no inverse."""
+    every = found.readings
+    t = every.states.time if clock == "time" else np.arange(len(every), dtype=float)
+    assert t is not None  # noqa: S101 - the caller's condition
+    along, t = replace(every, along=t)[~found.outlier], t[~found.outlier]
+    if np.ptp(t) == 0:
+        return None
+    groups = (deflection_groups if found.mode == "deflection" else arrival_groups)(along)
+    chosen = _some(runs(along, groups, PIECE))
+    place = np.zeros(len(along), dtype=np.int64)
+    place[found.whitening.reading] = np.arange(len(found.raw))
+    loaded = np.concatenate([g[0][0] for g in chosen])
+    reference = np.concatenate([g[1][0] for g in chosen])
+    rows = np.concatenate([loaded, reference])
+    m = POSITION
+    weights = block_diag(*(g[2] for g in chosen))
+    difference = np.kron(np.concatenate([np.eye(len(loaded)), -weights], axis=1), np.eye(m))
+    some = along[rows]
+    white = _diagonal(some.covariance[:, :m, :m])
+    if some.common is not None:
+        flat = some.common[:, :m].reshape(len(rows) * m, -1)
+        together = (some.arrivals[:, None] == some.arrivals) & ~np.eye(len(rows), dtype=bool)
+        white = white + (flat @ flat.T) * np.kron(together, np.ones((m, m)))
+    v = difference @ white @ difference.T
+    std = np.sqrt(np.diag(v))
+    if not np.all(std > 0):
+        return None
+    try:
+        lower = np.linalg.cholesky(v / std[:, None] / std)
+    except np.linalg.LinAlgError:
+        return None
+    inverse = solve_triangular(lower, np.diag(1 / std), lower=True, check_finite=False)
+    whitened = inverse @ difference
+    s = found.solution
+    live = np.flatnonzero(s.estimated)
+    jacobian = found.model.jacobian(s.prediction, s.theta, m, live)[rows]
+    columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
+    y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
+    each = whitened.reshape(len(y), len(rows), m)
+    factor = np.einsum("rni,nij->rnj", each, some.instrument_root(m))
+    flat = factor.reshape(len(y), -1)
+    ridge = s.equations.basis.prior_precision
+    if len(y) < 2 * np.sum(ridge == 0):
+        return None
+    return _Problem(found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T)
+
+
+def _inverse(lower: Floats) -> Floats:
+    """Return the inverse of L Lᵀ."""
+    half, _ = lapack.dpotri(lower, lower=1)
+    out = np.tril(half)
+    return np.asarray(out + np.tril(out, -1).T)
+
+
+def _diagonal(blocks: Floats) -> Floats:
+    """(N·m, N·m) matrix of blocks (N, m, m)."""
+    n, m = blocks.shape[:2]
+    out = np.zeros((n, m, n, m))
+    out[np.arange(n), :, np.arange(n)] = blocks
+    return out.reshape(n * m, n * m)
+
+
+def _some(pieces: list[Group]) -> list[Group]:
+    """All pieces of an order, or as many of them, evenly spaced, as have `MOST_ROWS`."""
+    size = POSITION * sum(p[0].size for p in pieces)
+    count = max(int(len(pieces) * min(MOST_ROWS / size, 1.0)), 1)
+    return [pieces[k] for k in np.linspace(0, len(pieces) - 1, count).astype(int)]

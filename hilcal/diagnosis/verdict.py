@@ -1,0 +1,299 @@
+"""The verdict on a fitted model: the one place where it is decided.
+
+The rules, in this order:
+
+0. A figure of the cell that was entered otherwise explains the misfit (see `wrong_figures`):
+   `ambiguous`, until that is settled; nothing else is looked for.
+1. A suspect passes all tests (see `effect_ranking.Suspect.passes`), and all effects of the
+   catalogue together leave more than noise (see `catalogue_sufficiency`): `unknown_effect`.
+2. A suspect passes, and the readings separate it from every other: `missing_effect`; else
+   `ambiguous`.
+3. None passes, and χ² is what chance allows: `adequate`; or `ambiguous` where another effect could
+   replace one that an earlier diagnosis chose.
+4. χ² is too large, and something recorded predicts a share of the misfit on poses left out, or
+   repeats of a pose have it in common: `unknown_effect`, with that share.
+   Where χ² is too large, no variable predicts the misfit on poses left out beyond chance, and it
+   is the same under every load of a pose, so that more poses would tell (see `pose_alone`):
+   `ambiguous`.
+5. χ² is too large, nothing predicts the residual (no suspect, no learner, no variable) or repeated
+   readings scatter as much, and the arm's own scatter is not in the stated covariance. It is
+   estimated (see `arm_scatter`), before rule 4. Where something predicts no more of the
+   misfit than is negligible in an uncertainty budget (`noise_verdict.PREDICTABLE`), c holds too,
+   and the share is said; a and b then leave it to rule 4:
+   a. the readings prefer a noisier instrument at more than 20 : 1: `noise_misjudged`;
+   b. the scatter is larger than an arm's repeatability can be (see `arm_repeatability`):
+      `noise_misjudged`, be it the instrument, or an arm or a target that was loose;
+   c. else `adequate`. An arm whose scatter is not stated was taken for one without any, which no
+      arm is; so where the readings do not tell its scatter from a noisier instrument, that is said
+      and the verdict stays.
+6. Otherwise the stated noise is too small, or too large: `noise_misjudged` (see `noise_verdict`).
+   This holds where the arm's repeatability is stated, too: the noise is then complete, and wrong.
+
+A noise that was estimated from the readings (`Readings.noise_stated`) is too large where something
+is missing that the catalogue does not have, so that χ² does not show it: 4 holds as well where laws
+surely predict the residual on poses left out.
+
+Of several targets that are read in one arrival, where the arm's scatter is not stated and χ² is too
+large, the rules hold for the fit with the estimated scatter in its covariance (see
+`Evidence.by_arrivals`), and 3 becomes 5b or 5c.
+
+Noise that is correlated along the order of the readings is in the covariance of the fit before it
+is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
+3 and 5c become `ambiguous`.
+
+Where the model has a background and its residual is noise of any size, or the arm's scatter,
+effects of the catalogue are there that the readings do not prove one by one: 3, 5 and 6 become
+`ambiguous`, the suspects are those of the background, and the size of the noise is said.
+
+A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
+same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
+instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.diagnosis.arm_repeatability import instrument_instead, of_repeatability_size
+from hilcal.diagnosis.background_evidence import BackgroundEffect, as_suspects
+from hilcal.diagnosis.diagnosis import Diagnosis, History, Reason
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE, ranked
+from hilcal.diagnosis.evidence import Evidence
+from hilcal.diagnosis.misfit_breakdown import MisfitShare
+from hilcal.diagnosis.noise_verdict import PREDICTABLE, judge_noise
+from hilcal.diagnosis.residual_regression import ResidualRegression
+from hilcal.diagnosis.separability import Separability, separability
+from hilcal.identification.fit import Fit
+from hilcal.readings.arm_scatter import ArmScatter
+
+NOTHING = History()
+IN_SAMPLE = ("pose", "direction")
+"""First words of variables whose share is not of poses left out."""
+MOST_NAMED = 2
+"""Variables that a sentence names."""
+BESIDE_A_BACKGROUND: tuple[Reason, ...] = (
+    "residual_is_noise", "inseparable_addition", "arm_scatter", "misjudged_noise",
+)  # fmt: skip
+"""Reasons that are not the whole truth where effects are proved together, not one by one."""
+SAME_IN_POSE = 0.5
+"""Share of the misfit in common to all readings of a pose from which on it is not the scatter of
+single arrivals; a choice."""
+
+
+def diagnose(
+    fit: Fit, history: History = NOTHING, say: Callable[[str], None] = lambda text: None
+) -> Diagnosis:
+    """Judge a fit.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> d = hc.diagnose(found)
+    >>> d.verdict, d.suspects[0].effect
+    ('missing_effect', 'joint_tilt_compliance')
+
+    Args:
+        fit: the fit.
+        history: how its model was reached.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: for a fit whose residual is not whitened, or of too many readings.
+    """
+    limits.check_fitted(len(fit.readings), fit.readings.m)
+    return judge(Evidence(fit, say=say), history)
+
+
+def with_one_named(
+    d: Diagnosis, fit: Fit, history: History, background: tuple[BackgroundEffect, ...]
+) -> Diagnosis:
+    """Return the judgement where an effect of the background is named: what is predicted stays.
+
+    Args:
+        d: of the model with the effect in its background.
+        fit: with it named.
+        history: of that model.
+        background: the effects of its background.
+    """
+    before = {b.effect for b in d.background}
+    others = tuple(s for s in d.suspects if s.effect not in before)
+    suspects = (*as_suspects(background), *others) if d.reason == "background" else d.suspects
+    return replace(d, fit=fit, history=history, suspects=suspects, background=background)
+
+
+def judge(e: Evidence, history: History) -> Diagnosis:
+    """Combine the evidence of a fit with what is known of the way to its model."""
+    if e.wrong_figures:
+        return _wrong_figure(e, history)
+    found = _with_arrivals(e, history)
+    if e.fit.disagreement is not None and not any(s.passes for s in found.suspects):
+        return replace(found, reason="readings_disagree")
+    return found
+
+
+def _wrong_figure(e: Evidence, history: History) -> Diagnosis:
+    """Judge a fit that a figure of the cell explains: no effect is looked for before that."""
+    return Diagnosis(
+        fit=e.fit,
+        history=history,
+        reason="wrong_figure",
+        suspects=(),
+        misfit_breakdown=e.misfit_breakdown,
+        predictable_share=0.0,
+        dependences=(),
+        follows=(),
+        pure_error=e.pure_error,
+        noise=None,
+        redundant=(),
+        separability=(),
+        insufficiency=None,
+        alternatives=(),
+        wrong_figures=e.wrong_figures,
+    )
+
+
+def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
+    """Judge; where readings of one arrival share its scatter, by arrivals."""
+    inner = e.by_arrivals
+    if inner is None or e.arm_scatter is None:
+        return _judged(e, history)
+    told = _judged(inner, history)
+    share, by = told.predictable_share, told.follows
+    scatter = replace(e.arm_scatter, predicted_share=share, predicted_by=by)
+    if told.reason != "residual_is_noise":
+        return replace(told, fit=e.fit, scatter=scatter)
+    size = of_repeatability_size(scatter, e.fit.model.cell.arm)
+    return replace(
+        told,
+        fit=e.fit,
+        reason="arm_scatter" if size else "misjudged_noise",
+        noise=judge_noise(e.fit, e.pure_error, False),
+        scatter=scatter,
+    )
+
+
+def _judged(e: Evidence, history: History) -> Diagnosis:
+    """Judge by the evidence as it is."""
+    added = tuple(n for n in history.added if n not in e.fit.model.random)
+    suspects = ranked(e.suspects, history.rejected)
+    lead = suspects[0] if suspects and suspects[0].passes else None
+    insufficiency = None if lead is None else e.insufficiency
+    noise, scatter = None, e.fit.readings.arm_scatter
+    rivals: tuple[Separability, ...] = ()
+    reason: Reason
+    if lead is not None:
+        trees = e.tree_share(lead.holdout_share) if e.misfit else 0.0
+        regression = ResidualRegression(trees, ())
+        predicted = max(regression.share, lead.holdout_share) if e.misfit else 0.0
+        if insufficiency is not None:
+            reason = "insufficient_catalogue"
+            regression = ResidualRegression(regression.share, insufficiency.dependences)
+        else:
+            rivals = separability(e.linearisation, lead, e.effects) if lead.same_as else ()
+            reason = "inseparable_suspects" if rivals else "one_suspect"
+        follows = _carrying(regression)
+    else:
+        # A noise that was estimated with something missing is too large to show it.
+        hidden = not e.fit.readings.noise_stated and e.regression.sure
+        regression = e.regression if e.misfit or hidden else ResidualRegression(0.0, ())
+        significant = _significant(e.misfit_breakdown)
+        follows = _carrying(regression) or tuple(v.variable for v in significant)
+        sizes = [
+            *(v.share for v in significant),
+            *(s.holdout_share for s in suspects if s.explains),
+        ]
+        predicted = max([regression.share, *sizes]) if e.misfit or hidden else 0.0
+        # What an implausible size would explain is no noise either.
+        patterns = [
+            s.holdout_share
+            for s in suspects
+            if not s.plausible and s.score.p_value * len(suspects) < FALSE_ALARM
+        ]
+        predictable = regression.share > PREDICTABLE or bool(sizes) or bool(patterns)
+        noise = judge_noise(e.fit, e.pure_error, predictable)
+        in_fit = e.fit.readings.arm_scatter is not None
+        little = noise.reason == "predictable" and max(predicted, *patterns, 0.0) <= PREDICTABLE
+        may = e.misfit and (noise.misjudged or little) and _may_scatter(e)
+        found = e.arm_scatter if may else None
+        by_arm = found is not None and _explained_by_arm(e.fit, found)
+        if found is not None and (by_arm or noise.misjudged):
+            by = follows[:MOST_NAMED]
+            scatter = replace(found, predicted_share=predicted, predicted_by=by)
+        if hidden and predicted > PREDICTABLE:
+            reason = "no_suspect"
+        elif by_arm:
+            reason = "arm_scatter"
+        elif noise.misjudged and not (in_fit and noise.reason == "too_large"):
+            reason = "misjudged_noise"
+        elif noise.off and not noise.misjudged:
+            reason = "no_suspect"
+        else:
+            in_doubt = any(a.inseparable for a in e.alternatives(added, history.removed))
+            reason = "inseparable_addition" if in_doubt else "residual_is_noise"
+        serial = e.fit.readings.serial
+        if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
+            reason = "serial_or_effect"
+        if reason in BESIDE_A_BACKGROUND and e.background:
+            reason, suspects = "background", (*as_suspects(e.background), *suspects)
+    alone = None
+    if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):
+        alone = e.pose_alone
+        reason = reason if alone is None else "pose_alone"
+    return Diagnosis(
+        fit=e.fit,
+        history=history,
+        reason=reason,
+        suspects=suspects,
+        misfit_breakdown=e.misfit_breakdown,
+        predictable_share=predicted,
+        dependences=regression.dependences,
+        follows=follows[:MOST_NAMED],
+        pure_error=e.pure_error,
+        noise=noise,
+        redundant=e.redundant,
+        separability=rivals,
+        insufficiency=insufficiency,
+        alternatives=e.alternatives(added, history.removed),
+        scatter=scatter,
+        pose_alone=alone,
+        background=e.background,
+    )
+
+
+def _may_scatter(e: Evidence) -> bool:
+    """Whether what is left can be the arm's scatter: not stated, and not the same within a pose."""
+    same = any(
+        v.variable == "pose" and v.share > SAME_IN_POSE and v.p_value < FALSE_ALARM
+        for v in e.misfit_breakdown
+    )
+    readings = e.fit.readings
+    return not readings.scatter_stated and readings.arm_scatter is None and not same
+
+
+def _explained_by_arm(fit: Fit, scatter: ArmScatter) -> bool:
+    """Whether an arm's repeatability is the explanation of what is left."""
+    arm = fit.model.cell.arm
+    return not instrument_instead(scatter) and of_repeatability_size(scatter, arm)
+
+
+def _predicted(e: Evidence, regression: ResidualRegression) -> bool:
+    """Whether something recorded predicts the misfit on poses left out.
+
+    Where every pose errs by itself, n of them follow a variable by chance to a share of 1/√n.
+    """
+    shares = (v.share for v in e.misfit_breakdown if v.variable.split()[0] not in IN_SAMPLE)
+    chance = 2.0 / np.sqrt(int(e.fit.pose.max()) + 1)
+    return regression.share > PREDICTABLE or max(shares, default=0.0) > chance
+
+
+def _carrying(of: ResidualRegression) -> tuple[str, ...]:
+    """Variables that carry a share worth naming, largest first."""
+    return tuple(v.variable for v in of.dependences if v.share >= LEAST_SHARE)
+
+
+def _significant(found: tuple[MisfitShare, ...]) -> tuple[MisfitShare, ...]:
+    """Variables that predict a share of the misfit worth naming, beyond chance among all."""
+    kinds = [v for v in found if v.variable.split()[0] not in IN_SAMPLE]
+    alarm = FALSE_ALARM / max(len(kinds), 1)
+    return tuple(v for v in kinds if v.p_value < alarm and v.share >= LEAST_SHARE)

@@ -1,0 +1,354 @@
+"""Functions of composed quantities: the best of the bends, extended to sums, and refined.
+
+f(u) with u = φ₁ + Σ w_i φ_i, the φ products of functions of two quantities at most, is a
+single-index model, one step of projection pursuit (Friedman and Stuetzle 1981, JASA 76, 817).
+
+1. All bends and steps of single products are screened at all sites; see `bends`.
+2. Of the best, u is extended by a further product: f(u + w φ) ≈ f(u) + w φ f'(u), so that what
+   φ f'(u) explains beside f(u) and its level f'(u) ranks all φ, and gives w (Gauss-Newton).
+3. Of the best of all, levels, weights and an exponent are refined together, the coefficient
+   projected out.
+
+What is found pays for all arguments of its complexity, for the levels, and for each weight and
+exponent ½ ln ν.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.bends import unit_rows
+from hilcal.discovery.composed import composed
+from hilcal.discovery.screen import LEAST_MOTION, SEEN
+from hilcal.discovery.shapes import Shape
+from hilcal.types import Floats
+
+if TYPE_CHECKING:
+    from hilcal.discovery.problem import Beside
+    from hilcal.discovery.terms import Term
+
+BEST, EXTENDED = 10, 3
+"""Bends that are extended, and further products that are tried of each; a choice, by time."""
+LARGEST_SUM = 3
+"""Products of a sum at most; a choice."""
+QUANTITIES = 2
+"""Recorded quantities of an argument at most; a choice: sums of more are too many."""
+REFINED = 2
+"""Functions of single products, and of sums, that are refined; a choice, by time."""
+QUANTILES = tuple(k / 20 for k in range(1, 20))
+TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)
+"""Levels, and weights by that of the linearisation, that are tried; a choice."""
+EVALUATIONS = 60
+"""Of the sum of squares, for each number that is refined; a choice."""
+DIGITS = 3
+LEFT = 1e-3
+"""Share of a column's square that others must leave; a choice."""
+WORST = 1e12
+POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
+LEAST_POWER, MOST_POWER = 0.5, 4.0
+"""Exponents of a bend; at least 1 where wrenches bend, as a slope without limit has no equilibrium.
+A choice."""
+LOG2 = float(np.log(2.0))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Bent:
+    """A function of a composed quantity at a site.
+
+    Attributes:
+        s: the site.
+        which: products of the argument, by index in the grammar.
+        weights: of these; the first is 1.
+        shape: the function.
+        numbers: of it.
+        evidence: logarithm, without what the search costs.
+        price: what the choice of the argument costs.
+    """
+
+    s: int
+    which: tuple[int, ...]
+    weights: tuple[float, ...]
+    shape: Shape
+    numbers: tuple[float, ...]
+    evidence: float
+    price: float
+
+    @property
+    def odds(self) -> float:
+        """Evidence less what the argument costs."""
+        return self.evidence - self.price
+
+
+class _Site:
+    """Sums of squares of one site beside the model and chosen terms, for any amplitude."""
+
+    def __init__(self, beside: Beside, s: int) -> None:
+        screen = beside.problem.screen
+        form = screen.form[s]
+        self.evidence = beside.evidence
+        self.slope: Floats = form.T @ beside.problem.thin
+        self.free: Floats = np.float32(beside.problem.share) * screen.free[s]
+        for told, unit in beside.taken():
+            own = form.T @ unit
+            self.slope = self.slope - np.float32(told) * own
+            self.free = self.free - np.outer(own, own)
+        self.moved: Floats = np.sum(form**2, axis=0)
+        self.ones: Floats = self.free.sum(axis=1)
+        self.one = float(self.ones.sum())
+        self.constant = self.one > SEEN * float(self.moved.sum()) + LEAST_MOTION
+        self.told = float(self.slope.sum())
+
+    def odds(self, values: Floats) -> Floats:
+        """(C,) evidence of amplitudes (C, K), the better of without and with a constant."""
+        square = np.einsum("ck,ck->c", values @ self.free, values)
+        seen = square > SEEN * (values**2 @ self.moved) + LEAST_MOTION
+        slope, across = values @ self.slope, values @ self.ones
+        return _better(self.evidence, slope, np.where(seen, square, 0.0), across,
+                       self.told, self.one if self.constant else 0.0)  # fmt: skip
+
+
+def _better(
+    evidence: Any, slope: Floats, square: Floats, across: Floats, told: Any, one: Any
+) -> Floats:
+    """Evidence of columns, the better of without and with a constant beside them."""
+    seen = square > 0
+    gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
+    alone = np.where(seen, evidence(gain, 1), -np.inf)
+    has = np.asarray(one) > 0
+    safe = np.where(has, one, 1.0)
+    left = square - across**2 / safe
+    both = seen & has & (left > LEFT * square)
+    rest = slope - across * told / safe
+    gain = np.where(both, rest**2 / np.where(both, left, 1.0) + told**2 / safe, 0.0)
+    return np.maximum(alone, np.where(both, evidence(gain, 2) - LOG2, -np.inf))
+
+
+def composed_terms(beside: Beside) -> list[Term]:
+    """Return terms of functions of composed quantities.
+
+    Args:
+        beside: the candidates beside chosen terms.
+    """
+    found = _screened(beside)
+    at = {s: _Site(beside, s) for s in {b.s for b in found}}
+    sums: list[_Bent] = []
+    frontier = found
+    for _ in range(LARGEST_SUM - 1):
+        frontier = [e for b in frontier[:BEST] for e in _extended(beside, at[b.s], b)]
+        frontier.sort(key=lambda b: -b.odds)
+        sums += frontier
+    out: list[Term] = []
+    for b in (*_apart(found)[:REFINED], *_apart(sums)[:REFINED]):
+        out += _terms(beside, at[b.s], b)
+    return out
+
+
+def _apart(found: list[_Bent]) -> list[_Bent]:
+    """The best of each argument at each site, the best first."""
+    found = sorted(found, key=lambda b: -b.odds)
+    out: dict[tuple[int, frozenset[int]], _Bent] = {}
+    for b in found:
+        out.setdefault((b.s, frozenset(b.which)), b)
+    return list(out.values())
+
+
+def _screened(beside: Beside) -> list[_Bent]:
+    """Return the best bends of single products."""
+    p = beside.problem
+    screen, all_ = p.screen, p.screen.bends
+    if not len(all_.argument):
+        return []
+
+    def by_site(v: Floats) -> Floats:
+        return np.asarray(np.einsum("srk,r->sk", screen.form, v))
+
+    one = screen.one
+    share = np.float32(p.share)
+    moved = by_site(p.thin)
+    slope, told = moved @ all_.values.T, moved.sum(axis=1)
+    square, across = share * all_.square, share * all_.across_one
+    size = share * screen.square[:, one]
+    for along, unit in beside.taken():
+        own = by_site(unit)
+        mine, ones = own @ all_.values.T, own.sum(axis=1)
+        slope, told = slope - np.float32(along) * mine, told - along * ones
+        square = np.where(square > 0, square - mine**2, 0.0)
+        across, size = across - ones[:, None] * mine, size - ones**2
+    square = np.where(square > LEFT * share * all_.square, square, 0.0)
+    size = np.where(size > LEFT * share * screen.square[:, one], size, 0.0)
+    odds = _better(beside.evidence, slope, square, across, told[:, None], size[:, None])
+    cost = screen.grammar.cost[all_.argument]
+    price = screen.grammar.price_of_argument(cost)
+    odds = odds - price
+    out: dict[tuple[int, int], _Bent] = {}
+    for at in np.argsort(-odds, axis=None)[: 20 * BEST].tolist():
+        s, c = divmod(at, odds.shape[1])
+        k = int(all_.argument[c])
+        if not np.isfinite(odds[s, c]):
+            break
+        b = _Bent(
+            s, (k,), (1.0,), all_.shape[c], all_.numbers[c],
+            float(odds[s, c] + price[c]), float(price[c]),
+        )  # fmt: skip
+        out.setdefault((screen.alias[s], k), b)
+        if len(out) == BEST:
+            break
+    return list(out.values())
+
+
+def _values(beside: Beside, which: tuple[int, ...]) -> Floats:
+    """(P, K) products at the readings of the screening, in their own units."""
+    screen = beside.problem.screen
+    some = list(which)
+    values = screen.grammar.values[some][:, screen.readings] * screen.grammar.size[some, None]
+    return np.asarray(values, dtype=float)
+
+
+def _extended(beside: Beside, site: _Site, b: _Bent) -> list[_Bent]:
+    """Return the argument with the best of further products added, at the best level."""
+    grammar = beside.problem.screen.grammar
+    own = frozenset[str]().union(*(grammar.depends[k] for k in b.which))
+    unit = grammar.unit_of_smooth
+    more = [
+        k
+        for k in grammar.smooth.tolist()
+        if unit[k] == unit[b.which[0]]
+        and k not in b.which
+        and len(own | grammar.depends[k]) <= QUANTITIES
+    ]
+    if not more:
+        return []
+    u = np.asarray(b.weights) @ _values(beside, b.which)
+    phi = _values(beside, tuple(more))
+    slope = b.shape.slope(u, b.numbers)
+    columns = np.vstack([b.shape.value(u, b.numbers), slope, phi * slope])
+    size = np.sqrt(np.mean(columns**2, axis=1))
+    x = unit_rows(columns)
+    gain, beside_first = _gains(site, x)
+    out = []
+    for j in np.argsort(-gain)[:EXTENDED].tolist():
+        if not np.isfinite(gain[j]) or beside_first[0, j] == 0:
+            continue
+        weight = float(beside_first[1, j] / size[j + 2] / (beside_first[0, j] / size[0]))
+        if not np.isfinite(weight) or weight == 0:
+            continue
+        out.append(_leveled(beside, site, b, int(more[j]), weight, len(more)))
+    return out
+
+
+def _gains(site: _Site, x: Floats) -> tuple[Floats, Floats]:
+    """Gain of each further column of X (2 + P, K) beside the first two, and coefficients.
+
+    Returns:
+        (P,) reduction of the sum of squares by the further column, −inf where it is no other one;
+        (2, P) coefficients of the first column and of the further one, fitted together.
+    """
+    free = (x @ site.free).astype(float)
+    slope = (x @ site.slope).astype(float)
+    gram = free @ x.T.astype(float)[:, :2]
+    square = np.einsum("pk,pk->p", free, x)
+    own = gram[:2] + 1e-6 * np.diag(np.diag(gram[:2])) + 1e-12 * np.eye(2)
+    step = np.linalg.solve(own, slope[:2])
+    lift = np.linalg.solve(own, gram[2:].T)
+    left = square[2:] - np.einsum("ip,pi->p", lift, gram[2:])
+    rest = slope[2:] - gram[2:] @ step
+    seen = left > LEFT * square[2:] + LEAST_MOTION
+    last = rest / np.where(seen, left, 1.0)
+    gain = np.where(seen, rest * last, -np.inf)
+    return gain, np.vstack([step[0] - lift[0] * last, last])
+
+
+def _leveled(
+    beside: Beside, site: _Site, b: _Bent, more: int, weight: float, choices: int
+) -> _Bent:
+    """Return the sum with a further product, its weight and level the best of some."""
+    grammar = beside.problem.screen.grammar
+    which = (*b.which, more)
+    a = _values(beside, which)
+    tried: list[tuple[float, tuple[float, ...], tuple[float, ...]]] = []
+    for times in TIMES:
+        weights = (*b.weights, times * weight)
+        u = np.asarray(weights) @ a
+        levels = np.quantile(u, QUANTILES)
+        rest = [np.full(len(levels), n) for n in b.numbers[1:]]
+        own: list[Any] = [levels[:, None], *(n[:, None] for n in rest)]
+        odds = site.odds(unit_rows(b.shape.value(u, tuple(own))))
+        k = int(np.argmax(odds))
+        tried.append((float(odds[k]), weights, (float(levels[k]), *b.numbers[1:])))
+    evidence, weights, numbers = max(tried)
+    price = float(np.log(choices)) + LOG2 * (int(grammar.cost[more]) + 1)
+    price += 0.5 * float(np.log(beside.dof))
+    return replace(
+        b, which=which, weights=weights, numbers=numbers, evidence=evidence, price=b.price + price
+    )
+
+
+def _terms(beside: Beside, site: _Site, b: _Bent) -> list[Term]:
+    """Return a function with its numbers refined, and with an exponent, each with a constant."""
+    screen = beside.problem.screen
+    each = 0.5 * float(np.log(beside.dof))
+    grid = float(np.log(len(QUANTILES) * len(b.numbers)))
+    sums = b.price - float(screen.grammar.price_of_argument(screen.grammar.cost[b.which[0]]))
+    made = [(b, grid + sums)]
+    if b.shape.name in POWERS:
+        bent = replace(b, shape=POWERS[b.shape.name], numbers=(*b.numbers, 1.0))
+        made.append((bent, grid + sums + each))
+    out = []
+    for x, price in made:
+        k = screen.grammar.index(_refined(beside, site, x))
+        if k is None:
+            continue
+        out.append(beside.term(((b.s, k),), price))
+        if screen.visible(b.s, screen.one):
+            out.append(beside.term(((b.s, k), (b.s, screen.one)), price + LOG2))
+    return out
+
+
+def _refined(beside: Beside, site: _Site, b: _Bent) -> Amplitude:
+    """Return the amplitude with weights, levels and exponent where it explains most."""
+    from scipy.optimize import minimize  # slow to import
+
+    a = _values(beside, b.which)
+    more = len(b.weights) - 1
+    spread = float(np.std(np.asarray(b.weights) @ a))
+    scale = [abs(w) for w in b.weights[1:]]
+    scale += [spread if k in b.shape.places else abs(n) for k, n in enumerate(b.numbers)]
+    begin = np.array([*b.weights[1:], *b.numbers])
+    grammar = beside.problem.screen.grammar
+    low, high = float(np.finfo(float).tiny), np.inf
+    if b.shape in POWERS.values():
+        elastic = any(grammar.at(k).elastic for k in b.which)
+        low, high = 1.0 if elastic else LEAST_POWER, MOST_POWER
+
+    def parts(x: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        now = [_rounded(v) for v in begin + np.asarray(scale) * x]
+        return (1.0, *now[:more]), tuple(now[more:])
+
+    def objective(x: Floats) -> float:
+        weights, own = parts(x)
+        if not all(low <= n <= high for k, n in enumerate(own) if k not in b.shape.places):
+            return WORST
+        values = b.shape.value(np.asarray(weights) @ a, own)
+        return min(-float(site.odds(unit_rows(values[None]))[0]), WORST)
+
+    start = np.zeros(len(begin))
+    found = minimize(
+        objective, start, method="Nelder-Mead",
+        options={"maxfev": EVALUATIONS * len(begin), "xatol": 1e-3, "fatol": 1e-2,
+                 "initial_simplex": np.vstack([start, 0.15 * np.eye(len(begin))])},
+    )  # fmt: skip
+    weights, own = parts(found.x if found.fun < objective(start) else start)
+    terms = tuple((w, grammar.at(k)) for w, k in zip(weights, b.which, strict=True))
+    factors = terms[0][1].factors
+    recorded = len(terms) == 1 and len(factors) == 1 and factors[0].shape is shapes.LINEAR
+    quantity = factors[0].variable if recorded else composed(terms)
+    return Amplitude((Factor(quantity, b.shape, own),))
+
+
+def _rounded(x: float) -> float:
+    return float(f"{x:.{DIGITS}g}")

@@ -1,0 +1,285 @@
+"""`discover`: laws for what no effect of the catalogue explains, or silence.
+
+1. Where the stated noise explains the residual, there is nothing to explain.
+2. All candidates are screened, and laws of one, two and three terms chosen (`search`).
+3. The catalogue is given the same chance: its effects are added by algebra as long as they are
+   significant, and refitted in the exact model. Where they explain the readings as well as the law
+   in either, at odds of 20 : 1, the answer is the catalogue, and no law is proposed; nor is one
+   that an effect of it describes (`known_effects`).
+4. The search is repeated without each fold of poses. A law is proposed only where the laws so found
+   predict the poses left out.
+5. Free numbers are refined, and the law is refitted as an effect in the exact model.
+6. What a generic regression predicts of the misfit says how much could be explained at all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.stats import chi2
+
+from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
+from hilcal.diagnosis.residual_regression import Dependence, residual_regression
+from hilcal.discovery.curve import Curve, curves
+from hilcal.discovery.folds import FoldSearch, found_again, search_by_folds, stability
+from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
+from hilcal.discovery.law import Coefficient, Form, Law, form_of
+from hilcal.discovery.problem import Problem
+from hilcal.discovery.refit import at_linearisation, exact, refine
+from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.search import MOST_TERMS, Selection, alternatives, search
+from hilcal.discovery.write_effect import source_of_form
+from hilcal.errors import HilcalError, InputError
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import left_out_by_pose, linearise
+from hilcal.regression.evidence import score_family
+from hilcal.types import Floats
+
+Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
+"""Why there are laws, or none:
+
+- law: at least one is proposed;
+- adequate: the stated noise explains the residual;
+- catalogue: effects of the catalogue explain it as well;
+- no_law: something predicts it, but no law of this complexity does, or none that the exact model
+  can be fitted with;
+- unpredictable: nothing recorded predicts it.
+"""
+LEAST_SHARE = 0.1
+"""Share of the misfit on poses left out that a law must explain, searched for without them."""
+NEAR = 0.7
+"""Cosine from which an effect of the catalogue is named as resembling; a choice."""
+
+
+MOST_RIVALS = 2
+"""Alternatives that can be written as effects; a choice: `next` separates few."""
+
+
+@dataclass(frozen=True, eq=False)
+class Discovery:
+    """What the search for laws came to.
+
+    Attributes:
+        fit: the fit whose misfit it explains.
+        reason: why there are laws, or none.
+        laws: simplest first of those that predict as well as any.
+        attainable: share of the misfit that anything recorded predicts on poses left out.
+        searched_share: that of the laws that the search without each pose finds.
+        catalogue: effects of the catalogue that explain the misfit, where they do.
+        candidates: number of candidates that were tried.
+        after: the fit with the first law.
+        source: of the first law's effect, as a Python file.
+        curves: the first law over what it depends on, with the readings.
+        carried: where no law is found, recorded variables that the misfit depends on.
+        refused: laws that predict the misfit and are not proposed, and why: their exact refits
+            failed.
+        unfitted: effects of the catalogue that the exact model could not be fitted with, and why.
+    """
+
+    fit: Fit
+    reason: Reason
+    laws: tuple[Law, ...] = ()
+    attainable: float = 0.0
+    searched_share: float = 0.0
+    catalogue: tuple[str, ...] = ()
+    candidates: int = 0
+    after: Fit | None = None
+    source: str = ""
+    curves: tuple[Curve, ...] = ()
+    carried: tuple[Dependence, ...] = ()
+    refused: tuple[tuple[str, str], ...] = ()
+    unfitted: tuple[tuple[str, str], ...] = ()
+
+
+def discover(
+    fit: Fit, say: Callable[[str], None] = lambda text: None, name: str = "found"
+) -> Discovery:
+    """Search laws for what a fit leaves unexplained.
+
+    >>> with hc.Campaign.open(RUN) as run:
+    ...     found = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+    >>> d = hc.discover(found)
+    >>> d.reason, d.catalogue
+    ('catalogue', ('joint_tilt_compliance',))
+
+    Args:
+        fit: a gc-scaled fit.
+        say: takes progress, one line each.
+        name: of the effect that is proposed.
+
+    Raises:
+        InputError: a fit whose residual is not whitened.
+    """
+    if fit.scaling != "gc":
+        raise InputError(f"scaling {fit.scaling!r}: laws are searched in a fit scaled by gc")
+    if float(chi2.sf(fit.chi2, fit.dof)) >= MISFIT_ALARM:
+        return Discovery(fit, "adequate")
+    linear = linearise(fit)
+    say("forming all candidates")
+    found = screen(linear)
+    say(f"searching among {found.candidates} candidates")
+    problem = Problem(found)
+    selections = search(problem)
+    if not selections:
+        return _silent(fit, found, say, 0.0)
+    best = max(selections, key=lambda s: s.total)
+    say("comparing with the catalogue")
+    known = known_effects(fit)
+    instead = instead_of_law(fit, problem, best, known)
+    if instead.names:
+        answer = Discovery(fit, "catalogue", catalogue=instead.names, candidates=found.candidates)
+        return replace(answer, unfitted=instead.unfitted)
+    say("repeating the search without each fold of poses")
+    folds = search_by_folds(found, MOST_TERMS)
+    if not folds.sure or folds.share < LEAST_SHARE:
+        answer = _silent(fit, found, say, folds.share)
+    else:
+        answer = _laws(fit, problem, selections, folds, known, say, name)
+    return replace(answer, unfitted=instead.unfitted)
+
+
+def rival_sources(d: Discovery) -> dict[str, str]:
+    """Return the effects of what these readings do not tell from the first law, by name."""
+    if not d.laws:
+        return {}
+    law, out = d.laws[0], {}
+    for k, (form, values) in enumerate(law.rivals, start=1):
+        own = f"{law.name}_or_{k}"
+        evidence = f"These readings do not tell it from {law.name}: {law.formula}"
+        out[own] = source_of_form(form, own, values, evidence, f"{own}.py")
+    return out
+
+
+def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float) -> Discovery:
+    say("asking what is predictable at all")
+    known = residual_regression(found.linear)
+    predictable = known.share > PREDICTABLE
+    return Discovery(
+        fit,
+        "no_law" if predictable else "unpredictable",
+        attainable=known.share,
+        searched_share=searched,
+        candidates=found.candidates,
+        carried=known.dependences if predictable else (),
+    )
+
+
+def curve(problem: Problem, s: Selection) -> Floats:
+    """(R,) what a law explains of the residual, the model projected out."""
+    x = np.hstack([problem.columns(t) for t in s.terms])
+    free = problem.model.project_out(x)
+    step = np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0]
+    return np.asarray(free @ step)
+
+
+def _laws(
+    fit: Fit,
+    problem: Problem,
+    selections: list[Selection],
+    folds: FoldSearch,
+    known: KnownEffects,
+    say: Callable[[str], None],
+    name: str,
+) -> Discovery:
+    """Refit the laws, and order them."""
+    found = problem.screen
+    before = left_out_by_pose(fit)
+    rank = fit.whitening.rank
+    misfit = max(float(before.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
+    made: list[tuple[Law, Fit, Floats, str]] = []
+    refused: list[tuple[str, str]] = []
+    for s in selections:
+        form = refine(found, form_of(found, s.terms))
+        say(f"refitting with {form.text()}")
+        try:
+            after, form, coefficients, _ = exact(found, form, name)
+        except HilcalError as error:
+            refused.append((form.text(), str(error)))
+            continue
+        left = left_out_by_pose(after)
+        share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
+        law = _law(problem, s, form, name, coefficients, share, after, folds, known)
+        evidence = (
+            f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
+            f"{law.p_value:.1g}, the search\npaid for."
+        )
+        source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
+        made.append((law, after, left, source))
+    if not made:
+        silent = _silent(fit, found, say, folds.share)
+        return replace(silent, reason="no_law", refused=tuple(refused))
+    best = min(range(len(made)), key=lambda k: float(made[k][2].sum()))
+    kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
+    say("asking what is predictable at all")
+    attainable = residual_regression(found.linear).share
+    laws = tuple(
+        replace(made[k][0], name=name if not rank else f"{name}_{rank + 1}")
+        for rank, k in enumerate(kept)
+    )
+    return Discovery(
+        fit,
+        "law",
+        laws,
+        float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
+        folds.share,
+        (),
+        found.candidates,
+        made[kept[0]][1],
+        made[kept[0]][3],
+        curves(made[kept[0]][1], laws[0].form),
+        refused=tuple(refused),
+    )
+
+
+def _as_good(left: Floats, best: Floats) -> bool:
+    """Whether poses left out are predicted as well, to within one standard error."""
+    more = left - best
+    return bool(float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1)))
+
+
+def _law(
+    problem: Problem,
+    s: Selection,
+    form: Form,
+    name: str,
+    coefficients: tuple[Coefficient, ...],
+    share: float,
+    after: Fit,
+    folds: FoldSearch,
+    known: KnownEffects,
+) -> Law:
+    linear = problem.screen.linear
+    x = np.hstack([problem.columns(t) for t in s.terms])
+    score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)
+    price = sum(t.price for t in s.terms)
+    p_value = float(np.exp(min(np.log(max(score.p_value, 1e-300)) + price, 0.0)))
+    near = tuple(r for r in resembling(problem, s, known) if r.cosine >= NEAR)
+    situation = linear.fit.solution.prediction.situation
+    factors = (f for p in form.parts for f in p.amplitude.factors)
+    read = {v.symbol: v for f in factors for v in f.variable.recorded}
+    ranges = []
+    for symbol, v in read.items():
+        values = v.read(situation)
+        ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
+    others: dict[str, Form] = {}
+    for terms in alternatives(problem, s):
+        other = form_of(problem.screen, terms)
+        if other.text() != form.text():
+            others.setdefault(other.text(), other)
+    rivals = [(f, at_linearisation(problem.screen, f)) for f in [*others.values()][:MOST_RIVALS]]
+    return Law(
+        name=name,
+        form=form,
+        parameters=coefficients,
+        p_value=p_value,
+        odds=s.total,
+        holdout_share=share,
+        left=after.variance_factor,
+        stability=stability(problem.screen, folds, curve(problem, s)),
+        alternatives=tuple(others),
+        resembles=near[:3],
+        ranges=tuple(ranges),
+        rivals=tuple(rivals),
+        again=found_again(problem.screen, folds, s.terms),
+    )

@@ -1,0 +1,309 @@
+"""All amplitudes that are tried: products of functions, to a stated complexity.
+
+All products of at most `MOST_FACTORS` factors of different quantities up to the complexity `MOST`
+are tried.
+
+What a law costs for the search that found it is the logarithm of the number of candidates of its
+complexity, and log 2 for each unit of complexity: simple laws are few, and pay little.
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import comb, log
+
+import numpy as np
+
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor, different
+from hilcal.discovery.composed import Composed
+from hilcal.discovery.functions import FINEST, fine_waves, functions
+from hilcal.discovery.shapes import Numbers
+from hilcal.discovery.variables import Variable
+from hilcal.effects.protocol import Situation
+from hilcal.types import Floats, Ints
+
+MOST = 3
+"""Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
+MOST_FACTORS = 2
+"""Factors of a product; a choice, likewise."""
+SOME = 2000
+"""Products that are formed at a time; a choice, for memory."""
+ARGUMENT = 2
+"""Complexity of a product in a composed quantity; a choice, by the number of them."""
+COMPOSED_OF = {
+    "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
+}  # fmt: skip
+"""Quantities of which others are composed; a choice: components in joint axes are too many."""
+WAVES_OF_ARGUMENT = 2
+"""Multiples of an angle in a composed quantity; a choice."""
+SHAPES = 5
+"""Functions of a composed quantity: bends to both sides, the same with an exponent, steps."""
+FLAT = 0.1
+"""Factors whose spread is a smaller share of their size are in no product: it would be the other
+factor's law to within that share. A choice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Grammar:
+    """All amplitudes that are tried, and their values.
+
+    Attributes:
+        known: the quantities.
+        amplitudes: the products.
+        values: (F, N) their values, single precision, each with root mean square 1.
+        size: (F,) what they were divided by.
+        cost: (F,) complexities.
+        partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
+        less: (2, F) the amplitude without the first and without the second factor of a product of
+            two; −1 for no product.
+        situation: of the readings.
+        singles: the functions of one quantity from which products are made.
+    """
+
+    known: list[Variable]
+    amplitudes: tuple[Amplitude, ...]
+    values: Floats
+    size: Floats
+    cost: Ints
+    partner: Ints
+    less: Ints
+    situation: Situation
+    singles: tuple[Factor, ...]
+    _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
+    _read: dict[str, Floats] = field(default_factory=dict)
+
+    def at(self, k: int) -> Amplitude:
+        """Return an amplitude by its index."""
+        own = len(self.amplitudes)
+        return self.amplitudes[k] if k < own else self._more[k - own][0]
+
+    def rows(self, which: list[int]) -> Floats:
+        """(P, N) values of amplitudes, each with root mean square 1."""
+        own = len(self.amplitudes)
+        return np.array([self.values[k] if k < own else self._more[k - own][1] for k in which])
+
+    def index(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude, added where it is new; None where it is zero."""
+        known = self.place(amplitude)
+        if known is not None:
+            return known
+        values = self.values_of(amplitude)
+        size = float(np.sqrt(np.mean(values**2)))
+        if not np.isfinite(size) or size == 0:
+            return None
+        k = len(self.amplitudes) + len(self._more)
+        self._more.append((amplitude, (values / size).astype(np.float32), size))
+        self._places[_key(amplitude)] = k
+        return k
+
+    def values_of(self, a: Amplitude) -> Floats:
+        """(N,) of an amplitude at the readings."""
+        out = np.ones(self.values.shape[1])
+        for f in a.factors:
+            out = out * f.shape.value(self.read(f.variable), f.numbers)
+        return out
+
+    def read(self, v: Variable) -> Floats:
+        """(N,) of a quantity at the readings."""
+        if v.symbol not in self._read:
+            self._read[v.symbol] = v.read(self.situation)
+        return self._read[v.symbol]
+
+    def turned(self, k: int) -> int | None:
+        """Return the amplitude with sine for cosine in its first periodic factor."""
+        if k < len(self.amplitudes):
+            return int(self.partner[k]) if self.partner[k] >= 0 else None
+        factors = list(self.at(k).factors)
+        for i, f in enumerate(factors):
+            if f.shape.name == "cos":
+                factors[i] = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
+                return self.index(Amplitude(tuple(factors)))
+        return None
+
+    def place(self, amplitude: Amplitude) -> int | None:
+        """Return the index of an amplitude; None where it is not tried."""
+        return self._places.get(_key(amplitude))
+
+    @cached_property
+    def _places(self) -> dict[frozenset[tuple[str, str, Numbers]], int]:
+        return {_key(a): k for k, a in enumerate(self.amplitudes)}
+
+    def tuned(self, a: Amplitude) -> int:
+        """Return how many factors have numbers that are not of the grid."""
+        return sum(k not in self._grid for k in _key(a))
+
+    @cached_property
+    def _grid(self) -> frozenset[tuple[str, str, Numbers]]:
+        alone = (a for a in self.amplitudes if len(a.factors) == 1)
+        return frozenset(k for a in alone for k in _key(a))
+
+    def inner(self, k: int) -> list[int]:
+        """Return the amplitudes with one factor less."""
+        factors = self.at(k).factors
+        less = (Amplitude((*factors[:i], *factors[i + 1 :])) for i in range(len(factors)))
+        return [at for a in less if (at := self.place(a)) is not None]
+
+    def price(self, sites: int) -> Floats:
+        """(F,) log of the number of candidates of the same complexity, and of 2 per unit of it."""
+        count = np.bincount(self.cost) * sites
+        return np.asarray(np.log(count[self.cost]) + log(2.0) * self.cost)
+
+    def price_of(self, a: Amplitude, sites: int) -> float:
+        """Return the same of any product: as if all of its complexity had been tried."""
+        if len(a.factors) == 1 and isinstance(u := a.factors[0].variable, Composed):
+            # Further products of a sum are paid for where they are added.
+            argument = float(self.price_of_argument(np.array(u.terms[0][1].cost)))
+            return argument + log(SHAPES * sites) + log(2.0) * a.factors[0].shape.cost
+        kind = a.cost, len(a.factors)
+        count = self._counts.get(kind, self._counts.get((a.cost, 0), 1))
+        return log(max(count, 1) * sites) + log(2.0) * a.cost
+
+    @cached_property
+    def _counts(self) -> dict[tuple[int, int], int]:
+        """Number of products by complexity and factors; by complexity, those of `amplitudes`."""
+        n = np.bincount([f.cost for f in self.singles], minlength=4).tolist()
+        own = np.bincount(self.cost).tolist()
+        return {
+            (4, 2): comb(n[2], 2) + n[1] * n[3],
+            (3, 3): comb(n[1], 3),
+            (4, 3): comb(n[1], 2) * n[2],
+            **{(cost, 0): count for cost, count in enumerate(own)},
+        }
+
+    def price_of_argument(self, cost: Ints) -> Floats:
+        """Log of the number of arguments of complexities (…), and of 2 per unit of them."""
+        return np.asarray(self._of_argument[cost])
+
+    @cached_property
+    def _of_argument(self) -> Floats:
+        """(C,) log of the number of products in arguments, and of 2 per unit, by complexity."""
+        count = np.bincount(self.cost[self.smooth], minlength=ARGUMENT + 1)
+        return np.asarray(np.log(np.maximum(count, 1)) + log(2.0) * np.arange(len(count)))
+
+    @cached_property
+    def smooth(self) -> Ints:
+        """(F',) products of which composed quantities are made: without a bend, and simple."""
+        found = [k for k, a in enumerate(self.amplitudes) if _smooth(a)]
+        return np.array(sorted(found, key=lambda k: self.cost[k]), dtype=np.int_)
+
+    @cached_property
+    def unit_of_smooth(self) -> dict[int, str]:
+        """Unit of each of these."""
+        return {k: self.at(k).unit() for k in self.smooth.tolist()}
+
+    @cached_property
+    def depends(self) -> tuple[frozenset[str], ...]:
+        """Names of the quantities that each amplitude depends on."""
+        return tuple(frozenset(a.names) for a in self.amplitudes)
+
+
+def _smooth(a: Amplitude) -> bool:
+    kinds = {f.variable.kind for f in a.factors}
+    if not 0 < a.cost <= ARGUMENT or not kinds <= COMPOSED_OF | {"sum"}:
+        return False
+    if len(a.factors) > 1 and "sum" in kinds:
+        return False
+    return all(
+        f.shape.name == "linear"
+        or (f.shape.name in ("cos", "sin") and f.numbers[0] <= WAVES_OF_ARGUMENT)
+        or (f.shape.name == "even" and f.numbers[0] == 2)
+        for f in a.factors
+    )
+
+
+def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
+    return frozenset((f.variable.symbol, f.shape.name, f.numbers) for f in a.factors)
+
+
+def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
+    """Return all products of the functions of the quantities.
+
+    Args:
+        known: the quantities.
+        s: the situation of the readings.
+        poses: number of poses, which limits the multiples of an angle; see `FINEST`.
+    """
+    singles = [f for v in known for f in functions(v, v.read(s), MOST)]
+    singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
+    value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
+    cost = np.array([f.cost for f in singles])
+    flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))
+    pairs: list[tuple[int, int]] = [(-1, -1)] + [
+        (i, -1) for i in range(len(singles)) if cost[i] <= MOST
+    ]
+    curved = np.flatnonzero((cost < MOST) & ~flat).tolist()
+    for at, i in enumerate(curved):
+        for k in curved[at + 1 :]:
+            if cost[i] + cost[k] <= MOST and different(singles[i], singles[k]):
+                pairs.append((i, k))
+    value = np.vstack([value, np.ones(value.shape[1])])
+    values, size, kept = _products(value, np.array(pairs))
+    amplitudes = tuple(
+        Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
+    )
+    place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
+    turned = _turned(singles)
+    partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    alone = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
+    first, second = np.array(pairs)[kept].T
+    less = np.where(second >= 0, [alone[second + 1], alone[first + 1]], -1)
+    return Grammar(
+        known,
+        amplitudes,
+        values,
+        size,
+        np.array([a.cost for a in amplitudes]),
+        partner,
+        less,
+        s,
+        tuple(
+            f
+            for f, same in zip(singles, flat.tolist(), strict=True)
+            if not same and f.shape not in (shapes.FINE_COS, shapes.FINE_SIN)
+        ),
+    )
+
+
+def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
+    """Products of pairs of rows, each with root mean square 1, some at a time to save memory.
+
+    Args:
+        value: (C, N) functions.
+        pairs: (F, 2) rows of both factors.
+
+    Returns:
+        (F', N) products in single precision, (F',) what they were divided by, and which of the
+        pairs they are: those that are not zero throughout.
+    """
+    size = np.empty(len(pairs))
+    for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):
+        first, second = pairs[part].T
+        size[part] = np.sqrt(np.mean((value[first] * value[second]) ** 2, axis=1))
+    kept = np.flatnonzero(size > 0)
+    out: Floats = np.empty((len(kept), value.shape[1]), dtype=np.float32)
+    for part in (slice(a, a + SOME) for a in range(0, len(kept), SOME)):
+        first, second = pairs[kept[part]].T
+        out[part] = value[first] * value[second] / size[kept[part], None]
+    return out, size[kept], kept
+
+
+def _turned(singles: list[Factor]) -> dict[int, int]:
+    """Sine by cosine of the same quantity."""
+    place = {(id(f.variable), f.shape.name, f.numbers): k for k, f in enumerate(singles)}
+    return {
+        k: place[id(f.variable), "sin", f.numbers]
+        for k, f in enumerate(singles)
+        if f.shape.name == "cos"
+    }
+
+
+def _partner(
+    pair: tuple[int, int], turned: dict[int, int], place: dict[tuple[int, int], int]
+) -> int:
+    for at, k in enumerate(pair):
+        if k in turned:
+            other = [*pair]
+            other[at] = turned[k]
+            low, high = sorted(other, key=lambda i: (i < 0, i))
+            return place.get((low, high), -1)
+    return -1

@@ -1,0 +1,131 @@
+"""A law refined and refitted: free exponents and scales, then the exact model.
+
+Numbers in the functions of a law, as an exponent or a saturation, are taken from a coarse grid by
+the search. They are refined where the sum of squares that the law leaves is least, its coefficients
+and the model's projected out. A refined number is kept where it gains more evidence than a number
+costs, else the one of the grid, which is simpler.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal.discovery.free_numbers import free_numbers, with_values
+from hilcal.discovery.law import LETTERS, Coefficient, Form, ordinary, with_coefficients
+from hilcal.discovery.screen import Screen
+from hilcal.discovery.write_effect import effect_class, source_of_form
+from hilcal.effects.check import check_effect
+from hilcal.effects.protocol import Effect, Situation
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.fit import Fit, fit
+from hilcal.types import Floats
+
+WORTH = 3.0
+"""Gain in log likelihood that a refined number needs, beside ½ ln ν; 20 : 1."""
+DIGITS = 3
+SPANNED = 1e-10
+"""Directions of a law's columns below this share of the largest are rounding."""
+
+
+def refine(screen: Screen, form: Form) -> Form:
+    """Return the law with its free numbers refined, where the readings ask for it."""
+    from scipy.optimize import minimize  # slow to import
+
+    linear = screen.linear
+    s = linear.fit.solution.prediction.situation
+    free = free_numbers(form, s)
+    if not free:
+        return form
+    best = left_by(screen, form, s)
+
+    def at(x: Floats) -> list[float]:
+        return [number.at(v) for number, v in zip(free, x.tolist(), strict=True)]
+
+    def objective(x: Floats) -> float:
+        values = at(x)
+        if not np.isfinite(values).all():
+            return np.inf
+        return left_by(screen, with_values(form, free, values), s)
+
+    found = minimize(
+        objective, np.zeros(len(free)), method="Nelder-Mead",
+        options={"maxfev": 60 * len(free), "xatol": 1e-3, "fatol": 1e-3,
+                 "initial_simplex": _simplex(len(free))},
+    )  # fmt: skip
+    values = [float(f"{v:.{DIGITS}g}") for v in at(found.x)]
+    refined = with_values(form, free, values)
+    after = left_by(screen, refined, s)
+    dof = linear.fit.dof
+    gain = 0.5 * dof * np.log(best / max(after, 1e-300))
+    return refined if gain > len(free) * (0.5 * np.log(dof)) + WORTH else form
+
+
+def _simplex(count: int) -> Floats:
+    return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
+
+
+def left_by(screen: Screen, form: Form, s: Situation) -> float:
+    """Sum of squares that a law leaves, by algebra; infinite where it is not finite."""
+    linear = screen.linear
+    x = form.columns(screen, s)
+    if not np.isfinite(x).all():
+        return np.inf
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return linear.rss - float(x.T @ linear.residual @ step)
+
+
+def by_algebra(screen: Screen, form: Form, s: Situation) -> Floats:
+    """(P,) coefficients at the linearisation, in ordinary motions."""
+    x, linear = form.columns(screen, s), screen.linear
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return np.asarray(step, dtype=float)
+
+
+def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
+    """Return the coefficients by algebra, without their uncertainties."""
+    s = screen.linear.fit.solution.prediction.situation
+    step = by_algebra(screen, form, s) * ordinary(form)
+    return tuple(
+        Coefficient(LETTERS[k], float(v), float("nan"), form.unit(k)) for k, v in enumerate(step)
+    )
+
+
+def exact(
+    screen: Screen, form: Form, name: str
+) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
+    """Refit the model with the law as an effect that keeps to the protocol.
+
+    A coefficient that the model absorbs is dropped, as the zero of a compliance that grows with
+    time, a τ (t − t0), beside a compliance of the model: it is no part of what is found.
+
+    Returns:
+        The fit, the law as it was fitted, its coefficients, and the effect.
+
+    Raises:
+        CannotAnswerError: the readings do not determine the law, or the model finds no equilibrium
+            with it.
+        InputError: the effect does not keep to the protocol.
+    """
+    before = screen.linear.fit
+    s = before.solution.prediction.situation
+    while True:
+        letters = LETTERS[: form.count]
+        kind = effect_class(source_of_form(form, name, at_linearisation(screen, form)), name)
+        check_effect(kind, before.model.cell)
+        effect = kind(before.model.cell, s.states)
+        model = replace(before.model, effects=(*before.model.effects, effect))
+        start = np.concatenate([before.theta, np.zeros(form.count)])
+        after = fit(model, before.readings, before.mode, before.scaling, start)
+        rows = model.slices()[-1]
+        values, std = after.theta[rows], after.uncertainty.std[rows]
+        determined = np.isfinite(std)
+        if determined.all():
+            break
+        if not determined.any():
+            raise CannotAnswerError("the readings do not determine it beside the model")
+        form = with_coefficients(form, np.flatnonzero(determined).tolist())
+    found = tuple(
+        Coefficient(letter, float(values[k]), float(std[k]), form.unit(k))
+        for k, letter in enumerate(letters)
+    )
+    return after, form, found, kind

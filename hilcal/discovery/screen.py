@@ -1,0 +1,218 @@
+"""All candidates at once: every site times every amplitude, whitened and projected off the model.
+
+The column of site s and amplitude a is linear in a: x = T_s a with T_s (R, N) the whitened motion
+of each reading by an ordinary motion of the site. So for all amplitudes A (F, N) of a site
+
+    xᵀ v  = A (T_sᵀ v),        xᵀ M x = diag(A Q_s Aᵀ),    Q_s = T_sᵀ M T_s (N, N)
+
+and no column is formed: a million candidates take seconds. Many readings are thinned to whole poses
+for this; what is short-listed is scored on all of them.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hilcal.discovery.amplitudes import Amplitude
+from hilcal.discovery.bends import Bends, bends
+from hilcal.discovery.grammar import Grammar, grammar
+from hilcal.discovery.sites import Site, site_motions
+from hilcal.discovery.variables import variables
+from hilcal.identification.fit import Fit
+from hilcal.identification.linearisation import Linearisation
+from hilcal.regression.projection import projection
+from hilcal.types import Bools, Floats, Ints
+
+MOST_READINGS = 400
+"""Readings that the screening uses at most; a choice, by time: it takes their square."""
+SEEN = 1e-4
+"""Share that must be left of a column's square, of what the readings move each by itself. Less is
+explained by the model, or cancels in deflections, and single precision does not resolve it."""
+ALIKE = 1 - 1e-9
+"""Cosine of two sites' motions from which on they are the same; rounding."""
+LEAST_MOTION = 1e-4
+"""Square of a column that counts as none, in units of the noise: all readings together move by less
+than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
+
+
+@dataclass(frozen=True, eq=False)
+class Screen:
+    """All candidates beside a model.
+
+    Attributes:
+        linear: the fit as a linear problem.
+        grammar: amplitudes.
+        sites: where they act.
+        motion: (N, m, S) motion of each reading by an ordinary motion of each site.
+        rows: (R,) which of the whitened rows the screening uses.
+        readings: (K,) which of the fitted readings it uses.
+        form: (S, R', K) T_s of these rows and readings, single precision.
+        free: (S, K, K) Q_s of these.
+        square: (S, F) xᵀ M x; zero where the model explains a column.
+        across: (S, F) xᵀ M x' with the partner of each amplitude.
+        across_one: (S, F) xᵀ M x' with a constant at the site.
+        across_less: (2, S, F) xᵀ M x' of a product with what is left without either factor.
+    """
+
+    linear: Linearisation
+    grammar: Grammar
+    sites: tuple[Site, ...]
+    motion: Floats
+    rows: Bools
+    readings: Ints
+    form: Floats
+    free: Floats
+    square: Floats
+    across: Floats
+    across_one: Floats
+    across_less: Floats
+
+    @cached_property
+    def price(self) -> Floats:
+        """(F,) what the search costs a candidate, see `grammar`."""
+        return self.grammar.price(len(self.sites))
+
+    @cached_property
+    def alias(self) -> tuple[int, ...]:
+        """(S,) the simplest site that moves every reading as each does, up to a factor.
+
+        So the tilt of a bearing about the axis of the joint before it is that joint's displacement.
+        """
+        flat = self.motion.reshape(-1, len(self.sites))
+        size = np.linalg.norm(flat, axis=0)
+        unit = flat / np.where(size > 0, size, 1.0)
+        same = np.abs(unit.T @ unit) > ALIKE
+        takes = [(s.takes(False), s.takes(True), s.takes(False, True)) for s in self.sites]
+        out = []
+        for k in range(len(self.sites)):
+            others = [o for o in np.flatnonzero(same[k]).tolist() if takes[o] == takes[k]]
+            out.append(min([k, *others], key=lambda o: (self.sites[o].rank, o)))
+        return tuple(out)
+
+    @cached_property
+    def one(self) -> int:
+        """Index of the constant amplitude."""
+        return self.grammar.amplitudes.index(Amplitude(()))
+
+    def visible(self, site: int, amplitude: int) -> bool:
+        """Whether the model leaves something of a candidate; unknown where it is grown."""
+        return amplitude >= len(self.price) or bool(self.square[site, amplitude] > 0)
+
+    def price_of(self, amplitude: int) -> float:
+        """Return what the search costs a candidate, in no or in further products too."""
+        if amplitude < len(self.price):
+            return float(self.price[amplitude])
+        return self.grammar.price_of(self.grammar.at(amplitude), len(self.sites))
+
+    @cached_property
+    def bends(self) -> Bends:
+        """Bends and steps of composed quantities."""
+        return bends(
+            self.grammar, self.sites, self.readings, self.form, self.free, (SEEN, LEAST_MOTION)
+        )
+
+    @cached_property
+    def values(self) -> Floats:
+        """(K, F) amplitudes at the readings of the screening."""
+        return np.ascontiguousarray(self.grammar.values[:, self.readings].T)
+
+    @property
+    def candidates(self) -> int:
+        """Number of candidates that the model does not explain."""
+        return int(np.count_nonzero(self.square))
+
+    def inner(self, v: Floats) -> Floats:
+        """(S, F) xᵀ v of all candidates, v (R,), in single precision."""
+        by_reading = np.einsum("srn,r->sn", self.form, v[self.rows].astype(np.float32))
+        return np.asarray(by_reading @ self.values)
+
+    def columns(self, which: list[tuple[int, int]]) -> Floats:
+        """(R, P) whitened columns of candidates (site, amplitude)."""
+        if not which:
+            return np.zeros((len(self.linear.residual), 0))
+        w = self.linear.fit.whitening
+        site, amplitude = np.array(which).T
+        raw = self.motion[:, :, site] * self.grammar.rows(amplitude.tolist()).T[:, None, :]
+        return w.whiten_readings(raw)
+
+
+def screen(linear: Linearisation) -> Screen:
+    """Prepare the search beside a fit."""
+    fit = linear.fit
+    situation = fit.solution.prediction.situation
+    poses = len(np.unique(fit.pose))
+    words = grammar(variables(situation), situation, poses)
+    places, motion = site_motions(fit)
+    w = fit.whitening
+    rows, readings = _thinned(fit)
+    own = projection(linear.rows[rows], linear.projection.ridge)
+    form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
+    square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)
+    across: Floats = np.zeros_like(square)
+    across_one: Floats = np.zeros_like(square)
+    across_less: Floats = np.zeros((2, *square.shape), dtype=np.float32)
+    every: Floats = np.empty((len(places), len(readings), len(readings)), dtype=np.float32)
+    a = words.values[:, readings]
+    squares = a**2
+    has = np.flatnonzero(words.partner >= 0)
+    kinds = np.array([(x.elastic, x.sensed) for x in words.amplitudes])
+    every_kind = {(bool(e), bool(d)) for e, d in np.unique(kinds, axis=0)}
+    for k in range(len(places)):
+        spread = np.zeros((len(motion), w.m, len(readings)))
+        spread[readings, :, np.arange(len(readings))] = motion[readings, :, k]
+        t = w.whiten_readings(spread)[rows]
+        form[k] = t
+        every[k] = free = own.information(t).astype(np.float32)
+        lifted = a @ free
+        across_one[k] = lifted.sum(axis=1)  # a constant has the value 1
+        across_less[:, k] = _across_factors(words, a, lifted)
+        square[k] = np.einsum("fn,fn->f", lifted, a)
+        across[k, has] = np.einsum("fn,fn->f", lifted[has], a[words.partner[has]])
+        seen = SEEN * (squares @ np.sum(t**2, axis=0).astype(np.float32)) + LEAST_MOTION
+        square[k, square[k] < seen] = 0.0
+        for kind in every_kind:
+            if not places[k].takes(*kind):
+                square[k, (kinds == kind).all(axis=1)] = 0.0
+    return Screen(
+        linear, words, places, motion, rows, readings, form, every, square, across, across_one,
+        across_less,
+    )  # fmt: skip
+
+
+def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
+    """(2, F) xᵀ Q x' of products with what is left without the first, and the second factor.
+
+    With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
+
+    Args:
+        words: the amplitudes.
+        values: (F, K) these, each with root mean square 1.
+        lifted: (F, K) Q of them.
+    """
+    out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
+    products = np.flatnonzero((words.less >= 0).all(axis=0))
+    if not len(products):
+        return out
+    second, first = words.less[:, products]
+    alone, place = np.unique(words.less[:, products], return_inverse=True)
+    g, f = place.reshape(2, -1)
+    v = values[alone]
+    both = v @ (v * lifted[alone]).T
+    scale = words.size[second] * words.size[first] / words.size[products]
+    out[0, products] = both[f, g] * scale
+    out[1, products] = both[g, f] * scale
+    return out
+
+
+def _thinned(fit: Fit) -> tuple[Bools, Ints]:
+    """Return the rows (R,) and readings (K,) that are used: whole poses, at random."""
+    w, kept = fit.whitening, fit.readings[~fit.outlier]
+    if len(kept) <= MOST_READINGS:
+        return np.ones(w.m * len(w), dtype=np.bool_), np.arange(len(kept))
+    group = kept.pose
+    order = np.random.default_rng(20261122).permutation(int(group.max()) + 1)
+    count = np.cumsum(np.bincount(group, minlength=len(order))[order])
+    chosen = order[: max(int(np.searchsorted(count, MOST_READINGS)), 1)]
+    mine = np.isin(group, chosen)
+    return np.repeat(mine[w.reading], w.m), np.flatnonzero(mine)

@@ -1,0 +1,290 @@
+"""Forward selection of laws with backward pruning, the size of the search paid for.
+
+At each step the term with the best odds beside those that are chosen is added (see `problem`), and
+terms are taken out again where the others make them needless. Of terms that odds of 20 : 1 do not
+tell apart the simplest is taken.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from hilcal.discovery.gains import SHORT_LIST
+from hilcal.discovery.problem import Beside, Problem
+from hilcal.discovery.screen import Screen
+from hilcal.discovery.terms import Scored, Term
+from hilcal.regression.forward_selection import families_beside
+from hilcal.types import Floats
+
+BEAM = 3
+"""First terms with which selections are begun; a choice."""
+MOST_TERMS = 3
+"""Terms of a law at most; a choice."""
+MOST_COEFFICIENTS = 8
+"""Coefficients of a law at most; a choice: more is no law that one reads."""
+LEAST = 3.0
+"""Logarithm of the odds, the search paid for, that a further term needs: 20 : 1."""
+FALSE_ALARM = 1e-3
+"""Chance of a first term where nothing is hidden, over the whole search."""
+SAME = 0.98
+"""Correlation of two projected columns from which on they count as the same law."""
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Terms that were chosen.
+
+    Attributes:
+        terms: in the order of choosing them.
+        odds: that each added.
+    """
+
+    terms: tuple[Term, ...]
+    odds: tuple[float, ...]
+
+    @property
+    def total(self) -> float:
+        """Logarithm of the odds of the whole law against none."""
+        return sum(self.odds)
+
+
+def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
+    """Return the best selection of each number of terms, from one on; none where chance would do.
+
+    A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
+
+    Args:
+        problem: the rows to search on.
+        most: terms at most.
+        beam: first terms that are followed.
+    """
+    beside = problem.beside(())
+    found = _ordered(beside)
+    if not found or not _sure(found[0], problem):
+        return []
+    starts = _distinct(problem, found, beam)
+    best: dict[int, Selection] = {}
+    for start in starts:
+        s = Selection((start.term,), (start.odds,))
+        _keep(problem, best, s)
+        while len(s.terms) < most:
+            after = problem.beside(s.terms)
+            further = _ordered(after)
+            if not further or further[0].odds < LEAST:
+                break
+            more = further[0]
+            terms = (*s.terms, more.term)
+            if sum(t.count for t in terms) > MOST_COEFFICIENTS:
+                break
+            grown = _pruned(problem, replace(s, terms=terms, odds=_chain(problem, terms)))
+            if grown.total < s.total + LEAST:
+                break
+            # What was added last is the best beside the others already.
+            s = _exchanged(problem, grown, last=len(grown.terms) - 1)
+            _keep(problem, best, s)
+    return [_plainly(problem.screen, s) for s in worth_their_length(best[k] for k in sorted(best))]
+
+
+def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
+    """Return those that odds of 20 : 1 ask for beside every one before, which is shorter."""
+    out: list[Selection] = []
+    for s in selections:
+        if all(s.total >= shorter.total + LEAST for shorter in out):
+            out.append(s)
+    return out
+
+
+def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
+    """Return laws with another term that the rows do not tell from it, at odds of 20 : 1."""
+    found: list[tuple[float, tuple[Term, ...]]] = []
+    for k in range(len(s.terms)):
+        others = (*s.terms[:k], *s.terms[k + 1 :])
+        beside = problem.beside(others)
+        own = beside.score([s.terms[k]])[0].odds
+        found += [
+            (c.odds - own, (*s.terms[:k], _plain(problem.screen, c.term), *s.terms[k + 1 :]))
+            for c in _ordered(beside)
+            if c.odds > own - LEAST and c.term.parts != s.terms[k].parts
+        ]
+    own_kind = _kind(problem.screen, s.terms)
+    kinds = {own_kind: s.terms}
+    for _, terms in sorted(found, key=lambda x: -x[0]):
+        kinds.setdefault(_kind(problem.screen, terms), terms)
+    return [*kinds.values()][1:]
+
+
+def _kind(screen: Screen, terms: tuple[Term, ...]) -> frozenset[tuple[object, ...]]:
+    """Sites and functions of a law, without the numbers in these."""
+    return frozenset(
+        (s, frozenset((f.variable.symbol, f.shape.name) for f in screen.grammar.at(a).factors))
+        for t in terms
+        for s, a in t.parts
+    )
+
+
+def _ordered(beside: Beside) -> list[Scored]:
+    """Score the short list, best first; the simplest of those that odds of 20 : 1 do not tell."""
+    found = sorted(beside.score(beside.shortlist()), key=lambda c: -c.odds)
+    if not found:
+        return []
+    as_good = [c for c in found if c.odds > found[0].odds - LEAST]
+    first = min(as_good, key=lambda c: _preference(beside.problem.screen, c))
+    return [first, *(c for c in found if c is not first)]
+
+
+def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
+    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest.
+
+    The rank of functions decides only where the odds are the same to within one.
+    """
+    *simple, functions = _simplicity(screen, c.term)
+    return (*simple, -round(c.odds), functions, -c.odds)
+
+
+def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
+    """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
+
+    A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
+    free zero of a factor is no less simple than an exponent of 4. Of causes that the readings do
+    not tell apart, as joints that warm alike, the one of the joint itself is simpler than that of
+    another. A joint's temperature seldom moves anything but this joint and stands for whatever
+    else changes with time: elsewhere it counts a unit more.
+    """
+    amplitudes = [screen.grammar.at(a) for _, a in t.parts]
+    cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
+    sites = max(screen.sites[s].rank for s, _ in t.parts)
+    functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
+    far = [
+        [(_far(f.variable.joint, screen.sites[s].joint), f.variable.kind) for f in a.factors]
+        for a, (s, _) in zip(amplitudes, t.parts, strict=True)
+    ]
+    apart = max(sum(distance for distance, _ in each) for each in far)
+    cost += any((2, "temperature") in each for each in far)
+    return t.count + cost, sites, apart, functions
+
+
+def _far(quantity: int, site: int) -> int:
+    """Whether a quantity is that of the site's own joint (0), of none (1), or of another (2)."""
+    if quantity == site:
+        return 0
+    return 1 if quantity < 0 else 2
+
+
+def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:
+    count = len(s.terms)
+    if count not in best or _better(problem, s, best[count]):
+        best[count] = s
+
+
+def _plainly(screen: Screen, s: Selection) -> Selection:
+    """Name the simplest of the sites that move all readings alike."""
+    return replace(s, terms=tuple(_plain(screen, t) for t in s.terms))
+
+
+def _plain(screen: Screen, t: Term) -> Term:
+    places = {place for place, _ in t.parts}
+    if len(places) > 1:
+        return t
+    return replace(t, parts=tuple((screen.alias[place], f) for place, f in t.parts))
+
+
+def _better(problem: Problem, s: Selection, other: Selection) -> bool:
+    """Whether a law is more likely, or simpler where odds of 20 : 1 do not tell them apart."""
+    if abs(s.total - other.total) > LEAST:
+        return s.total > other.total
+    return _extent(problem, s.terms) < _extent(problem, other.terms)
+
+
+def _sure(c: Scored, problem: Problem) -> bool:
+    """Whether chance would not do the same, over the whole search."""
+    return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
+        FALSE_ALARM
+    )
+
+
+def _distinct(problem: Problem, found: list[Scored], count: int) -> list[Scored]:
+    """Return the best terms that are not the same law."""
+    out: list[Scored] = []
+    units: list[Floats] = []
+    for c in found[:SHORT_LIST]:
+        if c.odds < LEAST:
+            break
+        x = problem.columns(c.term)
+        fit = problem.model.project_out(x) @ c.score.step
+        size = float(np.linalg.norm(fit))
+        if size == 0:
+            continue
+        fit = fit / size
+        if all(abs(float(fit @ u)) < SAME for u in units):
+            out.append(c)
+            units.append(fit)
+        if len(out) == count:
+            break
+    return out
+
+
+def _pruned(problem: Problem, s: Selection) -> Selection:
+    """Take out terms that the others make needless."""
+    while len(s.terms) > 1:
+        worth = []
+        for k, term in enumerate(s.terms):
+            others = (*s.terms[:k], *s.terms[k + 1 :])
+            worth.append(problem.beside(others).score([term])[0].odds)
+        weakest = int(np.argmin(worth))
+        if worth[weakest] >= LEAST:
+            return replace(s, odds=_chain(problem, s.terms))
+        terms = (*s.terms[:weakest], *s.terms[weakest + 1 :])
+        terms = (replace(terms[0], price=terms[0].alone), *terms[1:])
+        s = replace(s, terms=terms, odds=_chain(problem, terms))
+    return s
+
+
+def _exchanged(problem: Problem, s: Selection, last: int) -> Selection:
+    """Exchange each term, up to some, for a better one beside the others.
+
+    These were not there when it was chosen.
+    """
+    for k in range(last):
+        others = (*s.terms[:k], *s.terms[k + 1 :])
+        found = _ordered(problem.beside(others))
+        if not found or found[0].term.parts == s.terms[k].parts:
+            continue
+        terms = (replace(others[0], price=others[0].alone), *others[1:], found[0].term)
+        if sum(t.count for t in terms) > MOST_COEFFICIENTS:
+            continue
+        other = replace(s, terms=terms, odds=_chain(problem, terms))
+        if _better(problem, other, s):
+            s = other
+    return s
+
+
+def _extent(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
+    """Number of quantities, of sites, of coefficients; how simple the terms are."""
+    screen = problem.screen
+    parts = [part for t in terms for part in t.parts]
+    names = {n for _, f in parts for n in screen.grammar.at(f).names}
+    each = np.sum([_simplicity(screen, t) for t in terms], axis=0)
+    return len(names), len({s for s, _ in parts}), *each.tolist()
+
+
+def _chain(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
+    """Odds of each term beside those before it, whose coefficients keep their priors.
+
+    So they add up to the odds of the whole law, and compare with those of effects.
+    """
+    x = [problem.columns(t) for t in terms]
+    ends = np.cumsum([0, *(c.shape[1] for c in x)])
+    places = {str(k): slice(int(a), int(b)) for k, (a, b) in enumerate(pairwise(ends))}
+    whole = np.hstack(x)
+    families = families_beside(
+        problem.model.information(whole), problem.residual, problem.dof, whole, places, {}
+    )
+    out = []
+    for k, term in enumerate(terms):
+        score = families.scores()[str(k)]
+        out.append(score.log_evidence - term.price)
+        if score.rank:
+            families = families.with_family(str(k), score)
+    return tuple(out)

@@ -1,0 +1,183 @@
+"""Where a law may act: joints, bearings, links, base, target, tracker, and the force sensor.
+
+A site is a unit motion, or a unit error of the force sensor: recorded = true + error.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.effects.force_sensor import acting_columns
+from hilcal.effects.protocol import Columns, Effect, Field, Parameter, Situation
+from hilcal.identification.fit import Fit
+from hilcal.readings.readings import States
+from hilcal.types import Floats
+
+ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
+"""An ordinary motion, by unit: 0.1 mrad, 0.1 mm, 10 ppm of the distance, and an ordinary error of
+a force sensor; a choice. It only sets the range of strengths that the evidence tries, which is a
+million wide."""
+Place = Field | Literal["sensor"]
+SETUP = ("target", "tracker", "force sensor")
+"""What is set up anew for another campaign of the same arm."""
+_AXES = "xyz"
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """A unit motion.
+
+    Attributes:
+        field: of `Deviation`; "sensor" for the recorded wrench, flange axes.
+        element: joint or slot; 0 where the field has none.
+        axis: component of the twist; 0 for joints and the scale.
+        group: what moves, e.g. "joint 2 bearing tilts".
+        words: the same with the axis.
+        symbol: in formulas.
+        latex: likewise.
+        unit: rad, m, 1, N or N·m.
+        joint: index of the joint that it belongs to; −1 for none.
+    """
+
+    field: Place
+    element: int
+    axis: int
+    group: str
+    words: str
+    symbol: str
+    latex: str
+    unit: str
+    joint: int = -1
+
+    @property
+    def rank(self) -> int:
+        """Order in which equally good sites are shown: joints, base, target, others."""
+        first = self.group.split(",")[0]
+        if self.field == "dq":
+            return 0
+        return {"base": 1, "target": 2, "tracker": 3}.get(first, 4) + (self.axis > 2)
+
+    @property
+    def of_setup(self) -> bool:
+        """Whether it is of the setup of a campaign, not of the arm."""
+        return self.group.split(",")[0] in SETUP
+
+    def takes(self, elastic: bool, sensed: bool = False) -> bool:
+        """Whether a law that depends on transmitted or on recorded wrenches, or not, may act here.
+
+        Transmitted wrenches move parts of the arm only. They move the base as the frame of joint 1,
+        other causes as the frame of the base itself. What the force sensor reads, in its own axes,
+        is the cause of its own errors only.
+        """
+        if self.field == "sensor" or sensed:
+            return self.field == "sensor" and not elastic
+        if self.field == "twist" and self.element == 0:
+            return elastic
+        return not elastic or self.field in ("dq", "twist")
+
+
+def sites(n: int) -> tuple[Site, ...]:
+    """Return all sites of an arm of n joints."""
+    out = [
+        Site("dq", j, 0, f"joint {j + 1}", f"joint {j + 1}", f"dq_{j + 1}",
+             rf"\delta q_{j + 1}", "rad", j)
+        for j in range(n)
+    ]  # fmt: skip
+    out += _twists(0, "base", "base", "b", (0, 1, 2))
+    out += _twists(0, "base, tilt", "tilt_base", r"\beta", (3, 4))
+    out += _twists(0, "base", "base", "b", (0, 1, 2), field="base")
+    out += _twists(0, "base, tilt", "tilt_base", r"\beta", (3, 4), field="base")
+    for j in range(1, n):
+        k = j + 1
+        out += _twists(j, f"joint {k}, tilt of its axis", f"tilt{k}", rf"\theta_{k}", (3, 4), j)
+        out += _twists(j, f"joint {k}, play along its axis", f"axial{k}", f"a_{k}", (2,), j)
+    out += _twists(n, "flange", "bend", r"\phi", (3, 4, 5))
+    out += _twists(n, "target", "target", "p", (0, 1, 2))
+    out += _twists(0, "tracker", "tracker", "s", (0, 1, 2), field="station")
+    out += _twists(0, "tracker, turn", "turn", r"\sigma", (3, 4, 5), field="station")
+    scale = "tracker, scale of its distances"
+    out.append(Site("scale", 0, 0, scale, scale, "scale", r"\mu", "1"))
+    for c in range(6):
+        kind, way, letter = ("force", "along", "f") if c < 3 else ("moment", "about", "m")
+        group, axis = f"force sensor, {kind}", _AXES[c % 3]
+        out.append(
+            Site(
+                "sensor", 0, c, group, f"{group} {way} {axis}", f"sensor_{letter}{axis}",
+                rf"h_{{{letter}{axis}}}", "N" if c < 3 else "N·m",
+            )
+        )  # fmt: skip
+    return tuple(out)
+
+
+def _twists(
+    element: int,
+    group: str,
+    symbol: str,
+    latex: str,
+    axes: tuple[int, ...],
+    joint: int = -1,
+    field: Field = "twist",
+) -> list[Site]:
+    out = []
+    for c in axes:
+        axis, way = _AXES[c % 3], "along" if c < 3 else "about"
+        out.append(
+            Site(
+                field, element, c, group, f"{group} {way} {axis}", f"{symbol}_{axis}",
+                f"{latex}^{axis}", "m" if c < 3 else "rad", joint,
+            )
+        )  # fmt: skip
+    return out
+
+
+class UnitMotions(Effect):
+    """A constant unit motion at every site; for its Jacobian at the equilibrium of a fit."""
+
+    name = "unit_motions"
+    summary = "a constant at every site"
+
+    def setup(self, states: States) -> None:
+        """List the sites."""
+        self.sites = sites(self.cell.arm.n)
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """One per site."""
+        return tuple(Parameter(s.words, s.unit, ORDINARY[s.unit]) for s in self.sites)
+
+    def columns(self, s: Situation) -> tuple[Columns, ...]:
+        """Return a one in the place of each site."""
+        out = []
+        for field in dict.fromkeys(x.field for x in self.sites):
+            if field == "sensor":
+                continue
+            mine = [k for k, site in enumerate(self.sites) if site.field == field]
+            mine.sort(key=lambda k: self.sites[k].element)
+            wide = field not in ("dq", "scale")
+            values = np.zeros((1, len(mine), 6)) if wide else np.ones((1, len(mine)))
+            if wide:
+                for at, k in enumerate(mine):
+                    values[0, at, self.sites[k].axis] = 1.0
+            element = np.array([self.sites[k].element for k in mine])
+            out.append(Columns(field, np.array(mine), element, values))
+        return tuple(out)
+
+    def wrench_columns(self, theta: Floats, s: Situation) -> Floats:
+        """Return what unit errors of the force sensor do to the slot wrenches."""
+        errors = np.zeros((1, len(self.sites), 6))
+        for k, site in enumerate(self.sites):
+            if site.field == "sensor":
+                errors[0, k, site.axis] = 1.0
+        return acting_columns(s, errors)
+
+
+def site_motions(fit: Fit) -> tuple[tuple[Site, ...], Floats]:
+    """Return the sites and (N, m, S) motion of each reading by an ordinary motion of each."""
+    cell: Cell = fit.model.cell
+    states = fit.solution.prediction.situation.states
+    unit = UnitMotions(cell, states)
+    jacobian = fit.model.jacobian_of((unit,), fit.solution.prediction, fit.theta, fit.whitening.m)
+    scale = np.array([p.scale for p in unit.parameters])
+    return unit.sites, jacobian * scale

@@ -1,1 +1,0 @@
-"""Many campaigns of many arms: what arms of a type have in common, and which differ."""

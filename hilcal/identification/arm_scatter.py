@@ -1,0 +1,200 @@
+"""The arm's own scatter, estimated from a residual that nothing predicts.
+
+On top of the stated covariance V_0 of the readings, an arrival k of the arm adds F_k ε_k with
+
+    joints        F_k = R J_k,      ε_k ~ N(0, σ² 1)
+    each joint    F_k = R J_k,      ε_k ~ N(0, diag(σ_1², ..., σ_n²))
+    isotropic     F_k = 1 (3 × 3),  ε_k ~ N(0, σ² 1), the position of the target
+
+J_k the Jacobian of the target, R the orientation of the base in the sensor's frame. Readings of one
+arrival have ε_k in common, deflections that of their unloaded reading. The σ are variance
+components of the whitened residual, with the parameters of the model projected out (REML, see
+`regression.variance_components`). The kind is that of the largest evidence, ℓ − ½ c log dof for c
+components (Schwarz). The rival is V = f V_0, an instrument that is noisier than stated: the
+difference of their evidences says whether the readings tell the two apart.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.wide_effects import measured_columns
+from hilcal.model.model import Model
+from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
+from hilcal.regression.factored import Factored, Tall
+from hilcal.regression.variance_components import (
+    BlockRows,
+    VarianceComponents,
+    variance_components,
+)
+from hilcal.types import Floats, Ints
+
+MOST_ROWS = 4000
+"""Whitened rows that are used at most, of poses chosen at random, for speed; a choice: a σ of
+hundreds of arrivals is known to a few per cent."""
+KINDS: tuple[ScatterKind, ...] = ("joints", "each joint", "isotropic")
+
+
+def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, ...]:
+    """Return F (N, m, k) for unit σ of each component.
+
+    Args:
+        cell: with the registration and the targets as the model has them.
+        readings: N readings.
+        kind: of the scatter.
+    """
+    m = readings.m
+    if kind == "isotropic":
+        return (np.tile(np.eye(m)[:, :3], (len(readings), 1, 1)),)
+    f = joint_factors(cell, readings, np.ones(cell.arm.n))
+    return (f,) if kind == "joints" else tuple(f[:, :, [j]] for j in range(f.shape[2]))
+
+
+def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Readings:
+    """Return the readings with an estimated scatter in their covariance.
+
+    Args:
+        cell: as for `factors`.
+        readings: with the stated covariance.
+        scatter: the estimate.
+    """
+    parts = zip(factors(cell, readings, scatter.kind), scatter.std, strict=True)
+    f = np.concatenate([std * factor for factor, std in parts], axis=2)
+    return replace(
+        readings,
+        covariance=readings.covariance + f @ np.swapaxes(f, 1, 2),
+        common=None if readings.states.target is None else f,
+        stated=readings.covariance,
+        arm_scatter=scatter,
+    )
+
+
+def with_prior_scatter(model: Model, readings: Readings) -> Readings:
+    """Return the readings with the arm's scatter as the model's carried prior has it.
+
+    As they are where their covariance has one, where the prior knows of none, and without a prior:
+    an arm's scatter is carried over like its parameters.
+    """
+    scatter = None if model.prior is None else model.prior.posterior.scatter
+    if scatter is None or readings.scatter_stated or readings.arm_scatter is not None:
+        return readings
+    return with_arm_scatter(model.cell, readings, scatter)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whitened:
+    """What the components are estimated from: readings, scaling, residual (R,), columns (R, K)."""
+
+    readings: Readings
+    w: Whitening
+    y: Floats
+    rows: Tall
+
+    def blocks(self, components: list[list[Floats]]) -> list[BlockRows]:
+        """Rows in blocks, with the whitened blocks of each component."""
+        out, at = [], 0
+        for k, b in enumerate(self.w.buckets):
+            groups, size = len(b.loaded), b.factor.shape[-1]
+            stop = at + groups * size
+            y = self.y[at:stop].reshape(groups, size)
+            rows = self.rows
+            if not isinstance(rows, Factored):  # which has one bucket
+                rows = rows[at:stop].reshape(groups, size, rows.shape[1])
+            out.append(BlockRows(y, rows, np.stack([c[k] for c in components])))
+            at = stop
+        return out
+
+    def component(self, factor: Floats) -> list[Floats]:
+        """Whitened covariance of each bucket (G, S, S) by a factor F (N, m, k)."""
+        common = None if self.readings.common is None else factor
+        covariance = factor @ np.swapaxes(factor, 1, 2)
+        of = replace(self.readings, covariance=covariance, common=common, serial=None)
+        parts = zip(self.w.buckets, covariance_blocks(of, self.w), strict=True)
+        return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
+
+    def instrument(self) -> list[Floats]:
+        """The same for the stated covariance itself."""
+        seen = [np.any(b.factor != 0, axis=2) for b in self.w.buckets]
+        return [s[:, :, None] * np.eye(s.shape[1]) for s in seen]
+
+
+def estimate_arm_scatter(fit: Fit) -> ArmScatter | None:
+    """Estimate the arm's scatter from a gc-scaled fit; None where the residual shows none.
+
+    Args:
+        fit: to readings with their stated covariance alone.
+    """
+    data, ridge = _whitened(fit), fit.solution.equations.basis.prior_precision
+    cell, price = fit.model.cell, 0.5 * float(np.log(fit.dof))
+
+    def maximised(kind: ScatterKind | None) -> VarianceComponents:
+        if kind is None:  # a noisier instrument
+            return variance_components(data.blocks([data.instrument()]), ridge)
+        parts = [data.component(f) for f in factors(cell, data.readings, kind)]
+        return variance_components(data.blocks(parts), ridge)
+
+    found, noisier = {kind: maximised(kind) for kind in KINDS}, maximised(None)
+    evidence = {kind: v.log_likelihood - len(v.variance) * price for kind, v in found.items()}
+    best = max(KINDS, key=lambda kind: evidence[kind])
+    variance = found[best].variance
+    if not variance.any():
+        return None
+    std = np.sqrt(variance)
+    spread = np.sqrt(np.diag(found[best].covariance))
+    error = np.where(std > 0, spread / (2 * np.where(std > 0, std, 1.0)), 0.0)
+    moved = sum(
+        v * np.mean(np.sum(f[:, :3] ** 2, axis=(1, 2)))
+        for v, f in zip(variance, factors(cell, data.readings, best), strict=True)
+    )
+    return ArmScatter(
+        kind=best,
+        std=tuple(std.tolist()),
+        std_error=tuple(error.tolist()),
+        size_m=float(np.sqrt(moved)),
+        log_evidence=float(evidence[best] - noisier.log_likelihood + price),
+        instrument_factor=float(np.sqrt(1.0 + noisier.variance[0])),
+    )
+
+
+def _whitened(fit: Fit) -> _Whitened:
+    """Whiten the residual and the columns of a fit in blocks of whole arrivals."""
+    kept, s = fit.readings[~fit.outlier], fit.solution
+    live = np.flatnonzero(s.estimated)
+    if kept.states.target is not None and kept.common is None:
+        kept = replace(kept, common=np.zeros((len(kept), kept.m, fit.model.cell.arm.n)))
+    chosen = _some_poses(kept, fit.white.size)
+    some = kept[chosen]
+    w = whitening(some, fit.mode, "gc")
+    place = np.zeros(len(kept), dtype=np.int64)
+    place[fit.whitening.reading] = np.arange(len(fit.raw))
+    white = w.whiten(fit.raw[place[chosen[w.reading]]]).reshape(-1)
+    rows = _rows(fit, w, chosen, live)
+    return _Whitened(some, w, white + rows @ s.coordinates(), rows)
+
+
+def _rows(fit: Fit, w: Whitening, chosen: Ints, live: Ints) -> Tall:
+    """Columns (R, K) of a fit, by its identifiable coordinates, in some readings."""
+    s = fit.solution
+    if isinstance(s.tall, Factored) and w.by_reading:
+        columns = measured_columns(fit.model, s.prediction, s.theta, fit.whitening, live)
+        if isinstance(columns, Factored):
+            tall = columns.of(chosen).turned_rows(w.buckets[0].factor)
+            return s.equations.basis.restricted(s.estimated).rows(tall)
+    jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
+    white = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
+    return np.asarray(white @ s.transform[live])
+
+
+def _some_poses(readings: Readings, size: int) -> Ints:
+    """Rows of the readings: all, or those of poses chosen at random for `MOST_ROWS` of `size`."""
+    if size <= MOST_ROWS:
+        return np.arange(len(readings))
+    poses = np.unique(readings.pose)
+    count = max(int(MOST_ROWS / size * len(poses)), 1)
+    chosen = np.random.default_rng(20250304).choice(poses, count, replace=False)
+    return np.flatnonzero(np.isin(readings.pose, chosen))

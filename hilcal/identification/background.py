@@ -1,0 +1,144 @@
+"""The background of a model: effects that predict together, and are not proved one by one.
+
+Every arm has every effect, most of them too small to name. A model with a background has all
+effects of its catalogue that the readings allow, random with a mean of zero and the standard
+deviations that the mixed model estimates (see `hilcal.mixed`). Those that people see as the model
+are named; the others are its background. The prediction is that of all of them.
+"""
+
+from collections.abc import Collection
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+
+from hilcal.effects.protocol import FRAME_ROLES
+from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.mixed_fit import INSTRUMENT, SCATTER, SCATTER_RAD, MixedFit, mixed_fit
+from hilcal.model.model import Model
+from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.types import Floats
+
+MOST_ROWS = 1500
+"""Elements of readings up to which a background is fitted: with more, effects are named one by one
+until nothing is left, and the equations cost the cube of the columns. A choice."""
+SEED = 0
+"""Of the average over the standard deviations, so that equal readings give equal fits."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """The parameters of one effect of a background that have one unit.
+
+    Attributes:
+        effect: its name.
+        std: root of the mean square of their standard deviations, SI.
+        unit: SI unit.
+        rms_m: root of the mean square of what they move the measured positions by, m.
+    """
+
+    effect: str
+    std: float
+    unit: str
+    rms_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Background:
+    """What a background moves; effects that the readings do not tell apart can cancel in it.
+
+    Attributes:
+        rms_m: of all its effects together, m.
+        parts: of each, what moves most first.
+    """
+
+    rms_m: float
+    parts: tuple[Part, ...]
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of its effects."""
+        return tuple(dict.fromkeys(p.effect for p in self.parts))
+
+    def to_json(self) -> dict[str, object]:
+        """Return the key `background` of the contract."""
+        return {"rms_m": self.rms_m, "effects": [asdict(p) for p in self.parts]}
+
+
+def background_of(fit: Fit) -> Background:
+    """Return what the background of a fit moves; nothing where its model has none."""
+    model = fit.model
+    if not model.background:
+        return Background(0.0, ())
+    jacobian = model.jacobian(fit.solution.prediction, fit.theta, 3)
+    moves, parts = fit.whitening.raw(jacobian) * fit.theta, []
+    inside = np.zeros(model.size, dtype=bool)
+    for effect, mine in zip(model.effects, model.slices(), strict=True):
+        if effect.name not in model.background:
+            continue
+        inside[mine] = True
+        units, std = [p.unit for p in effect.parameters], model.random[effect.name]
+        for unit in dict.fromkeys(units):
+            own = np.array([u == unit for u in units])
+            rms = float(np.sqrt(np.mean(std[own] ** 2)))
+            parts.append(Part(effect.name, rms, unit, _rms(moves[:, :, mine][:, :, own])))
+    return Background(_rms(moves[:, :, inside]), tuple(sorted(parts, key=lambda p: -p.rms_m)))
+
+
+def _rms(moves: Floats) -> float:
+    """Root of the mean square of the displacements that columns (D, 3, q) add up to."""
+    return float(np.sqrt(np.mean(np.sum(moves.sum(axis=2) ** 2, axis=1))))
+
+
+def allows_background(of: Fit) -> bool:
+    """Whether the readings are few enough for a background, and no other campaign is the prior.
+
+    A prior of another campaign says of its own effects how large they are.
+    """
+    return len(of.white) <= MOST_ROWS and of.model.prior is None
+
+
+def with_background(of: Fit, named: Collection[str]) -> Fit:
+    """Fit all effects of the catalogue.
+
+    The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
+    factor of the instrument's makes the standard deviations of the effects smaller by as much,
+    which is the same fit. Readings that were set aside as gross errors stay so.
+
+    Args:
+        of: a fit that allows it.
+        named: effects that are not of the background.
+    """
+    readings = of.readings.as_stated()
+    found = mixed_fit(of.model, readings[~of.outlier], of.mode, np.random.default_rng(SEED))
+    if not readings.scatter_stated:
+        readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
+    return fit(background_model(found, named), readings, of.mode, start=found.theta)
+
+
+def _scatter(found: MixedFit) -> ArmScatter:
+    """Return the arm's scatter of a mixed fit, in units of the instrument's noise."""
+    noise = found.std(INSTRUMENT)
+    k = found.problem.names.index(SCATTER)
+    std, error = found.std(SCATTER) / noise * SCATTER_RAD, found.variances.covariance[k, k] ** 0.5
+    moved = joint_factors(found.model.cell, found.readings, np.full(found.model.cell.arm.n, std))
+    return ArmScatter(
+        kind="joints",
+        std=(float(std),),
+        std_error=(float(std * error),),
+        size_m=float(np.sqrt(np.mean(np.sum(moved[:, :3] ** 2, axis=(1, 2))))),
+        log_evidence=0.0,
+        instrument_factor=float(noise),
+    )
+
+
+def background_model(found: MixedFit, named: Collection[str]) -> Model:
+    """Return the model of a mixed fit with the effects that are not named as its background."""
+    std = found.prior_std() / found.std(INSTRUMENT)
+    random = {
+        effect.name: std[mine]
+        for effect, mine in zip(found.model.effects, found.model.slices(), strict=True)
+        if effect.role not in FRAME_ROLES
+    }
+    return replace(found.model, random=random, background=frozenset(random) - frozenset(named))

@@ -1,0 +1,115 @@
+"""The parameters of a fit as a table: name, value, standard uncertainty, unit, identifiable."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, overload
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.toml import suggest
+from hilcal.types import Bools, Floats
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from hilcal.model.model import Model
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """One fitted parameter.
+
+    Attributes:
+        name: effect and parameter, e.g. "joint_compliance.j2".
+        value: estimate, SI; None where the data do not determine it.
+        std: standard uncertainty, SI; None where the data do not determine it.
+        unit: SI unit.
+        identifiable: whether the data determine it.
+    """
+
+    name: str
+    value: float | None
+    std: float | None
+    unit: str
+    identifiable: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Estimates(Sequence[Estimate]):
+    """The fitted parameters, in the order of the model; those of dropped groups are left out.
+
+    Attributes:
+        rows: one per parameter.
+    """
+
+    rows: tuple[Estimate, ...]
+
+    @classmethod
+    def of(
+        cls, model: "Model", theta: Floats, std: Floats, identifiable: Bools, kept: Bools
+    ) -> "Estimates":
+        """Return the parameters (P,) of a model that are `kept`.
+
+        A standard uncertainty (P,) that is infinite stands for none.
+        """
+        names = [(f"{e.name}.{p.name}", p.unit) for e in model.effects for p in e.parameters]
+        seen = identifiable & np.isfinite(std)
+        return cls(
+            tuple(
+                Estimate(
+                    name,
+                    float(theta[k]) if identifiable[k] else None,
+                    float(std[k]) if seen[k] else None,
+                    unit,
+                    bool(identifiable[k]),
+                )
+                for k, (name, unit) in enumerate(names)
+                if kept[k]
+            )
+        )
+
+    def __len__(self) -> int:
+        """Return the number of parameters."""
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Estimate]:
+        """Yield the parameters in order."""
+        return iter(self.rows)
+
+    @overload
+    def __getitem__(self, key: int | str) -> Estimate: ...
+    @overload
+    def __getitem__(self, key: slice) -> Sequence[Estimate]: ...
+    def __getitem__(self, key: int | str | slice) -> Estimate | Sequence[Estimate]:
+        """Return a parameter by place or by name.
+
+        Raises:
+            InputError: no parameter has that name.
+        """
+        if isinstance(key, int | slice):
+            return self.rows[key]
+        for row in self.rows:
+            if row.name == key:
+                return row
+        names = tuple(row.name for row in self.rows)
+        raise InputError(f"no parameter {key!r}{suggest(key, names)}; valid: {', '.join(names)}")
+
+    def to_dicts(self) -> list[dict[str, object]]:
+        """Return one dictionary per parameter, as JSON documents hold them."""
+        return [asdict(row) for row in self.rows]
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Return a pandas data frame, indexed by the names.
+
+        Raises:
+            InputError: pandas is not installed.
+        """
+        try:
+            import pandas as pd
+        except ImportError as error:
+            raise InputError(
+                "to_frame needs pandas, which is not installed: pip install pandas; to_dicts "
+                "returns the same without it"
+            ) from error
+        return pd.DataFrame(self.to_dicts()).set_index("name")

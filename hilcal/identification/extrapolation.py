@@ -1,0 +1,127 @@
+"""Which readings lie outside of what a model was fitted to: in which variable, and by how much.
+
+A model may be wrong wherever nothing was measured, however well it predicts poses left out among
+those that were. A variable is left where a reading is beyond the fitted ones' smallest or largest
+value by more than `MARGIN` of their range; an angle is where it is whole turns on, too, unless the
+model tells them apart (`whole_turns`). Joint angles inside of their ranges can be far from all
+fitted ones as well; then the leverage of a reading is large: the variance of its prediction over
+that of the noise, (J C Jᵀ) V⁻¹ σ⁻² with the largest eigenvalue, compared with h/(1 − h) of the
+fitted measurements, each predicted without itself.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.identification.errors import ErrorBlock
+from hilcal.identification.predictive import Predictive
+from hilcal.identification.validation import Validation
+from hilcal.identification.whole_turns import whole_turns
+from hilcal.readings.ranges import ranges_of, turning_variables, variables
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Whitening, inverse_root
+from hilcal.types import Bools, Floats
+
+FAR = 2.0
+"""Leverage from which a reading is outside, in units of that which only one in a hundred of the
+fitted measurements exceeds; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Beyond:
+    """Readings beyond the fitted range of one variable.
+
+    Attributes:
+        variable: e.g. "joint 2 angle", "force", "leverage".
+        unit: SI.
+        low: smallest fitted value.
+        high: largest fitted value; of the leverage, the limit.
+        count: number of measurements beyond.
+        most: how far the farthest is beyond.
+    """
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+    count: int
+    most: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Extrapolation:
+    """What a fit states of readings that it has not seen, and which of them lie outside.
+
+    Attributes:
+        outside: (D,) measurements that lie outside in any variable.
+        variables: those that are left, most measurements first.
+        stated_m: (D,) standard deviation that the fit states of the 3-D position error, m.
+        z: (D,) error over the stated standard deviation, rms of the elements.
+        inside_error: of the measurements inside; None where there are none.
+        outside_error: of those outside; None where there are none.
+    """
+
+    outside: Bools
+    variables: tuple[Beyond, ...]
+    stated_m: Floats
+    z: Floats
+    inside_error: ErrorBlock | None
+    outside_error: ErrorBlock | None
+
+
+def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
+    """Compare readings with those that a model was fitted to.
+
+    Args:
+        p: what the fit knows.
+        fitted: the readings that it was fitted to.
+        found: the other readings, predicted.
+    """
+    w, other = found.whitening, found.readings
+    prediction = p.model.predict(other.states, p.theta)
+    spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
+    total = spread + noise
+    root = inverse_root(noise)
+    leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
+    outside = np.zeros(len(w.reading), dtype=np.bool_)
+    beyond_any = []
+    known = {r.variable: r for r in ranges_of(fitted.states)}
+    turning = turning_variables(whole_turns(p.model, p.theta))
+    for name, unit, values in variables(other.states):
+        if name not in known:
+            continue
+        r, after, turns = known[name], values[w.reading], name in turning
+        far = r.beyond(after, turning=turns)
+        if far.any():
+            most = float(r.over(after[far], turning=turns).max())
+            beyond_any.append(Beyond(name, unit, r.low, r.high, int(far.sum()), most))
+        outside |= far
+    limit = FAR * float(np.quantile(p.leverage / (1 - p.leverage), 0.99))
+    far = leverage > max(limit, 1e-12)
+    if far.any():
+        most = float(leverage.max() - limit)
+        beyond_any.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
+    outside |= far
+    white = np.einsum("dij,dj->di", inverse_root(total), found.raw)
+    return Extrapolation(
+        outside=outside,
+        variables=tuple(sorted(beyond_any, key=lambda v: -v.count)),
+        stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
+        z=np.sqrt(np.mean(white**2, axis=1)),
+        inside_error=_error(found.raw, w, ~outside),
+        outside_error=_error(found.raw, w, outside),
+    )
+
+
+def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:
+    """Errors of some measurements, each whitened by itself."""
+    if not mine.any():
+        return None
+    distance = np.linalg.norm(raw[mine, :3], axis=1)
+    white = np.einsum("dij,dj->di", inverse_root(w.covariance[mine]), raw[mine])
+    return ErrorBlock(
+        rms_m=float(np.sqrt(np.mean(distance**2))),
+        mean_m=float(distance.mean()),
+        max_m=float(distance.max()),
+        rms_sigma=float(np.sqrt(np.mean(white**2))),
+    )

@@ -1,0 +1,132 @@
+"""The JSON of a fit."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+
+import numpy as np
+
+from hilcal.identification.background import background_of
+from hilcal.identification.before import error_before
+from hilcal.identification.disagreement_words import disagreement_words
+from hilcal.identification.fit import Fit
+from hilcal.identification.frames_document import fit_to_json
+from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.gross_errors import gross_errors
+from hilcal.identification.weight import weight_note
+
+
+def to_json(fit: Fit) -> dict[str, object]:
+    """Keys of the contract, and what else a script may want to know of a fit.
+
+    `value` and `std` are null where the data do not determine a parameter, conditions where
+    there is nothing to condition.
+    """
+    basis, scatter = fit.solution.equations.basis, fit.readings.arm_scatter
+    serial = fit.readings.serial
+    return {
+        "model": list(fit.model.named),
+        "readings": fit.mode,
+        "scaling": fit.scaling,
+        "n_readings": len(fit.readings),
+        "n_measurements": len(fit.raw),
+        "dof": fit.dof,
+        "rank": fit.rank,
+        "converged": fit.solution.converged,
+        "iterations": fit.solution.iterations,
+        "condition": {
+            "unscaled": finite(basis.condition_unscaled),
+            "scaled": finite(basis.condition_scaled),
+        },
+        "parameters": fit.parameters.to_dicts(),
+        "background": background_of(fit).to_json(),
+        "unidentifiable": list(fit.uncertainty.null),
+        "inflated": fit.uncertainty.inflated,
+        "variance_factor": fit.variance_factor,
+        "variance_factor_interval": list(fit.variance_factor_interval),
+        "error": {
+            "before": error_before(fit).to_json(),
+            "fit": fit.error.to_json(),
+            "holdout": fit.holdout.to_json(),
+        },
+        "noise_floor_m": full_prediction(fit).noise_floor,
+        "outliers": outliers(fit),
+        "arm_scatter": None if scatter is None else scatter.to_json(),
+        "serial_noise": None if serial is None else serial.to_json(),
+        "registration": fit.frames.base.tolist(),
+        "frames": fit_to_json(fit),
+        "notes": list(notes(fit)),
+        **prior_to_json(fit),
+    }
+
+
+def prior_to_json(fit: Fit) -> dict[str, object]:
+    """Key `prior`: where it is from, and how far each part of it and the readings disagree.
+
+    `drift` is a standard deviation in ordinary magnitudes, in shrunk families in their strengths.
+    """
+    prior = fit.model.prior
+    if prior is None:
+        return {}
+    found = [
+        {
+            "effect": c.group.effect,
+            "part": c.group.part,
+            "joint": c.group.joint,
+            "moved_sigma": c.moved_sigma,
+            "p_value": c.p_value,
+            "drift": c.drift,
+        }
+        for c in fit.conflicts
+    ]
+    source = asdict(prior.posterior.source)
+    return {"prior": {"source": source, "relation": prior.relation, "effects": found}}
+
+
+def outliers(fit: Fit) -> list[dict[str, object]]:
+    """Readings that were set aside, with their Mahalanobis distance and what they look like."""
+    return [
+        {"pose": g.pose, "load": g.load, "sigma": g.sigma, "reason": g.reason}
+        for g in gross_errors(fit)
+    ]
+
+
+def notes(fit: Fit) -> tuple[str, ...]:
+    """What a reader of the numbers has to know, a sentence each."""
+    out = []
+    if not fit.solution.converged:
+        out.append(
+            f"not converged after {fit.solution.iterations} steps: do not trust the parameters"
+        )
+    if fit.uncertainty.inflated:
+        out.append(
+            "the residuals are larger than the noise, so the errors are not independent: the "
+            "standard uncertainties were widened to what leaving out groups of poses shows"
+        )
+    registered = [e.name for e in fit.model.effects if e.role == "registration"]
+    if fit.mode == "deflection" and registered:
+        out.append(
+            f"deflections do not see where the base is, only how it is turned: {registered[0]} "
+            "is determined by the closed-form registration and by how deflections turn"
+        )
+    if fit.disagreement is not None:
+        out.append(disagreement_words(fit))
+    weight = weight_note(fit)
+    if weight is not None:
+        out.append(weight)
+    return tuple(out)
+
+
+def finite(value: float) -> float | None:
+    """Return a JSON number, null where there is none."""
+    return float(value) if np.isfinite(value) else None
+
+
+def plain(content: object) -> object:
+    """Return JSON content in which every number that is not finite is null."""
+    if isinstance(content, float | np.floating):
+        return finite(float(content))
+    if isinstance(content, Mapping):
+        return {str(k): plain(v) for k, v in content.items()}
+    if isinstance(content, list | tuple):
+        return [plain(v) for v in content]
+    return content

@@ -1,0 +1,165 @@
+"""Readings with their full covariance: what the file states, and the arm's repeatability."""
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig, Tracker
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.registration import register
+from hilcal.readings.covariance import (
+    COVERS,
+    INSTRUMENT,
+    WHOLE,
+    scatter_factor,
+    tracker_covariance,
+    tracker_noise,
+)
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import inverse_root
+from hilcal.robot.chain import drive_jacobian, evaluate
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.stated_noise import rounding_variance, with_rounding
+from hilcal.types import Floats
+
+CovarianceParts = Literal[
+    "instrument", "instrument and repeatability", "instrument and arm as stated", "as imported"
+]
+"""What the covariance of a reading consists of, see `readings.covariance`:
+
+- instrument: the arm's scatter is not in it;
+- instrument and repeatability: J Σ_q Jᵀ of [repeatability] was added;
+- instrument and arm as stated: the table, or the cell, says that the arm's scatter is in it;
+- as imported: by an older version, which added nothing.
+"""
+
+
+def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) -> Readings:
+    """Return all readings of a campaign with their full covariance, see `readings.covariance`.
+
+    The arm's repeatability is added where the stored covariances cover the instrument alone.
+
+    Raises:
+        InputError: there are no readings yet, or they are damaged.
+    """
+    return full_readings(campaign.readings(), campaign.about(COVERS), cell, config)
+
+
+def full_readings(
+    readings: Readings, covers: str | None, cell: Cell, config: CellConfig
+) -> Readings:
+    """Return readings with their full covariance.
+
+    Args:
+        readings: with the covariance of a file or a table.
+        covers: what that covers; None for a file that does not say.
+        cell: the cell.
+        config: its configuration.
+    """
+    parts = covariance_parts(covers, config)
+    joint_std = config.repeatability.per_joint(cell.arm.n)
+    if parts == "instrument and repeatability":
+        return with_joint_scatter(cell, readings, joint_std)
+    if parts == "instrument and arm as stated":
+        return with_common_scatter(cell, readings, joint_std)
+    return replace(readings, scatter_stated=False)
+
+
+def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
+    """Return readings with the instrument's covariance that [tracker] states, as imports make it.
+
+    Args:
+        tracker: the section.
+        readings: N readings.
+
+    Raises:
+        InputError: a reading lies at the tracker's station.
+    """
+    position, station = readings.value[:, :3], tracker.station_m or (0.0, 0.0, 0.0)
+    cov = tracker_covariance(position, tracker_noise(tracker), station, readings.m)
+    return replace(readings, covariance=with_rounding(cov, rounding_variance(position, 1.0))[0])
+
+
+def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
+    """Return what the full covariance of a campaign's readings consists of.
+
+    Args:
+        covers: what the stored covariances cover, as the campaign's file states it.
+        config: of the cell.
+    """
+    if covers == WHOLE:
+        return "instrument and arm as stated"
+    if covers != INSTRUMENT:
+        return "as imported"
+    stated = bool(np.any(np.asarray(config.repeatability.joint_std_rad) > 0))
+    return "instrument and repeatability" if stated else "instrument"
+
+
+def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
+    """Return the readings with the scatter of the joints added to the instrument's covariance.
+
+    V = V_instrument + R J Σ_q Jᵀ Rᵀ with the Jacobian of the nominal arm and R the orientation of
+    the base in the sensor's frame, estimated from the readings where it is unknown. With too few
+    poses to estimate it, the readings are returned as they are; nothing can be fitted to them
+    either. Targets that were read in one arrival have the scatter in common (`Readings.common`).
+
+    Args:
+        cell: the cell.
+        readings: N readings whose covariances are the instrument's alone.
+        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    """
+    factor = _scatter(cell, readings, joint_std)
+    if factor is None:
+        return readings
+    return replace(
+        readings,
+        covariance=readings.covariance + factor @ np.swapaxes(factor, 1, 2),
+        common=None if readings.states.target is None else factor,
+    )
+
+
+def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
+    """Return readings whose covariances include the joints' scatter with what arrivals share of it.
+
+    Only several targets share any. The factor F of a reading is shortened where F Fᵀ is more than
+    its covariance.
+
+    Args:
+        cell: the cell.
+        readings: N readings with their full covariances.
+        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    """
+    factor = None
+    if readings.states.target is not None:
+        factor = _scatter(cell, readings, joint_std)
+    if factor is None:
+        return readings
+    largest = np.linalg.norm(inverse_root(readings.covariance) @ factor, ord=2, axis=(1, 2))
+    return replace(readings, common=factor / np.maximum(largest, 1.0)[:, None, None])
+
+
+def _scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Floats | None:
+    """Factors (N, m, n) of the joints' scatter; None for none, or an unknown registration."""
+    if not np.any(joint_std):
+        return None
+    try:
+        registered = register(cell, readings).cell
+    except CannotAnswerError:
+        return None
+    return joint_factors(registered, readings, joint_std)
+
+
+def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
+    """Return the factors F (N, m, n) of the joints' scatter, see `readings.covariance`.
+
+    Args:
+        cell: with its registration and targets as they are.
+        readings: N readings.
+        joint_std: (n,) standard deviations, rad.
+    """
+    chain = evaluate(cell.arm, readings.states.q)
+    at = cell.target_of(readings.states.target)
+    jac = drive_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
+    return scatter_factor(jac, joint_std, cell.registration[:3, :3], readings.m)

@@ -1,0 +1,247 @@
+"""The linearisation of a fit: evidence and predictions of effects that are not in the model.
+
+The ranking of effects that could be missing and the planning of measurements that separate them
+both use it, so that the planner's power and the diagnosis's test are of the same information.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from hilcal.identification.effect_columns import EffectColumns
+from hilcal.identification.fit import Fit
+from hilcal.identification.folds import random_folds
+from hilcal.identification.gauss_newton import columns_of
+from hilcal.identification.holdout import folds_of
+from hilcal.identification.priors import scales_of
+from hilcal.identification.wide_effects import whitened_columns
+from hilcal.regression.backward_elimination import ReducedModel, eliminate_columns
+from hilcal.regression.evidence import FamilyScore, score_family
+from hilcal.regression.factored import Tall, gram, scaled, written
+from hilcal.regression.leave_out import (
+    FamilyProducts,
+    Fold,
+    family_products,
+    left_out_of_families,
+    left_out_residual,
+)
+from hilcal.regression.paired_test import improves
+from hilcal.regression.projection import Projection
+from hilcal.regression.spectrum import Spectrum
+from hilcal.types import Floats, Ints
+
+LEAST_MISFIT = 3.0
+"""A misfit counts as at least so many standard deviations of χ²; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Reduction of the held-out error by a family.
+
+    Attributes:
+        share: of the misfit; negative where it makes predictions worse.
+        sure: whether the error falls by more than it scatters from pose to pose.
+    """
+
+    share: float
+    sure: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation:
+    """A gc-scaled fit as a linear problem.
+
+    Attributes:
+        fit: the fit.
+        projection: M, off the columns of the fitted model.
+        residual: (R,) whitened residual r, after the remaining step of the model.
+    """
+
+    fit: Fit
+    projection: Projection
+    residual: Floats
+
+    @property
+    def rows(self) -> Floats:
+        """(R, K) whitened Jacobian of the model by identifiable coordinates."""
+        return self.projection.rows
+
+    @cached_property
+    def rss(self) -> float:
+        """‖r‖²."""
+        return float(self.residual @ self.residual)
+
+    @cached_property
+    def left_out(self) -> Floats:
+        """(poses,) squared whitened residual of each pose, predicted without it.
+
+        With the strengths of the fit, as `held_out` predicts with one family more; those of
+        `Fit.left_out` are chosen without the pose.
+        """
+        white = left_out_residual(self.folds, self.projection, self.fit.white)
+        return by_pose(self.fit, white)
+
+    @cached_property
+    def folds(self) -> tuple[Fold, ...]:
+        """The model without each fold of poses."""
+        fit = self.fit
+        return folds_of(fit.model, fit.solution, fit.whitening.rows_of(random_folds(fit.pose)))
+
+    def project_out(self, x: Floats) -> Floats:
+        """Return M X of whitened columns X (R, P)."""
+        return self.projection.project_out(x)
+
+    def information(self, x: Floats | FamilyProducts) -> Floats:
+        """Return S = Xᵀ M X (P, P) of whitened columns X (R, P), or of their products."""
+        if isinstance(x, FamilyProducts):
+            return self.projection.schur(x.whole.gram, x.whole.cross)
+        return self.projection.information(x)
+
+    def products(self, families: Iterable[Tall]) -> list[FamilyProducts]:
+        """Return the products of families of whitened columns, which `held_out` needs."""
+        return family_products(self.folds, self.projection, self.fit.white, families)
+
+    def score(
+        self, x: Floats, s: Floats | Spectrum | None = None, most: float = np.inf
+    ) -> FamilyScore:
+        """Score whitened columns X (R, P) beside the model.
+
+        Args:
+            x: X.
+            s: (P, P) S where it is known, or its spectrum.
+            most: largest plausible strength.
+        """
+        s = self.information(x) if s is None else s
+        return self.score_of(s, x.T @ self.residual, most)
+
+    def score_of(self, s: Floats | Spectrum, g: Floats, most: float = np.inf) -> FamilyScore:
+        """Score a family by S, or its spectrum, and g = Xᵀ r (P,); see `families`."""
+        return score_family(s, g, self.rss, self.fit.dof, most=most)
+
+    def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
+        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were computed together.
+
+        The model's columns and the residual are multiplied by all that were whitened together at
+        once.
+        """
+        own = np.column_stack([self.rows, self.residual])
+        together = next((of.together for of in columns if of.together is not None), None)
+        of_all = None if together is None else own.T @ together
+        out = []
+        for of in columns:
+            if of_all is not None and of.together is together:
+                both = of_all[:, of.within]
+            else:
+                both = (of.tall.T @ own).T
+            lifted = self.projection.inverse_root @ both[:-1]
+            out.append((gram(of.tall) - lifted.T @ lifted, both[-1]))
+        return out
+
+    def misfit(self) -> float:
+        """‖r‖² − dof, the misfit beyond the noise, at least `LEAST_MISFIT` of its σ."""
+        dof = self.fit.dof
+        return float(max(self.rss - dof, LEAST_MISFIT * np.sqrt(2 * dof)))
+
+    def share(self, gain: float) -> float:
+        """Share of the misfit that a reduction of ‖r‖² is, within [0, 1]."""
+        return float(np.clip(gain / self.misfit(), 0.0, 1.0))
+
+    def held_out(self, families: Sequence[tuple[FamilyProducts, FamilyScore]]) -> list[HeldOut]:
+        """Return the reductions of the held-out error by families; see `regression.leave_out`.
+
+        Args:
+            families: products of each, which stands beside the model by itself, and its score,
+                for the ridge.
+        """
+        seen = [(of, found.ridge) for of, found in families if found.rank]
+        left = iter(left_out_of_families(self.folds, self.projection, self.fit.white, seen))
+        return [
+            self._held_out(next(left)) if found.rank else HeldOut(0.0, False)
+            for _, found in families
+        ]
+
+    def _held_out(self, left: Floats) -> HeldOut:
+        """Compare residuals (R,) predicted without their poses with those of the model alone."""
+        noise = self.fit.whitening.rank
+        before, after = self.left_out, by_pose(self.fit, left)
+        misfit = max(float(before.sum()) - noise, LEAST_MISFIT * np.sqrt(2 * noise))
+        gain = float(before.sum() - after.sum())
+        return HeldOut(float(np.clip(gain / misfit, -1.0, 1.0)), improves(before, after))
+
+
+def linearise(fit: Fit) -> Linearisation:
+    """Return the linearisation of a gc-scaled fit."""
+    return Linearisation(fit, fit.solution.projection(), fit.solution.projected_residual())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelColumns:
+    """The columns of a fitted model in ordinary magnitudes of its parameters.
+
+    Those of parameters that are held at zero are left out, but for those by which their effect
+    would be scored as a suspect.
+
+    A carried prior's are by the coordinates in which it is independent.
+
+    Attributes:
+        parameter: (L,) indices of the parameters, or coordinates, ascending.
+        scale: (L,) ordinary magnitudes, SI.
+        white: (R, L) whitened columns.
+        gram: (L, L) their products.
+    """
+
+    parameter: Ints
+    scale: Floats
+    white: Floats
+    gram: Floats
+
+
+def model_columns(fit: Fit) -> ModelColumns:
+    """Return the columns of a fitted model."""
+    model, s, w = fit.model, fit.solution, fit.whitening
+    states = s.prediction.situation.states
+    scored: list[bool] = []
+    for effect in model.effects:
+        names = {p.name for p in effect.for_scoring(states).parameters}
+        scored += [p.name in names for p in effect.parameters]
+    carried = s.space.carried(model.size)
+    kept = (s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried)
+    parameter = np.flatnonzero(kept)
+    scale = s.space.scales(scales_of(model))[parameter]
+    columns: Tall
+    if len(s.space.index):
+        columns = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
+    else:
+        columns = whitened_columns(model, s.prediction, s.theta, w, parameter)
+    columns = scaled(columns, scale)
+    return ModelColumns(parameter, scale, written(columns), gram(columns))
+
+
+def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:
+    """Take an effect out of a fit, at the same linearisation.
+
+    Args:
+        fit: the fit.
+        columns: of its model.
+        effect: name of the effect, which is in its model.
+    """
+    mine = fit.model.slices()[fit.model.names.index(effect)]
+    index, scale, s = columns.parameter, columns.scale, fit.solution
+    theta, prior = s.y[index] / scale, s.prior[index] / scale
+    out = (index >= mine.start) & (index < mine.stop)
+    return eliminate_columns(
+        columns.white, columns.gram, fit.white, theta, prior, out, s.beta, fit.whitening.rank
+    )
+
+
+def by_pose(fit: Fit, white: Floats) -> Floats:
+    """(poses,) sums of squared whitened residuals (R,)."""
+    squares = np.sum(white.reshape(len(fit.pose), -1) ** 2, axis=1)
+    return np.asarray(np.bincount(fit.pose, weights=squares), dtype=float)
+
+
+def left_out_by_pose(fit: Fit) -> Floats:
+    """(poses,) squared whitened residual of each pose, predicted without it."""
+    return by_pose(fit, fit.whitening.whiten(fit.left_out).reshape(-1))

@@ -1,0 +1,318 @@
+"""The mixed model of all effects, fitted to readings.
+
+Every effect of the catalogue that the readings allow takes part, each of its families with a
+variance of its own (see `hilcal.mixed`). The rows are linearised at the joint optimum: at the
+parameters that the mixed model predicts, again until they stay.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.effects.protocol import FRAME_ROLES
+from hilcal.effects.spec import EffectSpec
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.residual import residual
+from hilcal.mixed.families import LogStdPrior, families_of
+from hilcal.mixed.posterior import average
+from hilcal.mixed.prediction import coordinates_covariance
+from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
+from hilcal.mixed.variances import Variances, estimate_variances
+from hilcal.model.model import Model
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
+from hilcal.types import Floats
+
+HARMONICS = 64
+"""Harmonics of a transmission error, whatever the number of poses: those that few poses cannot
+resolve are there all the same, and act as scatter. A choice: teeth of strain wave gears err once a
+turn of the motor, 100 and more times a turn of the joint, by less than any tracker sees."""
+ROUNDS = 5
+"""Most linearisations; a choice, three are usual."""
+CONVERGED = 0.02
+"""Change of the predicted readings, in units of their noise, at which the linearisation stays."""
+SCATTER_RAD = 3e-5
+"""Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
+INSTRUMENT, SCATTER = "instrument", "arm's scatter"
+"""Names of the components of the noise."""
+UNSEEN = -0.5
+"""`independent_rows` gives a row that is not seen the variance -1."""
+LITTLE = 1e-3
+"""Share by which the arm's scatter turns rows that the instrument's parts leave alike."""
+NOISE_SPREAD = 1.5
+"""Of the log of the noise: a factor of 4.5 either way; a choice."""
+FEW_ROWS = 300
+"""Rows up to which the variances are averaged over; beyond, their estimate is as good, and a step
+of the walk costs the cube of the rows. A choice."""
+WALK = 600
+"""Steps of the walk; a choice: twice as many change errors by less than 1 %."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A part of the noise of N readings.
+
+    Attributes:
+        name: of it.
+        covariance: (N, m, m) of a part of ordinary size.
+        prior: of the log of the standard deviation, in that size.
+        common: (N, m, n) F of what readings of one arrival have in common; see `Readings.common`.
+    """
+
+    name: str
+    covariance: Floats
+    prior: LogStdPrior
+    common: Floats | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MixedFit:
+    """All effects at once, fitted to readings.
+
+    Attributes:
+        model: with all effects.
+        readings: that it was fitted to.
+        w: their whitening, by the stated covariance.
+        theta: (P,) parameters.
+        variances: those of the families and of the noise, at the last linearisation.
+        covariance: (K, K) of the errors of the coordinates.
+    """
+
+    model: Model
+    readings: Readings
+    w: Whitening
+    theta: Floats
+    variances: Variances
+    covariance: Floats
+
+    @property
+    def problem(self) -> MixedProblem:
+        """The linear problem at the last linearisation."""
+        return self.variances.equations.problem
+
+    def std(self, name: str) -> float:
+        """Return the estimated standard deviation of a family or of a component of the noise."""
+        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
+
+    def prior_std(self) -> Floats:
+        """(P,) standard deviations of the parameters; infinite for frames."""
+        out = np.full(self.model.size, np.inf)
+        for f, log_std in zip(self.problem.families.random, self.variances.log_std, strict=False):
+            out[f.parameters] = np.exp(log_std) * f.magnitude
+        return out
+
+    def predict(self, states: States, m: int) -> tuple[Floats, Floats]:
+        """Predict what the sensor reads in N states.
+
+        Args:
+            states: joints, wrenches and what else the effects need.
+            m: 3 for positions, 6 for poses (the last three are the errors' rotation vector).
+
+        Returns:
+            (N, 3) positions, and (N, m, m) covariance of the prediction, without that of the
+            reading's noise.
+        """
+        prediction = self.model.predict(states, self.theta)
+        x = self.problem.coordinates(self.model.jacobian(prediction, self.theta, m))
+        spread = x @ self.covariance @ np.swapaxes(x, 1, 2)
+        return prediction.observation.position, spread
+
+    def noise(self, readings: Readings) -> Floats:
+        """(N, m, m) covariance of absolute readings by instrument and arm, as estimated."""
+        total = self.std(INSTRUMENT) ** 2 * readings.covariance
+        if SCATTER in self.problem.names:
+            f = _scatter_factors(self.model, readings)
+            total = total + self.std(SCATTER) ** 2 * (f @ np.swapaxes(f, 1, 2))
+        return np.asarray(total)
+
+
+def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
+    """Return a model with every effect of its catalogue that the states allow.
+
+    Waves that few poses cannot resolve are there all the same; `harmonics` of them are kept.
+    """
+    finer = tuple(
+        e.with_options(states, harmonics=harmonics)
+        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < harmonics
+        else e
+        for e in model.effects
+    )
+    model = replace(model, effects=finer)
+    for kind in model.catalogue.effects:
+        if kind.name in model.names or kind.role in FRAME_ROLES or not kind.computable(states):
+            continue
+        fine = {"harmonics": harmonics} if "harmonics" in kind.option_help else {}
+        model = model + EffectSpec(kind.name, fine)
+    return model
+
+
+def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Generator) -> MixedFit:
+    """Fit all effects at once.
+
+    Args:
+        model: frames, and effects that have to be in it.
+        readings: without gross errors.
+        mode: "deflection" or "absolute".
+        rng: for the average over the posterior of the variances.
+
+    Raises:
+        CannotAnswerError: no static equilibrium, or no likelihood.
+        InputError: a deflection without its unloaded reading.
+    """
+    model = with_all_effects(model, readings.states)
+    w = whitening(readings, mode, "gc")
+    found, theta = _iterated(model, readings, w)
+    problem = found.equations.problem
+    if len(problem.y) > FEW_ROWS:
+        return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
+    mean = average(found, rng, WALK)
+    theta = problem.parameters(mean.coordinates, model.size)
+    return MixedFit(model, readings, w, theta, found, mean.covariance)
+
+
+def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
+    """Estimate the variances of a model's effects at parameters theta (P,), without moving them.
+
+    Args:
+        model: with all effects that take part.
+        readings: without gross errors, with their stated covariance.
+        mode: "deflection" or "absolute".
+        theta: where the model is linearised.
+    """
+    return estimate_variances(linearised_problem(model, readings, mode, theta))
+
+
+def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
+    """Return the linear problem of a model at parameters theta (P,); arguments as above."""
+    w = whitening(readings, mode, "gc")
+    return _linearised(model, readings, w, theta)[0]
+
+
+def variances_with_noise(
+    model: Model, readings: Readings, mode: Mode, instrument: Sequence[Part], arm: Part
+) -> tuple[Variances, Floats]:
+    """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
+
+    Args:
+        model: with all effects that take part.
+        readings: without gross errors, with the covariance of the instrument.
+        mode: "deflection" or "absolute".
+        instrument: parts that add up to that covariance.
+        arm: its scatter.
+
+    Returns:
+        The variances, the components of the noise last, and the parameters (P,) predicted.
+    """
+    return _iterated(model, readings, whitening(readings, mode, "gc"), (*instrument, arm))
+
+
+def _iterated(
+    model: Model, readings: Readings, w: Whitening, parts: Sequence[Part] = ()
+) -> tuple[Variances, Floats]:
+    """Estimate the variances, linearised at the parameters (P,) that they predict; and those."""
+    theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
+    start: Floats | None = None
+    rounds = 0
+    while True:
+        problem, now = _linearised(model, readings, w, theta, parts)
+        found = estimate_variances(problem, start)
+        theta = problem.parameters(found.equations.coordinates, model.size)
+        rounds, start = rounds + 1, found.log_std
+        if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
+            return found, theta
+        white = now
+
+
+def _linearised(
+    model: Model,
+    readings: Readings,
+    w: Whitening,
+    theta: Floats,
+    parts: Sequence[Part] = (),
+) -> tuple[MixedProblem, Floats]:
+    """Return the linear problem at theta (P,), and the whitened residual (R,) there."""
+    prediction = model.predict(readings.states, theta)
+    now = w.whiten(residual(readings, prediction, w)).reshape(-1)
+    jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
+    rows = np.column_stack([now + jacobian @ theta, jacobian])
+    if parts:
+        rows, noise = _noise_of(parts, readings, w, rows)
+    else:
+        rows, noise = _noise(model, readings, w, rows)
+    return mixed_problem(rows[:, 0], rows[:, 1:], families_of(model), noise), now
+
+
+def _noise(
+    model: Model, readings: Readings, w: Whitening, rows: Floats
+) -> tuple[Floats, list[Noise]]:
+    """Whitened rows (R, ...), turned so that all noise is diagonal, and its components.
+
+    They are the instrument's, and the arm's scatter where the readings do not state it.
+    """
+    prior = LogStdPrior(0.0, NOISE_SPREAD)
+    seen = [np.any(b.factor != 0, axis=2) for b in w.buckets]
+    if readings.scatter_stated:
+        whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
+        return rows, [Noise(INSTRUMENT, whole, prior)]
+    f = _scatter_factors(model, readings)
+    common = None if readings.states.target is None else f
+    of = replace(readings, covariance=f @ np.swapaxes(f, 1, 2), common=common, serial=None)
+    turned, instrument, scatter, start = np.empty_like(rows), [], [], 0
+    for b, c, s in zip(w.buckets, covariance_blocks(of, w), seen, strict=True):
+        u, variance = independent_rows(b.factor @ c @ np.swapaxes(b.factor, 1, 2), s)
+        stop = start + s.size
+        block = rows[start:stop].reshape(*s.shape, -1)
+        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(s.size, -1)
+        instrument.append((variance > UNSEEN).reshape(-1).astype(np.float64))
+        scatter.append(np.maximum(variance, 0.0).reshape(-1))
+        start = stop
+    components = ((INSTRUMENT, instrument), (SCATTER, scatter))
+    return turned, [Noise(name, np.concatenate(v), prior) for name, v in components]
+
+
+def _noise_of(
+    parts: Sequence[Part], readings: Readings, w: Whitening, rows: Floats
+) -> tuple[Floats, list[Noise]]:
+    """Whitened rows (R, ...), turned so that the parts of the noise are diagonal, and these.
+
+    The instrument's parts add up to what the rows are whitened by, so that they share their
+    eigenvectors; of the arm's, the last one, what is correlated between two of these parts is left
+    out.
+    """
+    blocks = [
+        covariance_blocks(
+            replace(readings, covariance=p.covariance, common=p.common, serial=None), w
+        )
+        for p in parts
+    ]
+    turned, start = np.empty_like(rows), 0
+    variances: list[list[Floats]] = [[] for _ in parts]
+    for k, b in enumerate(w.buckets):
+        *instrument, arm = (b.factor @ of[k] @ np.swapaxes(b.factor, 1, 2) for of in blocks)
+        size = max(float(np.abs(arm).max(initial=0.0)), 1e-300)
+        apart = sum((j * x for j, x in enumerate(instrument, 1)), LITTLE * arm / size)
+        u = np.linalg.eigh(apart)[1]
+        stop = start + u.shape[0] * u.shape[1]
+        block = rows[start:stop].reshape(*u.shape[:2], -1)
+        turned[start:stop] = (np.swapaxes(u, 1, 2) @ block).reshape(stop - start, -1)
+        for of_part, x in zip(variances, (*instrument, arm), strict=True):
+            of_part.append(np.einsum("gij,gik,gkj->gj", u, x, u).reshape(-1))
+        start = stop
+    return turned, [
+        Noise(p.name, np.maximum(np.concatenate(v), 0.0), p.prior)
+        for p, v in zip(parts, variances, strict=True)
+    ]
+
+
+def scatter_part(model: Model, readings: Readings) -> Part:
+    """Return the arm's scatter, of `SCATTER_RAD` in each joint, as a part of the noise."""
+    f = _scatter_factors(model, readings)
+    common = None if readings.states.target is None else f
+    return Part(SCATTER, f @ np.swapaxes(f, 1, 2), LogStdPrior(0.0, NOISE_SPREAD), common)
+
+
+def _scatter_factors(model: Model, readings: Readings) -> Floats:
+    """(N, m, n) F of the arm's scatter by joints of `SCATTER_RAD` each."""
+    n = model.cell.arm.n
+    return joint_factors(model.cell, readings, np.full(n, SCATTER_RAD))

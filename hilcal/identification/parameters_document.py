@@ -1,0 +1,172 @@
+"""The parameters of a fit with their covariance as one JSON document, and back."""
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import __version__, limits
+from hilcal.errors import InputError
+from hilcal.identification.fit import Fit
+from hilcal.names import check_names
+from hilcal.toml import parse_json
+from hilcal.types import Bools, Floats
+
+FORMAT, VERSION = "hilcal-parameters", 1
+MOST_LISTED = 200
+"""Parameters up to which the covariance is written as numbers, half a megabyte; a choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parameters:
+    """What the document holds.
+
+    Attributes:
+        names: (P,) "effect.parameter".
+        units: (P,) SI.
+        value: (P,) as fitted, the undetermined ones as they are in the model.
+        std: (P,) standard uncertainties, infinite where the readings do not determine it.
+        identifiable: (P,) whether they do.
+        covariance: (P, P), NaN in rows and columns of those that they do not determine.
+        about: the rest of the document.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Floats
+    std: Floats
+    identifiable: Bools
+    covariance: Floats
+    about: Mapping[str, Any]
+
+
+def covariance_of(fit: Fit) -> Floats:
+    """(P, P) covariance of the parameters, NaN where the readings do not determine one.
+
+    C_ij = u_i ρ_ij u_j with u the standard uncertainties as stated (`Uncertainty.std`: widened
+    under a misfit, and by what is unknown of prior variances), and ρ the correlation of the
+    posterior under the stated noise.
+    """
+    solution, u = fit.solution, fit.uncertainty
+    transform = solution.equations.basis.transform
+    formal = transform @ solution.equations.inverse(solution.beta) @ transform.T
+    size = np.sqrt(np.maximum(np.diag(formal), 1e-300))
+    std = np.where(np.isfinite(u.std) & u.identifiable, u.std, np.nan)
+    found = std[:, None] * (formal / np.outer(size, size)) * std
+    found = (found + found.T) / 2
+    np.fill_diagonal(found, std**2)
+    return np.asarray(found)
+
+
+def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
+    """Return the document, SI.
+
+    Args:
+        fit: the fit.
+        source: what it is from: campaign, revision, hash of the readings.
+    """
+    u, model = fit.uncertainty, fit.model
+    every = [(e, p) for e in model.effects for p in e.parameters]
+    used = np.flatnonzero(u.identifiable & np.isfinite(u.std))
+    covariance = covariance_of(fit)[np.ix_(used, used)]
+    rows = [
+        {
+            "name": f"{e.name}.{p.name}",
+            "value": float(fit.theta[k]),
+            "std": float(u.std[k]) if np.isfinite(u.std[k]) and u.identifiable[k] else None,
+            "unit": p.unit,
+            "identifiable": bool(u.identifiable[k]),
+            "prior_std": float(prior) if np.isfinite(prior := fit.solution.prior[k]) else None,
+        }
+        for k, (e, p) in enumerate(every)
+    ]
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "hilcal": __version__,
+        "source": dict(source),
+        "robot": model.cell.arm.name,
+        "readings": fit.mode,
+        "scaling": fit.scaling,
+        "variance_factor": fit.variance_factor,
+        "effects": [
+            {"name": e.name, "options": _plain(dict(e.options)), "role": e.role}
+            for e in model.effects
+        ],
+        "parameters": rows,
+        "unidentifiable": list(u.null),
+        "covariance_of": [str(rows[k]["name"]) for k in used],
+        "covariance": _packed(covariance),
+    }
+
+
+def from_json(content: Mapping[str, Any]) -> Parameters:
+    """Return what `to_json` wrote, every bit of it.
+
+    Raises:
+        InputError: another kind of document.
+    """
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
+    check_names({k: v for k, v in content.items() if k != "source"}, "parameters")
+    rows = content["parameters"]
+    limits.check_parameters(len(rows))
+    names = tuple(row["name"] for row in rows)
+    at = [names.index(name) for name in content["covariance_of"]]
+    covariance = np.full((len(rows), len(rows)), np.nan)
+    covariance[np.ix_(at, at)] = _unpacked(content["covariance"], len(at))
+    return Parameters(
+        names=names,
+        units=tuple(row["unit"] for row in rows),
+        value=np.array([row["value"] for row in rows], dtype=float),
+        std=np.array([np.inf if row["std"] is None else row["std"] for row in rows], dtype=float),
+        identifiable=np.array([row["identifiable"] for row in rows], dtype=np.bool_),
+        covariance=covariance,
+        about={k: v for k, v in content.items() if k not in ("parameters", "covariance")},
+    )
+
+
+@limits.bounded
+def read(path: str | Path) -> Parameters:
+    """Read the document from a file.
+
+    Raises:
+        InputError: no such file, or another kind of document.
+    """
+    try:
+        return from_json(parse_json(limits.read_text(Path(path), limits.DOCUMENT)))
+    except (OSError, LookupError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: no parameters: {error!r}") from None
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+
+
+def _packed(covariance: Floats) -> dict[str, object]:
+    """Lower triangle, row by row: as numbers, or base64 of little-endian doubles where many."""
+    values = covariance[np.tril_indices(len(covariance))]
+    if len(covariance) <= MOST_LISTED:
+        return {"encoding": "numbers", "lower_triangle": values.tolist()}
+    text = base64.b64encode(values.astype("<f8").tobytes()).decode("ascii")
+    return {"encoding": "base64 of little-endian doubles", "lower_triangle": text}
+
+
+def _unpacked(content: Mapping[str, Any], count: int) -> Floats:
+    given = content["lower_triangle"]
+    if isinstance(given, str):
+        given = np.frombuffer(base64.b64decode(given), dtype="<f8")
+    i, j = np.tril_indices(count)
+    covariance = np.zeros((count, count))
+    covariance[i, j] = covariance[j, i] = np.array(given, dtype=float)
+    return covariance
+
+
+def _plain(value: Any) -> Any:
+    """Return tuples and arrays as lists."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    return [_plain(v) for v in value] if isinstance(value, tuple | list) else value

@@ -1,0 +1,204 @@
+"""Where the robot's base and flange are: declared once, for all that a campaign hands out.
+
+With the constant effects of a fit the arm is a chain of transforms A_k, nominally L_k,
+
+    T_sensor_target = T_sensor_chain A_0 Rz(q_1) A_1 … Rz(q_n) A_n τ
+
+No reading tells a base that stands elsewhere from a first link that is longer, turned, or from
+another zero of joint 1. So the base is
+
+- *stated* where the cell states it (a pose of the base in the tracker's frame, or positions in base
+  axes). What the fit finds of it is then the arm's.
+- else *mechanical*: A_0 = L_0, and A_1 has no turn about, and no shift along, the axis of joint 1
+  beyond those of L_1. It depends neither on the poses that were measured nor on how far the arm
+  sags there, as the base does that lets the nominal arm fit the readings best.
+
+With the flange it is the same: where the place of no target is stated, A_n = L_n, and A_{n−1} has
+no turn about and no shift along the axis of joint n beyond those of L_{n−1}; the targets are where
+they then are on it. Of axes parallel to the first or the last one the rest stays as it was fitted.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.effects.protocol import FRAME_ROLES
+from hilcal.model.model import Model
+from hilcal.readings.readings import States
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+TRIALS = 8
+"""Random states at which a deviation is asked whether it is constant; a choice."""
+SAME = 1e-15
+"""By how much a constant deviation may differ between states, m and rad: rounding."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RobotFrames:
+    """Base, flange and targets of a fitted model.
+
+    Attributes:
+        base: (4, 4) T_sensor_base.
+        base_stated: whether the cell states it; mechanical otherwise.
+        registered: (4, 4) from the axes of the registration, where the fit began, to the base's.
+        chain: (4, 4) the same from those of the fitted chain, which the fitted frame moved.
+        flange: (4, 4) T_chainflange_flange.
+        targets: (T, 4, 4) T_flange_target as fitted.
+        declared: (T, 4, 4) the same as stated, where all of them are.
+        links: (n + 1, 4, 4) the arm with its constant effects, from base to flange.
+        within: effects that are constant, and so in `links`.
+        beyond: effects that are not.
+    """
+
+    base: Floats
+    base_stated: bool
+    chain: Floats
+    registered: Floats
+    flange: Floats
+    targets: Floats
+    declared: Floats
+    links: Floats
+    within: tuple[str, ...]
+    beyond: tuple[str, ...]
+
+    @property
+    def base_is(self) -> str:
+        """How the base is known: "stated" or "mechanical"."""
+        return "stated" if self.base_stated else "mechanical"
+
+
+def robot_frames(model: Model, theta: Floats) -> RobotFrames:
+    """Return base, flange and targets of a fitted model.
+
+    Args:
+        model: the model.
+        theta: (P,) its parameters.
+    """
+    cell, nominal = model.cell, model.cell.arm.links
+    moved, targets = _fitted(model, theta)
+    stated = all(cell.known_targets)
+    links, within, beyond = _constant(model, theta)
+    if cell.registration_known:
+        base = cell.registration
+        links[0] = moved @ links[0]
+    else:
+        own, links[1] = _split(links[1], nominal[1])
+        base = cell.registration @ moved @ links[0] @ own @ se3.inverse(nominal[0])
+        links[0] = nominal[0]
+    if stated:  # an offset that was fitted all the same is the flange's
+        flange = targets[0] @ se3.inverse(cell.all_targets[0])
+        links[-1] = links[-1] @ flange
+    elif any(cell.known_targets):
+        flange = np.eye(4)
+    else:
+        own, before = _split(se3.inverse(links[-2]), se3.inverse(nominal[-2]))
+        flange = se3.inverse(links[-1]) @ own @ nominal[-1]
+        targets = se3.product(se3.inverse(flange)[None], targets)
+        links[-2], links[-1] = se3.inverse(before), nominal[-1]
+    registered = se3.inverse(base) @ cell.registration
+    return RobotFrames(
+        base=base,
+        base_stated=cell.registration_known,
+        registered=registered,
+        chain=registered @ moved,
+        flange=flange,
+        targets=targets,
+        declared=cell.all_targets if stated else targets,
+        links=links,
+        within=within,
+        beyond=beyond,
+    )
+
+
+def one_of_each(cell: Cell) -> States:
+    """Return one state that has every column, for effects that are built without readings."""
+    n = cell.arm.n
+    one = np.zeros(1)
+    return States(
+        q=np.zeros((1, n)),
+        wrench=np.zeros((1, 6)),
+        time=one,
+        load_time=one,
+        air_temperature=one,
+        joint_temperature=np.zeros((1, n)),
+        approach=np.ones((1, n)),
+    )
+
+
+def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
+    """Return how far the fitted base is from its registration (4, 4), and all targets (T, 4, 4)."""
+    cell, targets = model.cell, model.cell.all_targets.copy()
+    rows = np.zeros(len(targets), dtype=np.int64)
+    states = one_of_each(cell)[rows]
+    if cell.targets is not None:
+        states = replace(states, target=np.arange(len(targets)))
+    situation, base = model.predict(states, 0 * theta).situation, np.zeros(6)
+    for e, mine in zip(model.effects, model.slices(), strict=True):
+        if e.role not in FRAME_ROLES:
+            continue
+        d = e.deviation(theta[mine], situation)
+        if e.role == "registration" and d.base is not None:
+            base = base + d.base[0]
+        if e.role == "target" and d.target is not None:
+            targets[:, :3, 3] += d.target[:, :3]
+            targets[:, :3, :3] = se3.rotation(d.target[:, 3:]) @ targets[:, :3, :3]
+    return se3.matrix(*se3.exp(base)), targets
+
+
+def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tuple[str, ...]]:
+    """Return the links (n + 1, 4, 4) with what is constant; what is in them, and what is not.
+
+        A_k = L_k exp(ξ_k) Rz(dq_{k+1}),      A_n = L_n exp(ξ_n)
+
+    An effect is constant whose deviation is the same in random states under random loads.
+    """
+    arm = model.cell.arm
+    dq, twist = np.zeros(arm.n), np.zeros((arm.n + 1, 6))
+    within, beyond = [], []
+    situation = model.predict(random_states(model.cell), 0 * theta).situation
+    for e, mine in zip(model.effects, model.slices(), strict=True):
+        if e.role in FRAME_ROLES:
+            continue
+        d = e.deviation(theta[mine], situation)
+        fields = [d.base, d.station, d.target, d.scale]
+        constant = not e.elastic and _same(d.dq) and _same(d.twist)
+        if not constant or any(f is not None for f in fields) or d.dq is d.twist:
+            beyond.append(e.name)
+            continue
+        within.append(e.name)
+        dq = dq if d.dq is None else dq + d.dq[0]
+        twist = twist if d.twist is None else twist + d.twist[0]
+    turns = np.zeros((arm.n + 1, 3))
+    turns[: arm.n, 2] = arm.driven(dq)
+    links = arm.links @ se3.matrix(*se3.exp(twist))
+    links = links @ se3.matrix(se3.rotation(turns), np.zeros((arm.n + 1, 3)))
+    return links, tuple(within), tuple(beyond)
+
+
+def _same(values: Floats | None) -> bool:
+    return values is None or bool(np.abs(values - values[:1]).max() <= SAME)
+
+
+def random_states(cell: Cell) -> States:
+    """Return random states under random loads, with every column."""
+    n, rng = cell.arm.n, np.random.default_rng(20250308)
+    return States(
+        q=rng.uniform(-2, 2, (TRIALS, n)),
+        wrench=rng.uniform(-30, 30, (TRIALS, 6)),
+        time=rng.uniform(0, 1e4, TRIALS),
+        load_time=rng.uniform(0, 1e3, TRIALS),
+        air_temperature=rng.uniform(15, 30, TRIALS),
+        joint_temperature=rng.uniform(15, 50, (TRIALS, n)),
+        approach=np.sign(rng.standard_normal((TRIALS, n))),
+    )
+
+
+def _split(link: Floats, nominal: Floats) -> tuple[Floats, Floats]:
+    """Split a link into Rz Tz and a rest that has neither beyond what the nominal one has."""
+    m = link @ se3.inverse(nominal)
+    turn = np.arctan2(m[1, 0] - m[0, 1], m[0, 0] + m[1, 1])
+    own = se3.matrix(se3.rotation(np.array([0.0, 0.0, turn])), np.zeros(3))
+    own[2, 3] = link[2, 3] - nominal[2, 3]
+    return own, se3.inverse(own) @ link

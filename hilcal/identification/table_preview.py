@@ -1,0 +1,214 @@
+"""A proposed mapping, and what the nominal arm of a cell tells about it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification import description_words
+from hilcal.identification.conventions import CLEARER, Fit, choose_convention
+from hilcal.identification.gate import examine
+from hilcal.identification.registration import register
+from hilcal.robot.arm import Arm
+from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
+from hilcal.tables.guessing.guesser import FAR, GUESSED, SIDE_BY_SIDE, TURN
+from hilcal.tables.guessing.proposal import Proposal, Understood
+from hilcal.tables.guessing.propose import Proposed, propose
+from hilcal.tables.importing import import_readings
+from hilcal.tables.mapping import Mapping
+from hilcal.tables.orientation import rotations
+from hilcal.tables.units import ANGLES, LENGTHS
+from hilcal.toml import check_section
+from hilcal.types import Floats
+
+CLOSE = 0.02
+"""Part of the reach that a nominal arm may be off; arms are better by ten times; a choice."""
+MOST_TRIED = 8
+"""Choices of columns that are tried; each takes a registration."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Preview:
+    """How a table could be read.
+
+    Attributes:
+        rows: of the table.
+        proposal: the mapping in the making: understood, unsure, unused, missing.
+        outcome: what an import into the cell gives, in sentences; None without a cell.
+    """
+
+    rows: int
+    proposal: Proposal
+    outcome: tuple[str, ...] | None
+
+
+def preview_table(
+    path: str | Path, cell: Cell | None = None, second: str | Path | None = None
+) -> Preview:
+    """Propose a mapping for a table of any form; nothing is written.
+
+    >>> found = hc.preview_table(TABLE, hc.Cell.load(CELL))
+    >>> found.proposal.sections["joints"]["unit"]
+    'rad'
+
+    Args:
+        path: text, XLSX, MAT or Parquet.
+        cell: with it, the nominal arm tells the convention of orientations, and columns that
+            their values leave open.
+        second: a second file that holds the other columns of the same readings.
+
+    Raises:
+        InputError: a file that cannot be read, or two that do not belong together.
+    """
+    table = Path(path)
+    found = propose(table, None if second is None else Path(second), cell.arm.n if cell else None)
+    if cell is None:
+        return Preview(len(found.grid.rows), found.proposal, None)
+    settings = cell.configured()
+    _name_targets(found, [target.name for target in settings.tool.targets])
+    outcome = _decide_columns(table, found, settings, cell)
+    outcome += _decide_convention(found, cell.arm)
+    outcome += _try(table, found, settings, cell)
+    return Preview(len(found.grid.rows), found.proposal, tuple(outcome))
+
+
+def _name_targets(found: Proposed, names: list[str]) -> None:
+    """Give targets that stand side by side the cell's names, in its order."""
+    section = found.proposal.sections.get("position", {})
+    if names and len(names) == len(section.get("targets", ())):
+        section["targets"] = names
+        words = f"the targets are {', '.join(names)}, in the cell's order"
+        kept = [doubt for doubt in found.proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
+        found.proposal.unsure[:] = [*kept, ("position", words)]
+
+
+def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
+    """Settle a guessed convention by the nominal arm; a sentence that says so, where it does."""
+    proposal, grid = found.proposal, found.grid
+    sections = [proposal.sections.get(name) for name in ("joints", "position", "orientation")]
+    joints, position, section = sections
+    if joints is None or position is None or section is None or section["convention"] == "matrix":
+        return []
+    blocks = [
+        np.stack([grid.numbers(name) for name in s["columns"]], axis=1)
+        for s in (joints, position, section)
+    ]
+    if blocks[0].shape[1] != arm.n or blocks[1].shape[1] != 3:
+        return []
+    whole = np.isfinite(np.hstack(blocks)).all(axis=1)
+    q, y, numbers = (block[whole] for block in blocks)
+    unit = ANGLES[section.get("unit", "rad")]
+    choice = choose_convention(
+        arm, ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y, numbers, unit
+    )
+    if choice is None:
+        return []
+    guess = ("orientation", GUESSED)
+    proposal.unsure[:] = [doubt for doubt in proposal.unsure if doubt != guess]
+    best, second = choice.ranked[:2]
+    if choice.decided is None:
+        words = (
+            f"the nominal {arm.name} does not decide the convention: "
+            f"{best.convention} leaves {_left(best)}, {second.convention} {_left(second)}"
+        )
+        proposal.unsure.append(("orientation", words))
+        return []
+    if not _same(section["convention"], choice.decided, numbers, unit):
+        section["convention"] = choice.decided
+    proposal.open_convention = False
+    for k, u in enumerate(proposal.understood):
+        if u.what == "orientation":
+            meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
+            proposal.understood[k] = Understood(u.what, u.columns, meaning, u.example)
+    return [
+        f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
+        f"{_left(best)} are left, with the next convention {_left(second)}"
+    ]
+
+
+def _left(fit: Fit) -> str:
+    angle, distance = float(np.rad2deg(fit.angle)), 1e3 * fit.position
+    return f"{angle:.{0 if angle >= 10 else 2}f}° and {distance:.{0 if distance >= 10 else 2}f} mm"
+
+
+def _same(one: str, other: str, numbers: Floats, unit: float) -> bool:
+    return bool(np.allclose(rotations(one, numbers, unit), rotations(other, numbers, unit)))
+
+
+def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+    """Choose columns that their values leave open by the nominal arm; a sentence where it tells."""
+    proposal, grid = found.proposal, found.grid
+    if len(proposal.alternatives) < 2:
+        return []
+    fits: list[tuple[float, dict[str, dict[str, Any]]]] = []
+    for position, joints in proposal.alternatives[:MOST_TRIED]:
+        changed = dict(proposal.sections)
+        for name, columns, limit, units in (
+            ("position", position, FAR, ("mm", "m")),
+            ("joints", joints, TURN, ("deg", "rad")),
+        ):
+            if columns:
+                size = max(np.nanmax(np.abs(grid.numbers(c))) for c in columns)
+                changed[name] = {"columns": columns, "unit": units[0 if size > limit else 1]}
+        rms = _left_by_the_arm(table, changed, settings, cell)
+        if rms is not None:
+            fits.append((rms, changed))
+    fits.sort(key=lambda fit: fit[0])
+    clear = len(fits) > 1 and fits[1][0] > CLEARER * fits[0][0]
+    if not fits or fits[0][0] > CLOSE * cell.arm.reach or not (clear or len(fits) == 1):
+        return []
+    proposal.sections = fits[0][1]
+    for k, u in enumerate(proposal.understood):
+        if u.what in ("position", "joints"):
+            section = proposal.sections[u.what]
+            chosen = tuple(section["columns"])
+            example = tuple(grid.text(c)[0] for c in chosen)
+            proposal.understood[k] = Understood(u.what, chosen, section["unit"], example)
+    doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
+    proposal.unsure[:] = doubts
+    others = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""
+    return [
+        f"columns: the nominal {cell.arm.name} fits best with these: "
+        f"{1e3 * fits[0][0]:.2f} mm are left{others}"
+    ]
+
+
+def _left_by_the_arm(
+    table: Path, sections: dict[str, dict[str, Any]], settings: CellConfig, cell: Cell
+) -> float | None:
+    """Rms distance, m, that the nominal arm leaves with a mapping; None where it cannot be."""
+    only = {k: v for k, v in sections.items() if k in ("file", "second_file", "position", "joints")}
+    try:
+        mapping = check_section(only, Mapping, "the proposed mapping")
+        return register(cell, import_readings(table, mapping, settings, cell.arm).readings).rms
+    except (InputError, CannotAnswerError):
+        return None
+
+
+def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list[str]:
+    """Import with the proposed mapping; what comes of it, in sentences."""
+    if found.proposal.lacking:
+        return []
+    try:
+        result = import_readings(table, found.proposal.mapping(), settings, cell.arm)
+    except InputError as error:
+        return [f"refused: {error}"]
+    readings = result.readings
+    told = [*result.notes]
+    try:
+        registered = register(cell, readings)
+        told.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
+        if (wrong := examine(registered, readings)) is not None:
+            told.append(description_words.words(wrong, cell, readings))
+    except CannotAnswerError as error:
+        told.append(str(error))
+    return [
+        f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, "
+        f"{'positions' if readings.m == 3 else 'positions and orientations'}",
+        *told,
+    ]

@@ -1,0 +1,238 @@
+"""The force sensor as a campaign uses it: its zero, the tool it carries, what hangs."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import ForceSensor as Settings
+from hilcal.config import Load, Operator
+from hilcal.errors import CannotAnswerError, DeviceError
+from hilcal.measuring.devices import ForceSensorDevice, WrenchSample
+from hilcal.measuring.tool_load import PARAMETERS, ToolLoad, identify_tool_load, shift, tare
+from hilcal.measuring.weighing import compare
+from hilcal.robot import chain as chains
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+MIN_FRAMES = 20
+"""Frames that a mean wrench is made of at least."""
+ENOUGH_POSES = 4
+"""Unloaded readings from which the tool is identified at least."""
+TOOL_OFF_M = 0.01
+"""A tool whose centre of mass is so far from the configured one is remarked, m; a guess."""
+_FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
+"""Variance of a mean wrench at least, N² and N²·m²: a line that rounds shows no noise at all."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorFrame:
+    """Where the sensor is at one pose of the arm, base axes.
+
+    Attributes:
+        rotation: (3, 3) R_base_sensor.
+        arm: (3,) from the sensor's origin to the load point, m.
+    """
+
+    rotation: Floats
+    arm: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaredWrench:
+    """One mean wrench against the zero of its session, and the pose where it was felt.
+
+    Attributes:
+        wrench: (6,) sensor axes, N and N·m.
+        covariance: (6, 6) of this mean.
+        q: (n,) joint angles, rad.
+    """
+
+    wrench: Floats
+    covariance: Floats
+    q: Floats
+
+
+class ForceMeter:
+    """A force sensor with its zero.
+
+    The zero of a session is what the sensor reads at the reference pose with nothing on the
+    hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
+    whatever the sensor's own zero did while it was off; how the real tool differs from the
+    configured one stays in them, the same in all sessions.
+
+    Attributes:
+        zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
+        tool: what it carries.
+        identified: whether the tool has been weighed, else it is that of the configuration.
+    """
+
+    def __init__(
+        self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
+    ) -> None:
+        """Use an open sensor.
+
+        Args:
+            sensor: the device.
+            settings: where it sits.
+            cell: the cell.
+            window: over how long it is averaged, real seconds.
+        """
+        self.sensor = sensor
+        self.zero = np.zeros(6)
+        self._cell, self._seconds = cell, window
+        self._origin = np.array(settings.origin_m)
+        self._axes = se3.rotation(np.array(settings.rotvec_rad))
+        self._com = self._axes.T @ (cell.tool_com - self._origin)
+        self.identified = False
+        self._tared_down: Floats | None = None
+        nothing = np.zeros((PARAMETERS, PARAMETERS))
+        moment = cell.tool_mass * self._com
+        self.tool = ToolLoad(np.zeros(6), cell.tool_mass, moment, nothing, cell.gravity, 0.0, 0, 0)
+
+    def felt(self) -> Floats:
+        """Return the present wrench (6,) against the zero, sensor axes.
+
+        Raises:
+            DeviceError: the stream is dead or stale.
+        """
+        return np.asarray(self.sensor.latest().wrench - self.zero)
+
+    def average(self) -> WrenchSample:
+        """Return a mean of at least `MIN_FRAMES` frames, as the sensor gives it.
+
+        Raises:
+            DeviceError: the stream is dead, gives too few frames, or stands still.
+        """
+        sample = self.sensor.average(self._seconds)
+        if sample.frames < MIN_FRAMES:  # a fast clock's window is too short for the real line
+            self._seconds *= 1.2 * MIN_FRAMES / max(sample.frames, 1)
+            sample = self.sensor.average(self._seconds)
+        variance, rounding = np.diagonal(sample.covariance), 1e-12 * (1.0 + np.abs(sample.wrench))
+        if sample.frames >= MIN_FRAMES and np.all(variance <= rounding**2):
+            raise DeviceError(
+                f"force sensor: {sample.frames} frames are the same to the last digit: it sends "
+                "old values. Switch it off and on"
+            )
+        return sample
+
+    def tared(self, sample: WrenchSample, q: Floats) -> TaredWrench:
+        """Return a mean wrench against the zero, at joint angles (n,)."""
+        covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
+        return TaredWrench(sample.wrench - self.zero, covariance, np.asarray(q))
+
+    def frame(self, q: Floats) -> SensorFrame:
+        """Return where the sensor is at joint angles (n,)."""
+        chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
+        arm = chain.point(self._cell.load_point) - chain.point(self._origin)
+        return SensorFrame(chain.rotation[-1][0] @ self._axes, arm[0])
+
+    def to_flange(self, point: Floats) -> Floats:
+        """Return a point (3,) of the sensor's axes in flange axes, m."""
+        return np.asarray(self._origin + self._axes @ point)
+
+    def set_zero(self, sample: WrenchSample, q: Floats) -> None:
+        """Take a mean wrench without load, at joint angles (n,), as the zero."""
+        cell, rotation = self._cell, self.frame(q).rotation
+        self._tared_down = rotation.T @ cell.gravity
+        covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
+        zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
+        self.zero = zero.bias
+        if not self.identified:
+            self.tool = replace(zero, bias=np.zeros(6))
+
+    def turned(self, q: Floats) -> float:
+        """Return how far gravity has turned in the sensor's axes since the tare, m/s².
+
+        At joint angles (n,); |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not
+        say. Before any tare it is twice gravity, the most that it can be.
+        """
+        gravity = self._cell.gravity
+        if self._tared_down is None:
+            return 2.0 * float(np.linalg.norm(gravity))
+        return float(np.linalg.norm(self.frame(q).rotation.T @ gravity - self._tared_down))
+
+    def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
+        """Find the real tool from unloaded readings.
+
+        A reading whose force the tool does not explain to the tolerance was not unloaded, or
+        somebody leaned on the tool: the worst is left out until all are explained.
+
+        Args:
+            unloaded: the readings.
+            tolerance_N: by how much a force may differ.
+
+        Returns:
+            Numbers of the readings that were left out; None where they are too few.
+
+        Raises:
+            HilcalError: their poses do not determine it, or fewer than `ENOUGH_POSES` agree.
+        """
+        kept = list(range(len(unloaded)))
+        while len(kept) >= ENOUGH_POSES:
+            used = [unloaded[k] for k in kept]
+            rotation = np.array([self.frame(f.q).rotation for f in used])
+            wrench = np.array([f.wrench for f in used])
+            covariance = np.array([f.covariance for f in used])
+            tool = identify_tool_load(wrench, covariance, rotation, self._cell.gravity)
+            off = np.linalg.norm((wrench - tool.tool_wrench(rotation))[:, :3], axis=1)
+            if off.max() <= tolerance_N:
+                self.tool, self.identified = tool, True
+                return tuple(sorted(set(range(len(unloaded))) - set(kept)))
+            del kept[int(np.argmax(off))]
+        if len(unloaded) < ENOUGH_POSES:
+            return None
+        raise CannotAnswerError(
+            f"no {ENOUGH_POSES} of the {len(unloaded)} unloaded readings of the force sensor agree "
+            f"to {tolerance_N:g} N; does something touch the tool?"
+        )
+
+    def load_wrench(self, tared: TaredWrench) -> Floats:
+        """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""
+        frame = self.frame(tared.q)
+        return shift(self.tool.load_wrench(tared.wrench, frame.rotation), frame.arm)
+
+    def verify(self, load: Load | None, tared: TaredWrench, operator: Operator) -> tuple[bool, str]:
+        """Whether a load is what hangs, within the operator's tolerance; and the finding.
+
+        Compared at the load point, where a dead weight and a pull have no moment.
+        """
+        gravity, frame = self._cell.gravity, self.frame(tared.q)
+        expected = np.zeros(6) if load is None else load.wrench(gravity)
+        moved = np.eye(6)
+        moved[3:, :3] = -se3.skew(frame.arm)
+        at_sensor = self.tool.load_covariance(tared.covariance, frame.rotation)
+        std = np.sqrt(np.diagonal(moved @ at_sensor @ moved.T))
+        return compare(
+            expected,
+            self.load_wrench(tared),
+            std,
+            operator.tolerance_N,
+            operator.tolerance_share,
+            gravity,
+        )
+
+    def tool_differs(self, tolerance_N: float) -> str | None:
+        """Return in one line how the tool differs from [tool]; None where it does not.
+
+        It differs by a weight over the tolerance or, where that much could be felt, by a centre
+        of mass over `TOOL_OFF_M`; and by more than three standard deviations.
+        """
+        cell, tool = self._cell, self.tool
+        size = float(np.linalg.norm(cell.gravity))
+        std = float(np.sqrt(tool.covariance[6, 6]))
+        heavier = abs(tool.mass - cell.tool_mass)
+        com, com_std = self.to_flange(tool.com), float(np.linalg.norm(tool.com_std))
+        off = float(np.linalg.norm(com - cell.tool_com))
+        weight = heavier * size > tolerance_N and heavier > 3 * std
+        place = tool.mass * size > tolerance_N and off > max(TOOL_OFF_M, 3 * com_std)
+        if not weight and not place:
+            return None
+        return (
+            f"the force sensor feels a tool of {_tool(tool.mass, com)}, flange axes; [tool] says "
+            f"{_tool(cell.tool_mass, cell.tool_com)}"
+        )
+
+
+def _tool(mass: float, com: Floats) -> str:
+    return f"{mass:.3g} kg at ({', '.join(f'{x:.3f}' for x in com)}) m"

@@ -1,0 +1,472 @@
+"""One session of a campaign: from connected devices to the last missing reading."""
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from functools import partial
+from typing import Any, TypeVar
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.errors import DeviceError, HilcalError
+from hilcal.measuring.arrival import ArrivalReader, TargetReading
+from hilcal.measuring.clock import Clock
+from hilcal.measuring.devices import LoadChangedError, TargetLostError, WrenchSample
+from hilcal.measuring.drift import Shift
+from hilcal.measuring.eta import Eta
+from hilcal.measuring.force import ForceMeter, TaredWrench
+from hilcal.measuring.guard import Guard
+from hilcal.measuring.loads import TRIES, Hook, payload
+from hilcal.measuring.measure import Measured, Measurer
+from hilcal.measuring.motion import Mover
+from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
+from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
+from hilcal.measuring.rig import Rig
+from hilcal.measuring.rough_registration import RoughRegistration
+from hilcal.measuring.route import Stop
+from hilcal.measuring.session_state import SessionState
+from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
+from hilcal.measuring.store import Store
+from hilcal.readings.readings import Readings
+from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.types import Floats
+
+Done = TypeVar("Done")
+LiveModel = Callable[[Readings], LiveResidual]
+"""Returns the last reading against a model fitted to those before it."""
+
+
+class Session:
+    """Follows a route and stores a reading at every stop that has a step."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        cell: Cell,
+        config: CellConfig,
+        plan: Plan,
+        store: Store,
+        clock: Clock,
+        watcher: Watcher,
+        live: LiveModel | None = None,
+        wall: Callable[[], float] = time.time,
+        goal: StoppingRule | None = None,
+        epoch: float | None = None,
+    ) -> None:
+        """Read what earlier sessions stored; no device is used yet."""
+        self.in_control = False
+        self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
+        self._store, self._clock, self._watcher, self._live = store, clock, watcher, live
+        self._wall = wall
+        self._goal = GoalCheck(goal, plan, store, watcher, self._event)
+        window = clock.real(config.acquire.force_window_s)
+        self._meter: ForceMeter | None = None
+        if rig.force is not None and config.force_sensor is not None:
+            self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
+        self._guard = Guard(cell, config)
+        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, self._passed)
+        self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
+        self._hook = Hook(
+            rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
+        )
+        self._joint_std = config.repeatability.per_joint(cell.arm.n)
+        self._state = SessionState(cell, self._joint_std)
+        self._reader = ArrivalReader(
+            cell, rig.tracker, self._measurer, self._state.registration, clock, watcher
+        )
+        self._identified = 0
+        self._temperatures: bool | None = None
+        self._done = 0
+        self._tared = False
+        now = wall()
+        self._epoch = now if epoch is None else epoch
+        self._begun, self._elapsed = clock.now(), (now - self._epoch) * clock.scale
+        self._remember()
+
+    # earlier sessions
+
+    def _remember(self) -> None:
+        """Take over from the stored readings: times, tool, reference, unloaded positions."""
+        details = self._store.details()
+        stored = self._store.readings()
+        if not details or stored is None:
+            return
+        self._epoch = float(details[0]["epoch_wall_s"])
+        last = 0.0 if stored.states.time is None else float(stored.states.time[-1])
+        passed = (self._wall() - self._epoch) * self._clock.scale
+        self._elapsed = max(last, passed)
+        self._temperatures = stored.states.joint_temperature is not None
+        self._done = len(self._store.done())
+        for old, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
+            step = Step(old["pose"], old["load"], old["cycle"])
+            q, covariance = np.array(old["q_actual"]), np.array(old["tracker_covariance"])
+            self._state.add(step, q, value, covariance, stored_wrench(old), target)
+        felt = details[-1].get("felt")
+        if self._meter is not None and felt is not None:
+            self._meter.zero = np.array(felt["zero"])
+            self._identify()
+
+    # the way
+
+    def walk(self, stops: tuple[Stop, ...]) -> None:
+        """Go through all stops, or home as soon as the goal is met.
+
+        Raises:
+            HilcalError: something failed; the arm has to be stopped.
+        """
+        total = len(self._plan.steps)
+        self._event("start", {"missing": sum(s.step is not None for s in stops)})
+        self._begin(stops[:2])
+        pace = self._pace = Eta(self._clock)
+        behind, ahead = list(stops[:2]), stops[2:]
+        if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
+            ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
+        while ahead:
+            stop, *rest = ahead
+            ahead = tuple(rest)
+            behind.append(stop)
+            read = self._visit(stop)
+            if stop.step is not None and read is not None:
+                reading, settling = read
+                pace.read()
+                if self._goal.newly_met(last=all(s.step is None for s in ahead)):
+                    done = self._store.done()
+                    ahead = way_home(self._cell, self._config, self._plan, behind, done)
+                left = pace.left(
+                    sum(s.step is not None for s in ahead),
+                    sum(s.change_to is not None for s in ahead),
+                )
+                self._tell(stop.step, reading, total, left, settling)
+        self._finish()
+
+    def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
+        """Go to a stop, change the load, tare, measure."""
+
+        def visit() -> tuple[Readings, float] | None:
+            self._move(stop)
+            change = None if stop.change_to == self._hook.hanging else stop.change_to
+            if change is not None:
+                self._pace.arrived()
+                self._change(change)
+            if not self._tared:
+                self._tare()
+            if change is not None:
+                self._pace.changed()
+            return None if stop.step is None else self._reading(stop, stop.step)
+
+        return self._watched(visit)
+
+    def _watched(self, do: Callable[[], Done]) -> Done:
+        """Do something; again after what hangs was found wrong and has been put right."""
+        for left in reversed(range(TRIES)):
+            try:
+                return do()
+            except LoadChangedError as error:
+                self._rig.arm.stop()
+                if not left:
+                    raise
+                self._mover.left_here()
+                self._event("load", {"hanging": None, "why": str(error)})
+                self._watcher.notify(Remark(f"{error} The arm stands"))
+                self._hook.restore(str(error))
+                self._event("load", {"hanging": self._hook.hanging})
+        raise AssertionError("unreachable")
+
+    def _begin(self, start: tuple[Stop, ...]) -> None:
+        """Check where the arm stands, have the load taken off, go to the reference, tare.
+
+        The force sensor is tared before the first motion, too, so that it is watched from then on.
+        What is checked is checked again after every question and, by the mover, before each motion:
+        the arm may be moved by hand meanwhile. In a campaign that goes on, people are asked where
+        it does not stand where it was read last.
+        """
+        sample = self._rig.arm.sample()
+        unfit = self._guard.state(sample)
+        if unfit is not None:
+            raise DeviceError(unfit)
+        if self._temperatures is None:
+            self._temperatures = bool(np.isfinite(sample.joint_temperature).all())
+        first, last = start[0], self._state.last_q
+        self._mover.check_way(sample.q, first.q, first.name)
+        self._hook.begin()
+        left = sample.q if last is None else last
+        self._mover.goal = self._mover.agreed(first.q, first.name, left, self._hook.confirm)
+        self.in_control = True
+        self._rig.arm.take_control(*payload(self._cell, None))
+        self._watched(self._zero)
+        seen = []
+        for stop in start:
+            self._watched(partial(self._move, stop))
+            with suppress(TargetLostError):  # it is searched for when it is to be read
+                seen.append((stop.q, self._rig.tracker.measure().value[:3]))
+        self._check_tracker(seen)
+        self._watched(self._tare)
+
+    def _check_tracker(self, seen: list[tuple[Floats, Floats]]) -> None:
+        """Refuse a tracker whose target did not move with the arm; readings are held to these."""
+        registration = RoughRegistration(self._cell)
+        for q, position in seen:
+            wrong = registration.implausible(q, position)
+            if wrong is not None:
+                raise DeviceError(wrong)
+            registration.add(q, position)
+        for q, position in seen:
+            self._state.registration.add(q, position)
+
+    def _move(self, stop: Stop) -> None:
+        if not self._mover.is_at(stop.q):
+            self._watcher.notify(Phase(f"moving to {stop.name}"))
+            self._mover.move(stop.q, stop.name)
+
+    def _tare(self) -> None:
+        """Set the force sensor's zero at the reference pose, and store it."""
+        found = self._zero()
+        self._tared = True
+        if found is not None:
+            sample, q = found
+            self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
+
+    def _zero(self) -> tuple[WrenchSample, Floats] | None:
+        """Set the force sensor's zero at the present pose, with nothing on the hook.
+
+        Returns:
+            the mean wrench and the joint angles (n,), rad; None without a sensor.
+
+        Raises:
+            LoadChangedError: by the zero so far, something hangs or touches the tool.
+        """
+        meter, watch = self._meter, self._mover.watch
+        if meter is None or watch is None:
+            return None
+        self._watcher.notify(Phase("taring the force sensor"))
+        self._mover.wait(self._config.acquire.settle_s)
+        sample = meter.average()
+        q = self._mover.look().q
+        wrong = watch.wrong(meter.tared(sample, q))
+        if wrong:
+            raise LoadChangedError(wrong)
+        meter.set_zero(sample, q)
+        watch.expect(None)
+        return sample, q
+
+    def _change(self, name: str) -> None:
+        if name != UNLOADED and len(self._state.tared_wrenches) > self._identified:
+            self._identify()
+        self._hook.change(name)
+        self._event("load", {"hanging": name})
+        self._tared = name != UNLOADED
+
+    def _identify(self) -> None:
+        """Find the tool from all unloaded readings so far."""
+        if self._meter is None:
+            return
+        self._identified = len(self._state.tared_wrenches)
+        tolerance = self._config.operator.tolerance_N
+        try:
+            left_out = self._meter.identify(self._state.tared_wrenches, tolerance)
+        except HilcalError as error:
+            self._watcher.notify(Remark(f"the tool is not identified: {error}"))
+            return
+        if left_out is None:
+            return
+        tool = self._meter.tool
+        if left_out:
+            self._watcher.notify(
+                Remark(
+                    f"{len(left_out)} of {self._identified} unloaded readings differ by more than "
+                    f"{tolerance:g} N from the tool that the others weigh: was the tool touched?"
+                )
+            )
+        self._event(
+            "tool",
+            {
+                "mass_kg": float(tool.mass),
+                "com_m": self._meter.to_flange(tool.com).tolist(),
+                "bias": tool.bias.tolist(),
+                "variance_factor": tool.chi2 / max(tool.dof, 1),
+                "readings": self._identified,
+                "left_out": list(left_out),
+            },
+        )
+        differs = self._meter.tool_differs(tolerance)
+        if differs is not None:
+            self._watcher.notify(Remark(differs))
+
+    # one reading
+
+    def _reading(self, stop: Stop, step: Step) -> tuple[Readings, float]:
+        """Measure and store all targets; the arm has arrived. Returns the first one's reading."""
+        self._watcher.notify(Phase(f"measuring {step}"))
+        found = self._reader.read(stop.q, stop.name)
+        pairs = [self._row(stop, step, one) for one in found]
+        rows, details = [reading for reading, _ in pairs], [told for _, told in pairs]
+        self._check(found, details)
+        first = rows[0]
+        self._store.record(Readings.joined(rows), step, details[0], *details[1:])
+        self._done += 1
+        for one in found:
+            measured, mean = one.measured, one.measured.mean
+            name = f"{step}" if one.target is None else f"{step}, {self._name(one.target)}"
+            for text in measured.remarks:
+                self._watcher.notify(Remark(f"{name}: {text}"))
+            tared = None if one.target else self._tared_wrench(measured)
+            shift = self._state.add(
+                step, measured.q, mean.value, mean.covariance, tared, one.target or 0
+            )
+            if shift is not None:
+                self._tell_drift(step, shift)
+        self._look_back()
+        return first, sum(one.measured.settling for one in found)
+
+    def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
+        """Refuse the readings of an arrival of another target or another load.
+
+        They are kept as doubted.
+
+        Raises:
+            LoadChangedError: what hangs is not what should hang.
+            DeviceError: one cannot be its target's.
+        """
+        wrong = next(filter(None, map(self._doubt, found)), None)
+        if wrong is not None:
+            for told in details:
+                self._event("doubted", {"why": str(wrong), "reading": told})
+            raise wrong
+
+    def _look_back(self) -> None:
+        """Tell of stored readings that are seen to be doubtful now."""
+        for step, why in self._state.registration.late_doubts():
+            self._event("doubted", {"why": why, "reading": asdict(step), "stored": True})
+            self._watcher.notify(
+                Remark(f"{step}, stored before: {why} A fit sets gross errors aside")
+            )
+
+    def _doubt(self, one: TargetReading) -> DeviceError | None:
+        """Why a reading cannot be of its target under its load, or None."""
+        measured, watch = one.measured, self._mover.watch
+        position = measured.mean.value[:3]
+        stray = self._state.registration.implausible(measured.q, position, one.target or 0)
+        if stray is not None:
+            return DeviceError(stray)
+        tared = self._tared_wrench(measured)
+        wrong = "" if watch is None or tared is None else watch.wrong(tared)
+        return LoadChangedError(wrong) if wrong else None
+
+    def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
+        """One reading, and what is stored with it."""
+        measured, tared = one.measured, self._tared_wrench(one.measured)
+        elapsed = self._elapsed + one.ended - self._begun
+        reading = reading_of(
+            step,
+            stop.q,
+            measured,
+            self._wrench(step, tared),
+            elapsed,
+            one.ended - self._hook.since,
+            self._mover.side,
+            self._temperature(measured),
+            one.target,
+            self._cell.target_names,
+        )
+        session: dict[str, Any] = {
+            "epoch_wall_s": self._epoch,
+            "wall_s": self._wall(),
+            "time_s": elapsed,
+            "side": self._mover.side.tolist(),
+            "losses": None if self._rig.force is None else sample_json(self._rig.force.losses()),
+        }
+        if one.target is not None:
+            session["target"] = self._name(one.target)
+        zero = None if self._meter is None else self._meter.zero
+        return reading, detail(step, measured, tared, zero, session)
+
+    def _name(self, target: int) -> str:
+        return self._cell.target_names[target]
+
+    def _tared_wrench(self, measured: Measured) -> TaredWrench | None:
+        if self._meter is None or measured.force is None:
+            return None
+        return self._meter.tared(measured.force, measured.q)
+
+    def _wrench(self, step: Step, tared: TaredWrench | None) -> Floats:
+        """(6,) wrench of the load at the load point, base axes: configured or measured."""
+        load = self._hook.load(step.load)
+        if load is None:
+            return np.zeros(6)
+        sensor = self._config.force_sensor
+        pull = any((*load.force_N, *load.moment_Nm))
+        wanted = sensor is not None and (sensor.use == "all" or (sensor.use == "pulls" and pull))
+        if wanted and self._meter is not None and tared is not None:
+            return self._meter.load_wrench(tared)
+        return load.wrench(self._cell.gravity)
+
+    def _temperature(self, measured: Measured) -> Floats | None:
+        """(n,) °C, or None in a campaign without."""
+        if not self._temperatures:
+            return None
+        mean = (measured.before.joint_temperature + measured.after.joint_temperature) / 2
+        if not np.isfinite(mean).all():
+            raise DeviceError("arm: it no longer reports the temperatures of its joints")
+        return np.asarray(mean)
+
+    def _tell_drift(self, step: Step, shift: Shift) -> None:
+        limit = self._config.acquire.drift_limit_sigma
+        content = {"shift_m": shift.metres.tolist(), "sigma": shift.sigma}
+        self._event("drift", {"cycle": step.cycle, **content, "over": shift.sigma > limit})
+        if shift.sigma > limit:
+            self._watcher.notify(Remark(shift.words(limit)))
+
+    # people
+
+    def _passed(self, q: Floats) -> None:
+        """Tell where the arm is on its way."""
+        self._watcher.notify(ArmAt(tuple(q.tolist())))
+
+    def _tell(
+        self, step: Step, reading: Readings, total: int, left: float, settling: float
+    ) -> None:
+        number = int(reading.target[0])
+        deflection = self._state.deflection(step, reading.value[0, :3], number)
+        (_, live), *others = self._compared(reading)
+        self._watcher.notify(
+            ReadingStored(
+                step,
+                self._done,
+                total,
+                self._clock.real(left),
+                left,
+                deflection,
+                live,
+                settling,
+                self._goal.status,
+                number,
+                tuple(others),
+            )
+        )
+
+    def _compared(self, reading: Readings) -> list[tuple[int, LiveResidual]]:
+        """Each target that was read in an arrival against the readings before the arrival."""
+        out = [(int(k), LiveResidual()) for k in reading.target]
+        readings = None if self._live is None else self._store.readings()
+        if self._live is None or readings is None:
+            return out
+        before = np.arange(len(readings) - len(reading))
+        for k, (target, _) in enumerate(out):
+            with suppress(HilcalError):  # too early for a model; nothing depends on it
+                one = readings[np.append(before, len(before) + k)]
+                out[k] = target, self._live(one)
+        return out
+
+    def _finish(self) -> None:
+        found = self._state.repeatability()
+        if found is not None:
+            self._event("repeatability", asdict(found))
+            self._watcher.notify(Remark(found.words(self._joint_std)))
+        self._event("finished", {"readings": self._done})
+        self._watcher.notify(Phase("finished"))
+
+    def _event(self, kind: str, content: dict[str, Any]) -> None:
+        self._store.event(kind, {"wall_s": self._wall(), **content})

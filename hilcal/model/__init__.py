@@ -1,0 +1,1 @@
+"""Robot and effects: static equilibrium, observation, Jacobians."""

@@ -1,0 +1,253 @@
+"""The static equilibrium differentiated: how a reading moves where the arm yields to its motion.
+
+The elastic deviation f depends on the slot wrenches W, these on the deviated chain, and the chain
+on the deviation D: D = f(θ, W(D)). With the reading y(D), the derivatives C = ∂f/∂W (compliance)
+and K = ∂W/∂D (geometric stiffness),
+
+    dy/dθ = A ∂f/∂θ + B ∂W/∂θ,     A = ∂y/∂D + B K,     B = A C = Σ_i ∂y/∂D C (K C)^i
+
+The factor K C is about deflection/reach, so that few terms of the series are needed. B has as many
+rows as the reading, however many parameters there are.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from hilcal.effects.protocol import Effect, Situation
+from hilcal.model.observe import Motion, SlotFrames
+from hilcal.robot import se3
+from hilcal.robot.batch import zeros
+from hilcal.robot.chain import Chain
+from hilcal.robot.geometric_stiffness import GeometricStiffness, MotionGradient, rows_times
+from hilcal.robot.statics import Load
+from hilcal.types import Floats
+
+TOLERANCE = 1e-8
+"""Part of the derivative, root mean square over the states, that may be missing; a choice, with
+room for states whose loads are several times the mean."""
+MAX_TERMS = 40
+TORQUE = 5
+"""Component of a slot's wrench about the axis of its joint."""
+FORCE, MOMENT = slice(0, 3), slice(3, 6)
+"""Components of a slot's wrench."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Block:
+    """Derivative of the deviation at one slot by the wrench through one slot.
+
+    Attributes:
+        slot: whose wrench.
+        to: which joint (index) or slot deviates.
+        joint: whether it is a joint displacement, else a twist.
+        components: range of the components of the wrench: of its force, or of its moment.
+        elements: range of the elements of the deviation.
+        values: (N, I, E) or (1, I, E).
+    """
+
+    slot: int
+    to: int
+    joint: bool
+    components: slice
+    elements: slice
+    values: Floats
+
+
+def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Block]:
+    """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
+    blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
+    whole = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
+    found = [part for b in whole for part in _halves(b)]
+    drive = s.cell.arm.drive
+    return found if drive is None else [c for b in found for c in _of_joints(b, drive)]
+
+
+def _halves(b: Block) -> Iterator[Block]:
+    """Yield the parts of a block by the force and by the moment."""
+    first, last = b.components.start, b.components.stop
+    if first >= MOMENT.start or last <= FORCE.stop:
+        yield b
+        return
+    middle = MOMENT.start - first
+    yield replace(b, components=slice(first, FORCE.stop), values=b.values[:, :middle])
+    yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
+
+
+def _of_joints(b: Block, drive: Floats) -> Iterator[Block]:
+    """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
+
+    Forces and moments across an axis are those of the slot itself.
+    """
+    if not b.joint:
+        yield b
+        return
+    by_torque = b.components.stop == TORQUE + 1 and b.slot < len(drive)
+    last = b.components.stop - by_torque
+    for to in np.flatnonzero(drive[:, b.to]):
+        moved = replace(b, to=int(to), values=drive[to, b.to] * b.values)
+        if last > b.components.start:
+            rest = slice(b.components.start, last)
+            yield replace(moved, components=rest, values=moved.values[:, : last - rest.start])
+        if by_torque:
+            for slot in np.flatnonzero(drive[:, b.slot]):
+                values = drive[slot, b.slot] * moved.values[:, -1:]
+                at = slice(TORQUE, TORQUE + 1)
+                yield replace(moved, slot=int(slot), components=at, values=values)
+
+
+def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Block]) -> Motion:
+    """Add to the motions of a reading how the arm yields to the change of the wrenches.
+
+    Args:
+        moves: derivatives of the reading with the wrenches held as they are.
+        stiffness: of the chain under its load.
+        blocks: the compliance.
+    """
+    term = wrench_form(moves, blocks)
+    form, whole = dict(term), _norm(term)
+    before = whole
+    for _ in range(MAX_TERMS):
+        gradient = stiffness.gradient(term)
+        term = by_wrenches(blocks, gradient.joint, partial(_by_twist, gradient, moves.frames))
+        for place, b in term.items():
+            form[place] = form[place] + b
+        now = _norm(term)
+        # The terms shrink by one factor; what is missing of B is about the next one, and of A
+        # smaller by that factor once more.
+        if now**3 <= TOLERANCE * whole * before**2:
+            break
+        before = now
+    yielding = stiffness.gradient(form)
+    dq = moves.dq.copy(order="F")
+    for j in range(dq.shape[2]):
+        dq[:, :, j] += yielding.joint(j)
+    return replace(moves, dq=dq, yielding=yielding)
+
+
+def wrench_form(moves: Motion, blocks: list[Block]) -> dict[tuple[int, bool], Floats]:
+    """Derivatives (N, m, 3) of a reading by the force (False) and moment (True) of each slot."""
+    return by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
+
+
+def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
+    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches.
+
+    Args:
+        form: derivatives by the wrenches, see `wrench_form`.
+        change: the changes.
+        m: elements of a reading.
+    """
+    out = zeros(len(change), m, change.shape[1])
+    for (slot, moment), rows in form.items():
+        half = change[:, :, slot, MOMENT if moment else FORCE]
+        out += rows_times(rows, half, transposed=True)
+    return out
+
+
+def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m: int) -> Floats:
+    """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
+
+    A force f and a moment t there are R_kᵀ f and R_kᵀ (t + d_k × f) in slot k, d_k the lever.
+
+    Args:
+        form: derivatives by the slot wrenches, see `wrench_form`.
+        chain: the deviated chain.
+        load: where it acts.
+        m: elements of a reading.
+    """
+    point = chain.point(load.point)
+    out = zeros(len(point), m, 6)
+    for (slot, moment), rows in form.items():
+        turned = rows_times(rows, chain.rotation[slot], transposed=True)
+        if moment:
+            out[..., MOMENT] += turned
+            turned = se3.cross(turned, (point - chain.position[slot])[:, None])
+        out[..., FORCE] += turned
+    return out
+
+
+def by_wrenches(
+    blocks: list[Block],
+    by_joint: Callable[[int], Floats],
+    by_slot: Callable[[int, slice], Floats],
+) -> dict[tuple[int, bool], Floats]:
+    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot.
+
+    From those by the deviation; those that are zero are left out.
+
+    Args:
+        blocks: the compliance.
+        by_joint: (N, m) by the displacement of a joint.
+        by_slot: (N, m, E) by a range of the elements of the twist of a slot.
+    """
+    used: dict[int, slice] = {}
+    for b in blocks:
+        if not b.joint:
+            old = used.get(b.to, b.elements)
+            start, stop = min(old.start, b.elements.start), max(old.stop, b.elements.stop)
+            used[b.to] = slice(start, stop)
+    twists = {to: by_slot(to, elements) for to, elements in used.items()}
+    out: dict[tuple[int, bool], Floats] = {}
+    for b in blocks:
+        if b.joint:
+            found = by_joint(b.to)[..., None]
+        else:
+            e = used[b.to].start
+            found = twists[b.to][..., b.elements.start - e : b.elements.stop - e]
+        moment = b.components.start >= MOMENT.start
+        first = MOMENT.start if moment else FORCE.start
+        if (b.slot, moment) not in out:
+            out[b.slot, moment] = zeros(*found.shape[:2], 3)
+        to = out[b.slot, moment][..., b.components.start - first : b.components.stop - first]
+        if len(b.values) > 1:
+            to += np.einsum("nme,nie->nmi", found, b.values)
+            continue
+        for i, element in zip(*np.nonzero(b.values[0]), strict=True):
+            to[..., i] += found[..., element] * b.values[0, i, element]
+    return out
+
+
+def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements: slice) -> Floats:
+    """Derivative (N, m, E) by elements of the twist of a slot, from that by its motion."""
+    v = gradient.displacement(slot) if frames.need_displacement(slot, elements) else None
+    return frames.by_twist(slot, v, gradient.turn(slot), elements)
+
+
+def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
+    """Root of the sum of squares of the coefficients of the wrenches, in SI units."""
+    flat = (b.ravel(order="K") for b in form.values())
+    return math.sqrt(sum(float(b @ b) for b in flat))
+
+
+def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
+    """Compliance of one effect, from its response to unit wrenches."""
+    slots = s.wrench.shape[1]
+    every = range(slots)
+    groups = [every] if effect.local_response else [range(k, k + 1) for k in every]
+    for group in groups:
+        units = zeros(1 if effect.local_response else len(s.wrench), 6, slots, 6)
+        for i in range(6):
+            units[:, i, group, i] = 1.0
+        r = effect.response(theta, s, units)
+        for to in every:
+            slot = to if effect.local_response else group[0]
+            if r.twist is not None:
+                yield Block(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
+            if r.dq is not None and to < r.dq.shape[2]:
+                yield Block(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
+
+
+def _pruned(b: Block) -> Block | None:
+    """Return the block without components and elements that are zero in all states."""
+    if not b.values.any():
+        return None
+    there = np.any(b.values, axis=0)
+    i, e = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+    components, elements = slice(i[0], i[-1] + 1), slice(e[0], e[-1] + 1)
+    return replace(
+        b, components=components, elements=elements, values=b.values[:, components, elements]
+    )

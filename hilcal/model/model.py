@@ -1,0 +1,401 @@
+"""A model is a cell and a tuple of effects; `model + effect` is a new model."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import accumulate, pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hilcal.cell import Cell
+from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.effects.options import typical_compliances
+from hilcal.effects.protocol import Columns, Effect, Situation
+from hilcal.effects.spec import EffectSpec
+from hilcal.effects.total import total
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.model.equilibrium import Block, at_equilibrium, compliance
+from hilcal.model.observe import Motion, Observation, motion, observe
+from hilcal.model.reading_columns import ReadingColumns
+from hilcal.readings.readings import Readings, States
+from hilcal.robot import chain as chains
+from hilcal.robot import se3
+from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
+from hilcal.robot.chain import Chain
+from hilcal.robot.deviation import Deviation
+from hilcal.robot.geometric_stiffness import geometric_stiffness
+from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.types import Floats, Ints
+
+if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
+    from hilcal.identification.carried import CarriedPrior
+
+EQUILIBRIUM_TOLERANCE = 1e-13
+"""Motion of the flange that may be missing from the converged equilibrium, m."""
+MAX_EQUILIBRIUM_STEPS = 30
+FLANGE_STEP = 1e-4
+"""Step of a difference quotient, m or rad: rounding 1e-12, higher terms 1e-9 of the quotient."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What a model predicts of N states.
+
+    Attributes:
+        situation: the states at their deflected configuration.
+        deviation: the summed deviation.
+        observation: what the sensor would read.
+    """
+
+    situation: Situation
+    deviation: Deviation
+    observation: Observation
+
+    def __getitem__(self, rows: slice) -> "Prediction":
+        """Return the prediction of the chosen states."""
+        s = self.situation
+        chosen = replace(
+            s,
+            states=s.states[rows],
+            angle=s.angle[rows],
+            chain=take(s.chain, rows, axis=1),
+            wrench=s.wrench[rows],
+            load=replace(s.load, wrench=s.load.wrench[rows]),
+        )
+        return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
+
+    def put(self, rows: slice, part: "Prediction") -> None:
+        """Write the prediction of the chosen states; the chain's twists are the deviation's."""
+        s, of = self.situation, part.situation
+        put(self.deviation, rows, part.deviation)
+        put(self.observation, rows, part.observation)
+        put(s.chain, rows, replace(of.chain, twist=None), axis=1)
+        s.angle[rows], s.wrench[rows], s.load.wrench[rows] = of.angle, of.wrench, of.load.wrench
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """Robot and effects.
+
+    Attributes:
+        cell: the cell.
+        effects: its effects, each of another name.
+        catalogue: the effects that it could have.
+        readings: those that effects are set up for when they are added by name; None where the
+            model was made without.
+        prior: what another campaign taught of the arm; None for nothing. It is of those parameters
+            that have the same names.
+        random: by effect, the standard deviations (q,) of its parameters where they are random with
+            a mean of zero, SI (see `hilcal.mixed`).
+        background: names of effects that predict with all others, and that the readings do not
+            prove one by one. They are among `random`.
+    """
+
+    cell: Cell
+    effects: tuple[Effect, ...]
+    catalogue: Catalogue = field(default_factory=installed)
+    readings: Readings | None = None
+    prior: "CarriedPrior | None" = None
+    random: Mapping[str, Floats] = field(default_factory=dict)
+    background: frozenset[str] = frozenset()
+    _slices: tuple[slice, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Refuse an effect that is there twice."""
+        ends = accumulate((len(e.magnitudes) for e in self.effects), initial=0)
+        # Asked for at every step; an effect with a thousand parameters takes long to name them.
+        object.__setattr__(self, "_slices", tuple(slice(a, b) for a, b in pairwise(ends)))
+        names = self.names
+        for name in names:
+            if names.count(name) > 1:
+                raise InputError(f"effect {name} is in the model already: {', '.join(names)}")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects, in order."""
+        return tuple(e.name for e in self.effects)
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Names of the effects that people see as the model, in order; see `background`."""
+        return tuple(n for n in self.names if n not in self.background)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters."""
+        return self._slices[-1].stop if self._slices else 0
+
+    def slices(self) -> tuple[slice, ...]:
+        """Where each effect's parameters lie in the vector of all."""
+        return self._slices
+
+    def __add__(self, effect: Effect | EffectSpec) -> "Model":
+        """Return the model with one more effect; one that is only named is built for it.
+
+        Raises:
+            InputError: an effect that is there already, or cannot be built.
+        """
+        if isinstance(effect, EffectSpec):
+            return self._with(effect)
+        return replace(self, effects=(*self.effects, effect))
+
+    def _with(self, spec: EffectSpec) -> "Model":
+        """Return the model with an effect that is built for its cell and readings."""
+        if self.readings is None:
+            raise InputError(
+                f"effect {spec.name}: this model was made without readings; add an effect that is "
+                "built for a cell and states"
+            )
+        catalogue, states, m = self.catalogue, self.readings.states, self.readings.m
+        if not isinstance(spec.kind, str) and spec.kind not in catalogue.effects:
+            catalogue = catalogue.with_effects(spec.kind)
+        made = catalogue.make(spec.name, self.cell, states, spec.options, m)
+        return replace(self, effects=(*self.effects, made), catalogue=catalogue)
+
+    def predict(self, states: States, theta: Floats, near: Prediction | None = None) -> Prediction:
+        """Equilibrium of N states: elastic deviations at the deflected configuration.
+
+        The elastic deviations depend on the wrenches, those on the configuration, and the
+        configuration on the deviations: a fixed point, which the iteration approaches by a
+        factor of about deflection/reach (1e-3) per step. It begins undeflected, or as the same
+        states are in a prediction `near`, which takes a step or two less.
+
+        Raises:
+            CannotAnswerError: the deviations grow instead of settling.
+        """
+        whole: Prediction | None = None
+        for rows in chunks(len(states)):
+            part = self._equilibrium(states[rows], theta, near[rows] if near else None)
+            if len(part.situation.angle) == len(states):
+                return part
+            # Written at once: chunks that are kept until the end take new memory each.
+            whole = _room(states, part) if whole is None else whole
+            whole.put(rows, part)
+        assert whole is not None  # noqa: S101 - there is always a chunk
+        return whole
+
+    def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
+        """Return the equilibrium of a chunk of states."""
+        cell = self.cell
+        angle = states.q if states.q_actual is None else states.q_actual
+        angle = along_states(angle)
+        parts = self._parts(theta)
+        turns = chains.turns(cell.arm, angle)
+        chain = near.situation.chain if near else None
+        chain = chain or chains.evaluate(cell.arm, angle, nominal=turns)
+        nothing = zeros(len(states), cell.arm.n + 1, 6)
+        recorded = self._load(states, theta)
+        turned = along_states(cell.arm.drive_angles(angle))
+        s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
+        rigid = _deviation([(e, t) for e, t in parts if not e.elastic], s)
+        elastic = [(e, t) for e, t in parts if e.elastic]
+        before: float | None = None
+        for _ in range(MAX_EQUILIBRIUM_STEPS):
+            load = self._corrected(recorded, replace(s, chain=chain), theta)
+            wrench = slot_wrenches(cell.arm, chain, load)
+            s = replace(s, chain=chain, wrench=wrench, load=load)
+            deviation = _deviation(elastic, s, rigid, checked=before is None)
+            chain = chains.evaluate(cell.arm, angle, deviation, turns)
+            moved = _flange_motion(s.chain, chain, cell.arm.reach)
+            # The steps shrink geometrically: what is missing is about the next one.
+            missing = moved if before is None else moved * (moved / before)
+            if not elastic or missing <= EQUILIBRIUM_TOLERANCE:
+                break
+            before = moved
+        else:
+            _deviation(elastic, s, rigid)  # refuses columns that are not finite
+            raise CannotAnswerError(
+                "no static equilibrium: with these parameters the elastic deviations of "
+                f"{', '.join(e.name for e, _ in elastic)} grow instead of settling; measure "
+                "poses and loads that determine them, or leave an effect out"
+            )
+        s = replace(s, chain=chain)
+        return Prediction(s, deviation, observe(cell, chain, deviation, states.target))
+
+    def jacobian(
+        self,
+        prediction: Prediction,
+        theta: Floats,
+        m: int,
+        live: Ints | None = None,
+        drives: Floats | None = None,
+    ) -> Floats:
+        """Derivative (N, m, P) of the readings by all parameters, sensor axes.
+
+        With `live`, an ascending list of L parameters, only those: (N, m, L). Where `drives`
+        (N, m, n) is given, the derivative by displacements of the drives is written to it.
+        """
+        return self.jacobian_of(self.effects, prediction, theta, m, live, drives=drives)
+
+    def jacobian_of(
+        self,
+        effects: tuple[Effect, ...],
+        prediction: Prediction,
+        theta: Floats,
+        m: int,
+        live: Ints | None = None,
+        scale: Floats | None = None,
+        drives: Floats | None = None,
+    ) -> Floats:
+        """Derivative (N, m, P) of the readings by the parameters of `effects`.
+
+        `effects` may or may not be in the model; one that is not is taken at zero. Analytic:
+        the static equilibrium is differentiated implicitly (`equilibrium`). With `scale`
+        (P,), by the parameters in these units.
+        """
+        count = len(prediction.situation.angle)
+        if effects is self.effects:  # naming a thousand parameters takes long
+            sizes = [s.stop - s.start for s in self.slices()]
+        else:
+            sizes = [len(e.magnitudes) for e in effects]
+        place = np.full(sum(sizes), -1)
+        live = np.arange(len(place)) if live is None else live
+        place[live] = np.arange(len(live))
+        places = np.split(place, np.cumsum(sizes)[:-1]) if sizes else []
+        units = None if scale is None else scale[live]
+        out = np.empty((count, m, len(live)))
+
+        for rows in chunks(count, m * len(live)):
+            moves = self._fill(out[rows], effects, places, prediction[rows], theta, units)
+            if drives is not None:
+                drives[rows] = moves.drives
+        return out
+
+    def _fill(
+        self,
+        out: Floats,
+        effects: tuple[Effect, ...],
+        places: list[Ints],
+        prediction: Prediction,
+        theta: Floats,
+        scale: Floats | None,
+    ) -> Motion:
+        """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
+        s = prediction.situation
+        moves, blocks = self._motion(prediction, theta, out.shape[1])
+        columns = ReadingColumns(moves, blocks, s.load, scale)
+        mine = self._parts(theta)
+        for e, place in zip(effects, places, strict=True):
+            if not (place >= 0).any():
+                continue
+            at = next((t for other, t in mine if other is e), np.zeros(len(place)))
+            for c in e.checked_columns(s):
+                columns.add(c, place)
+            if e in self.effects and e.compliance(at) is not None:
+                for other, part in mine:
+                    for c in other.compliance_columns(part, s):
+                        columns.add(e.of_compliance(c), place)
+            if not blocks:
+                continue
+            if (change := e.load_columns(at, s)) is not None:
+                columns.add_load_changes(change, place)
+            elif (change := e.wrench_columns(at, s)) is not None:
+                columns.add_wrench_changes(change, place)
+        columns.write(out)
+        return moves
+
+    def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
+        """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""
+        s = prediction.situation
+        moves = motion(self.cell, prediction.observation, s.chain, prediction.deviation, m)
+        blocks = compliance([(e, t) for e, t in self._parts(theta) if e.elastic], s)
+        if not blocks:
+            return moves, blocks
+        following = self._following(s, theta)
+        stiffness = geometric_stiffness(self.cell.arm, s.chain, s.load, following)
+        return at_equilibrium(moves, stiffness, blocks), blocks
+
+    def _following(self, s: Situation, theta: Floats) -> Floats | None:
+        """Derivative (N, 6, 6) of the acting wrench by displacement and turn of the flange.
+
+        By central differences, of the corrections alone: they are a small part of the wrench,
+        and it is their change with a small motion.
+        """
+        parts = [(e, t) for e, t in self._parts(theta) if e.wrench_change(t, s) is not None]
+        if not parts:
+            return None
+        out = zeros(len(s.states), 6, 6)
+        for axis in range(6):
+            for sign in (1.0, -1.0):
+                step = np.zeros(6)
+                step[axis] = sign * FLANGE_STEP
+                rotation, position = s.chain.rotation.copy(), s.chain.position.copy()
+                rotation[-1] = se3.product(se3.rotation(step[3:]), rotation[-1])
+                position[-1] += step[:3]
+                moved = replace(s, chain=replace(s.chain, rotation=rotation, position=position))
+                for e, t in parts:
+                    change = e.wrench_change(t, moved)
+                    if change is not None:
+                        out[:, :, axis] += change * (sign / (2 * FLANGE_STEP))
+        return out
+
+    def _parts(self, theta: Floats) -> list[tuple[Effect, Floats]]:
+        """Each effect with its parameters."""
+        return [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
+
+    def _compliance(self, theta: Floats) -> Floats:
+        """(n,) joint compliances in force."""
+        found = [c for e, t in self._parts(theta) if (c := e.compliance(t)) is not None]
+        return found[0] if found else typical_compliances(self.cell)
+
+    def _load(self, states: States, theta: Floats) -> Load:
+        """Load as recorded, where it acts, and the weights."""
+        cell, point = self.cell, self.cell.load_point
+        moments: Floats | None = None
+        for e, t in self._parts(theta):
+            change = e.load_change(t)
+            if change is not None and change.point is not None:
+                point = point + change.point
+            if change is not None and change.first_moment is not None:
+                moments = change.first_moment + (0.0 if moments is None else moments)
+        wrench = along_states(states.wrench)
+        return Load(wrench, point, cell.tool_mass, cell.tool_com, cell.gravity, moments)
+
+    def _corrected(self, recorded: Load, s: Situation, theta: Floats) -> Load:
+        """Load with the wrench that acts, at the orientation of the flange."""
+        changes = [e.wrench_change(t, s) for e, t in self._parts(theta)]
+        given = [c for c in changes if c is not None]
+        return replace(recorded, wrench=sum(given, recorded.wrench)) if given else recorded
+
+
+def _deviation(
+    parts: list[tuple[Effect, Floats]],
+    s: Situation,
+    start: Deviation | None = None,
+    checked: bool = True,
+) -> Deviation:
+    """Return the sum of the deviations of effects at their parameters, added to `start`."""
+    columns: list[Columns] = []
+    first = 0
+    for e, t in parts:
+        found = e.checked_columns(s) if checked else e.columns(s)
+        columns += (replace(c, parameter=c.parameter + first) for c in found)
+        first += len(t)
+    theta = np.concatenate([t for _, t in parts]) if parts else np.zeros(0)
+    return total(tuple(columns), theta, s, start)
+
+
+def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
+    """Largest displacement, or rotation times reach, of the flange from one chain to another."""
+    shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
+    turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
+    return float(max(shift, reach * turn))
+
+
+def _room(states: States, part: Prediction) -> Prediction:
+    """Return the prediction of all states, yet to be written, from that of a chunk of them."""
+    count, s = len(states), part.situation
+    deviation = by_field([part.deviation], lambda given: room(given[0], count))
+    observation = by_field([part.observation], lambda given: room(given[0], count))
+    chain = by_field([replace(s.chain, twist=None)], lambda given: room(given[0], count, axis=1))
+    if deviation.twist is not None:
+        chain = replace(chain, twist=np.swapaxes(deviation.twist, 0, 1))
+    situation = replace(
+        s,
+        states=states,
+        angle=room(s.angle, count),
+        chain=chain,
+        wrench=room(s.wrench, count),
+        load=replace(s.load, wrench=room(s.load.wrench, count)),
+    )
+    return Prediction(situation, deviation, observation)

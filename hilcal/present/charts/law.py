@@ -1,0 +1,36 @@
+"""A law that the catalogue does not have, over what it depends on, beside the readings."""
+
+import plotly.graph_objects as go
+
+from hilcal.present.charts import style
+from hilcal.present.charts.readings_drawn import escaped
+from hilcal.present.story import StoryLaw
+
+
+def law(of: StoryLaw) -> go.Figure:
+    """Draw a law as a line, and what the readings say by themselves with standard uncertainties."""
+    traces = [
+        go.Scatter(
+            x=style.drawn(of.line[0]),
+            y=style.drawn(of.line[1]),
+            mode="lines",
+            line={"color": style.NOISE, "width": 2},
+            name="law",
+            hoverinfo="skip",
+        ),
+        go.Scatter(
+            x=of.x,
+            y=of.y,
+            error_y={"type": "data", "array": of.error, "color": style.GREY},
+            mode="markers",
+            marker={"color": style.MEASURED, "size": 8},
+            name="readings, mean ± standard uncertainty",
+            hovertemplate="%{x:.3g}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
+        ),
+    ]
+    says = (
+        f"{of.formula}: {of.y_label} over {of.x_label}; where the law is right, the readings "
+        "(points) lie on it (line, interpolated where there are none)."
+    )
+    x, y = escaped(of.x_label), escaped(of.y_label)
+    return style.figure(says, x=x, y=y, traces=traces, height=340)

@@ -1,0 +1,92 @@
+"""The page that compares two campaigns of one arm."""
+
+from hilcal import numbers
+from hilcal.diagnosis.change import LEVEL
+from hilcal.diagnosis.comparison import Comparison
+from hilcal.names import quoted
+from hilcal.present.charts.change import changes_chart, error_by_pose
+from hilcal.present.html.first_screen import Card, FirstScreen
+from hilcal.present.html.page import render
+from hilcal.present.html.parts import Part, Section, Words, chart, from_terminal, table
+from hilcal.present.text_change import comparison_report, next_step, sentence
+
+Named = tuple[str, str]
+
+
+def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str) -> str:
+    """Return the comparison as HTML.
+
+    Args:
+        c: the comparison.
+        files: name and SHA-256 of the earlier campaign's file and of the later one's.
+        operator: who answers for the measurement; empty where nobody is named.
+        made: when the report was made, ISO 8601, UTC.
+        version: of the program.
+    """
+    (earlier, _), (later, _) = files
+    arm = c.fit.model.cell.arm.name
+    told: list[Part] = list(from_terminal(comparison_report(c, earlier, later)))
+    charts: list[Part] = [chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
+    if c.changes.found:
+        charts.append(chart("What each change moves", changes_chart(c), wide=True, height=0))
+    rows = [(which, name, sha) for which, (name, sha) in zip(("earlier", "later"), files,
+                                                             strict=True)]  # fmt: skip
+    provenance = (
+        table("Files", ("campaign", "name", "SHA-256"), rows),
+        table(
+            "Identity of this report",
+            ("", ""),
+            (
+                ("Robot", arm),
+                ("Operator", operator or "not stated"),
+                ("Report made", f"{made[:19].replace('T', ' ')} UTC by hilcal {version}"),
+            ),
+        ),
+        Words("Commands that show the same", "heading"),
+        Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
+    )
+    sections = (
+        Section("changes", "What has changed", tuple(told)),
+        Section("today", "The earlier calibration today", tuple(charts)),
+        Section("provenance", "Provenance", provenance),
+    )
+    return render("Comparison of two campaigns", f"{arm}, {earlier} and {later}, {made[:10]}",
+                  first_screen(c, earlier), sections)  # fmt: skip
+
+
+def first_screen(c: Comparison, earlier: str) -> FirstScreen:
+    """Return what the first screen says."""
+    found, t = c.changes, c.today
+    error = t.prediction.error
+    worse = t.p_value < LEVEL
+    if not found.found and found.explained:
+        headline, tone = "Nothing has changed beyond the uncertainty", "good"
+    elif c.another_arm:
+        headline, tone = "This looks like another arm of the same type", "bad"
+    elif not found.found:
+        headline, tone = "Something has changed, and no single candidate explains it", "bad"
+    else:
+        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in found.found)))
+        headline, tone = f"Something has changed: {parts}", "bad"
+    good = (
+        f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
+        f"{numbers.digits(t.z, 2)} times what it states: "
+        + ("more than its uncertainty." if worse else "no more than its uncertainty.")
+    )
+    what = " ".join(sentence(x) for x in found.found) or headline + "."
+    cards = [
+        Card(
+            "Error today",
+            numbers.length(error.rms_m),
+            f"rms; largest {numbers.length(error.max_m)}",
+        ),
+        Card("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
+    ]
+    if t.drawing_m is not None:
+        cards.append(Card("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
+    answers = (
+        ("Is the calibration still good?", good),
+        ("What has changed?", what),
+        ("What to do?", numbers.sentence(next_step(c, earlier))),
+    )
+    return FirstScreen(headline, tone, answers, tuple(cards), "", None)

@@ -1,0 +1,233 @@
+"""The first screen: is the model good, where is it wrong, what is missing; before, after, limit."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.identification.before import error_before
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_prediction import names
+from hilcal.present import text
+from hilcal.present.html.content import ReportContent
+from hilcal.present.verdict_words import UNCALIBRATED, message
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """One number of the first screen: `label`, `value` with unit, and a note."""
+
+    label: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class FirstScreen:
+    """What the first screen says.
+
+    Attributes:
+        headline: the verdict in a few words.
+        tone: "good", "doubt" or "bad", for the colour; the headline says it in words.
+        answers: question and answer: is it good, where is it wrong, what is missing.
+        cards: before and after.
+        limit: "PASSED" or "FAILED" and why; empty without a limit.
+        passed: whether the limit is kept; None without one.
+    """
+
+    headline: str
+    tone: str
+    answers: tuple[tuple[str, str], ...]
+    cards: tuple[Card, ...]
+    limit: str
+    passed: bool | None
+
+
+def first_screen(m: ReportContent) -> FirstScreen:
+    """Return what the first screen says."""
+    d, fit = m.diagnosis, m.fit
+    headline, tone = headline_of(d)
+    limit, passed = limit_words(m)
+    return FirstScreen(
+        headline,
+        tone,
+        (
+            ("Is the model good?", how_good(m)),
+            ("Where is it wrong?", where_wrong(m)),
+            ("What is missing?", missing(d)),
+        ),
+        tuple(_cards(m, fit)),
+        limit,
+        passed,
+    )
+
+
+def headline_of(d: Diagnosis | None) -> tuple[str, str]:
+    """Return the verdict in a few words, and its tone."""
+    if d is None:
+        return "Not judged: only a model fitted with scaling gc can be", "doubt"
+    lead = d.lead.effect if d.lead is not None else ""
+    if d.verdict == "adequate":
+        if d.fit.mode == "deflection":
+            return f"The model is good for deflections; {UNCALIBRATED}", "good"
+        return "The model is good: what is left is noise", "good"
+    if d.verdict == "missing_effect":
+        return f"The model is incomplete: {lead} is missing", "bad"
+    if d.wrong_figures:
+        return "A figure of the cell seems to be wrong: correct it first", "bad"
+    if d.verdict == "ambiguous":
+        if d.reason == "inseparable_addition":
+            return "The model is good, but another one would be as good", "doubt"
+        return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
+    if d.verdict == "unknown_effect":
+        return "The model is incomplete: no known effect explains what is left", "bad"
+    return "The stated noise is wrong: the model cannot be judged by it", "doubt"
+
+
+def how_good(m: ReportContent) -> str:
+    """Say in a sentence how well the model predicts."""
+    d, prior = m.diagnosis, m.fit.model.prior
+    told = text.misses(m.fit)
+    if prior is not None:
+        told += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
+    if d is None:
+        return told
+    if d.verdict == "noise_misjudged":
+        return f"It cannot be told, for the stated noise is wrong. {told}"
+    good = d.verdict == "adequate" or d.reason == "inseparable_addition"
+    return f"{'Yes' if good else 'Not yet'}. {told}"
+
+
+def where_wrong(m: ReportContent) -> str:
+    """Say in a sentence where it is worst, and what the misfit follows."""
+    d = m.diagnosis
+    if d is not None and d.residual_is_noise:
+        return "Nowhere beyond the noise: all poses and loads are predicted within it."
+    fit, error = m.fit, left_out_errors(m.fit)
+    furthest = int(fit.whitening.reading[np.argmax(error)])
+    pose, load = names(fit.readings[~fit.outlier], furthest)
+    at = "unloaded" if load == UNLOADED else f"under {load}"
+    said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
+    return said if d is None else f"{said} {text.follows(d.misfit_breakdown)}"
+
+
+def missing(d: Diagnosis | None) -> str:
+    """Say in few words what is missing; the whole sentence stands with the evidence."""
+    if d is None:
+        return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
+    if d.verdict == "adequate":
+        return "Nothing that these readings could show."
+    if d.wrong_figures:
+        return numbers.sentence(message(d))
+    if d.reason == "inseparable_addition":
+        return _as_good(d)
+    if d.reason == "no_suspect":
+        best = f": the best, {d.suspects[0].effect}, does not" if d.suspects else ""
+        return (
+            f"No effect of the catalogue surely explains what is left{best}. hilcal discover "
+            "searches a law for it."
+        )
+    lead = d.lead
+    if lead is None or d.reason == "insufficient_catalogue":
+        return numbers.sentence(message(d), d.significant)
+    explained = (
+        f"explains {numbers.percent(lead.share)} of the misfit, "
+        f"{numbers.percent(max(lead.holdout_share, 0.0))} on poses left out"
+    )
+    name = lead.coarse or lead.effect
+    law = f"{name} is: {d.fit.model.catalogue[name].summary}."
+    if d.reason == "inseparable_suspects":
+        others = numbers.few([r.effect for r in d.separability])
+        return (
+            f"{lead.effect}, which {explained}; or {others}: these readings do not separate them. "
+            f"hilcal next plans those that do. {law}"
+        )
+    what = f"joints that differ in {name}: it" if lead.coarse else f"{name}: it"
+    return numbers.sentence(f"{what} {explained}. {law}", d.significant)
+
+
+def _as_good(d: Diagnosis) -> str:
+    """Say which effects of an adequate model others could replace."""
+    doubts = [
+        f"{a.effect} could as well be "
+        + (numbers.few(a.same_as, 1) if a.same_as else f"{len(a.others)} other effects together")
+        for a in d.alternatives
+        if a.inseparable
+    ]
+    told = "; ".join(doubts)
+    return f"Nothing that lowers the error. But {told}. hilcal next plans what separates them."
+
+
+def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
+    before = error_before(fit)
+    what = (
+        "deflection under load; a rigid arm has none"
+        if fit.mode == "deflection"
+        else "nominal arm, only its frames fitted"
+    )
+    yield Card(
+        "Before",
+        numbers.length(before.rms_m),
+        f"rms; largest {numbers.length(before.max_m)}; {what}",
+    )
+    if m.tested is not None:
+        e = m.tested.prediction.error
+        seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
+        yield Card(
+            "After, validation",
+            numbers.length(e.rms_m),
+            f"rms; largest {numbers.length(e.max_m)}; {seen}",
+        )
+    if m.corrected is not None:
+        e = m.corrected["error"]
+        before_m, after_m = (numbers.length(float(e[k]["rms_m"])) for k in ("before", "after"))
+        yield Card(
+            "Measured at corrected targets",
+            after_m,
+            f"rms; {before_m} without correction; {e['count']} points",
+        )
+    held = fit.holdout
+    yield Card(
+        "After, poses left out",
+        numbers.length(held.rms_m),
+        f"rms; largest {numbers.length(held.max_m)}",
+    )
+    yield Card(
+        "Noise alone",
+        numbers.length(m.story.noise_floor_m),
+        "rms that the stated noise would leave",
+    )
+
+
+def limit_words(m: ReportContent) -> tuple[str, bool | None]:
+    """Say whether the limit is kept, and by what that was judged."""
+    if m.limit_m is None:
+        return "", None
+    limit = numbers.length(m.limit_m)
+    if m.tested is not None:
+        a = m.tested.shares
+        passed = bool(a.passed)
+        head = "PASSED" if passed else "FAILED"
+        so = f"{a.everything.count - a.over} of {a.everything.count} errors are within {limit}"
+        largest = numbers.length(a.everything.max_m)
+        end = f" (campaign {m.tested.name}, never fitted; largest {largest})."
+        if a.undecided:
+            end += " Noise alone exceeds the limit, so that these readings cannot tell."
+        return f"{head}: {so}{end}", passed
+    error = left_out_errors(m.fit)
+    over = int(np.sum(error > m.limit_m))
+    head = "PASSED" if over == 0 else "FAILED"
+    return (
+        f"{head}: {len(error) - over} of {len(error)} errors are within {limit}, each pose "
+        f"predicted without itself (largest {numbers.length(float(error.max()))}). No validation "
+        "campaign was given: an independent test is missing."
+    ), over == 0
+
+
+def left_out_errors(fit: Fit) -> Floats:
+    """Return the 3-D errors (D,) of fitted measurements predicted without their pose, m."""
+    return np.asarray(np.linalg.norm(fit.left_out[:, :3], axis=1))

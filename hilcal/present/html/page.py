@@ -1,0 +1,84 @@
+"""The page: template, style, script and plotly.js in one file that loads nothing else."""
+
+import json
+from functools import cache
+from pathlib import Path
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+from plotly.offline import get_plotlyjs
+
+from hilcal.names import escaped
+from hilcal.present.charts import style
+from hilcal.present.html.appendix import appendix
+from hilcal.present.html.certificate import certificate
+from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import FirstScreen, first_screen
+from hilcal.present.html.parts import Section, in_script
+from hilcal.present.html.sections import sections
+
+HERE = Path(__file__).parent
+
+
+def page(m: ReportContent) -> str:
+    """Return the report of one campaign as HTML."""
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    parts = (certificate(m), *sections(m), *(appendix(m) if m.appendix else ()))
+    return render("Calibration report", about, first_screen(m), parts)
+
+
+def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...]) -> str:
+    """Return a page.
+
+    Args:
+        title: of the page.
+        about: what it is of, one line.
+        first: what the first screen says.
+        parts: the sections below it.
+    """
+    looks = {
+        name: json.loads(json.dumps(style.template(dark).to_plotly_json(), default=_plain))
+        for name, dark in (("light", False), ("dark", True))
+    }
+    return (
+        _environment()
+        .get_template("page.html")
+        .render(
+            title=title,
+            about=about,
+            first=first,
+            sections=parts,
+            looks=Markup(in_script(json.dumps(looks))),  # noqa: S704  (escaped by in_script)
+            config=Markup(in_script(json.dumps(style.CONFIG))),  # noqa: S704
+            plotly=Markup(get_plotlyjs()),  # noqa: S704  (the library's own text)
+            css=Markup((HERE / "style.css").read_text(encoding="utf-8")),  # noqa: S704
+            script=Markup((HERE / "script.js").read_text(encoding="utf-8")),  # noqa: S704
+        )
+    )
+
+
+def _plain(value: object) -> object:
+    to_json = getattr(value, "to_plotly_json", None)
+    if to_json is None:
+        raise TypeError(f"{type(value)} is no JSON")
+    return to_json()
+
+
+def _shown(value: object) -> object:
+    """Return what a page shows of a value; ends of lines are blanks in HTML anyway."""
+    if not isinstance(value, str) or isinstance(value, Markup):
+        return value
+    return "\n".join(map(escaped, value.split("\n")))
+
+
+@cache
+def _environment() -> Environment:
+    """Every text is escaped; what is markup is named in `render`."""
+    return Environment(
+        loader=FileSystemLoader(HERE),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_shown,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )

@@ -1,0 +1,223 @@
+"""The sections after the certificate: each of charts, tables and the words of commands."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.repeats import classes
+from hilcal.identification.fit import Fit
+from hilcal.present import text
+from hilcal.present.build_story import curve, regressor
+from hilcal.present.charts.added_variable import added_variable
+from hilcal.present.charts.error_per_revision import error_per_revision
+from hilcal.present.charts.law import law
+from hilcal.present.charts.measured_predicted import measured_predicted
+from hilcal.present.charts.misfit import misfit_curve
+from hilcal.present.charts.noise_check import noise_check
+from hilcal.present.charts.residuals import residual_by_load, residual_by_pose, residual_by_time
+from hilcal.present.charts.workspace import workspace
+from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import missing
+from hilcal.present.html.parts import (
+    Chart,
+    Part,
+    Section,
+    Table,
+    Words,
+    chart,
+    from_terminal,
+    table,
+)
+from hilcal.present.text_seen import doubtful, redundant_line
+from hilcal.present.verdict_words import message
+
+MOST_CURVES = 2
+MOST_LISTED = 6
+"""Suspects that stand on the page; a choice, as the others are."""
+MOST_PARAMETERS = 48
+MOST_LAWS = 4
+
+
+def sections(m: ReportContent) -> tuple[Section, ...]:
+    """Return all sections after the certificate."""
+    found = (_revisions(m), _where(m), _evidence(m), _laws(m), _parameters(m))
+    return tuple(s for s in found if s is not None)
+
+
+def _where(m: ReportContent) -> Section:
+    story, last, d = m.story, m.left_out, m.diagnosis
+    parts: list[Part] = [
+        Words(
+            "Errors are those of poses left out: each is predicted by a fit to the others."
+            + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any()))
+        ),
+        chart("By pose", residual_by_pose(story, last), wide=True),
+        chart("Measured against predicted", measured_predicted(story, last)),
+    ]
+    if len(set(story.load_names)) > 1:
+        parts.append(chart("By load", residual_by_load(story, last)))
+    if story.time_s is not None:
+        parts.append(chart("Over time", residual_by_time(story, last)))
+    parts += [
+        chart("From above", workspace(story, last, "xy")),
+        chart("From the side", workspace(story, last, "xz")),
+        chart("Noise check: fitted poses", noise_check(m.fit)),
+    ]
+    if d is not None:
+        if d.verdict != "adequate":
+            curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
+            parts += [chart(c.variable, misfit_curve(c)) for c in curves]
+        told = from_terminal(text.where_table(d.misfit_breakdown), "What the error follows")
+        parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
+    parts.append(Words(_noise(m)))
+    return Section("where", "Where it fails", tuple(parts))
+
+
+def _evidence(m: ReportContent) -> Section:
+    d, title = m.diagnosis, "What is missing, with its evidence"
+    if d is None:
+        words = Words("Not diagnosed: only a model fitted with scaling gc can be.")
+        return Section("evidence", title, (words,))
+    said = numbers.sentence(message(d), d.significant)
+    parts: list[Part] = [] if said == missing(d) else [Words(said)]
+    parts.append(suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
+    parts += from_terminal([*doubtful(d), *redundant_line(d)])
+    parts += added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
+    return Section("evidence", title, tuple(parts))
+
+
+def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
+    """Yield the added-variable plot of each suspect that has one."""
+    for s in of:
+        found = regressor(d.fit, s)
+        if found is not None:
+            yield chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
+
+
+def _laws(m: ReportContent) -> Section | None:
+    found = m.story.revisions[-1].laws
+    if not found:
+        return None
+    parts: list[Part] = []
+    for name in dict.fromkeys(one.name for one in found):
+        first = next(one for one in found if one.name == name)
+        rows = (
+            ("law", first.formula),
+            ("acts on", first.acts_on),
+            ("coefficients", first.coefficients),
+        )
+        parts.append(table(f"{name}, an effect of a file", ("", ""), rows))
+    parts += [chart(f"{one.name}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
+    parts.append(
+        Words(
+            "Each point is the mean over readings of the law's value plus what it leaves of them. "
+            "Nothing is known outside of the range that is drawn, nor within its gaps.",
+            "note",
+        )
+    )
+    return Section("laws", "Laws beyond the catalogue", tuple(parts))
+
+
+def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
+    """Return a table of suspects."""
+    heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
+    return table(
+        caption,
+        (*heads, "not separable from"),
+        (
+            (
+                s.effect,
+                numbers.percent(s.share),
+                numbers.percent(max(s.holdout_share, 0.0)),
+                f"{s.score.log_evidence:z.1f}",
+                numbers.chance(s.score.p_value),
+                "yes" if s.passes else "no",
+                ", ".join(s.same_as) or "-",
+            )
+            for s in rows
+        ),
+    )
+
+
+def _revisions(m: ReportContent) -> Section:
+    parts: list[Part] = [
+        chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
+        table(
+            "Revisions",
+            ("revision", "change", "fitted, rms", "left out, rms", "left out, σ",
+             "variance factor", "verdict"),
+            (
+                (
+                    str(r.revision),
+                    r.change or text.model_name(r.model),
+                    numbers.length(r.error_fit["rms_m"]),
+                    numbers.length(r.error_holdout["rms_m"]),
+                    f"{r.error_holdout['rms_sigma']:.2f}",
+                    numbers.digits(r.variance_factor),
+                    r.verdict.replace("_", " "),
+                )
+                for r in m.story.revisions
+            ),
+        ),
+    ]  # fmt: skip
+    if not m.stored:
+        parts.append(
+            Words(
+                "No revision is stored in the campaign: the baseline was fitted for this report "
+                "and is not kept. hilcal refine finds the effects that are missing."
+            )
+        )
+    return Section("revisions", "How the error fell", tuple(parts))
+
+
+def _parameters(m: ReportContent) -> Section:
+    fit = m.fit
+    parts: list[Part] = []
+    for name in fit.model.named:
+        if name in fit.model.catalogue.names:
+            parts.append(Words(f"{name}: {fit.model.catalogue[name].summary}.", "note"))
+    more = "hilcal report --appendix"
+    for part in from_terminal(text.parameters(fit, MOST_PARAMETERS, more), "Parameters"):
+        parts += _halves(part) if isinstance(part, Table) else (part,)
+    parts += [Words(line) for line in text.background_line(fit)]
+    return Section("parameters", "Parameters", tuple(parts))
+
+
+def _halves(t: Table) -> Iterator[Table]:
+    """Yield the two halves of a table of parameters, without what they mean."""
+    middle = -(-len(t.rows) // 2)
+    for rows, more in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
+        if rows:
+            cut = tuple(row[:-1] for row in rows)
+            yield replace(
+                t, caption=f"{t.caption}{more}", heads=t.heads[:-1], rows=cut, narrow=True
+            )
+
+
+def _noise(m: ReportContent) -> str:
+    """Say what the repeats tell of the noise."""
+    e = None if m.diagnosis is None else m.diagnosis.pure_error
+    if e is None:
+        return _too_few_repeats(m.fit)
+    low, high = e.interval
+    return (
+        f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance factor "
+        f"{e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of freedom)."
+    )
+
+
+def _too_few_repeats(fit: Fit) -> str:
+    """Say that repeats do not judge the noise of what was fitted."""
+    kept = fit.readings[~fit.outlier]
+    again = len(kept) - len(np.unique(classes(kept)))
+    if not again:
+        return "No reading was repeated: the noise is judged by the model alone."
+    what = "deflection" if fit.mode == "deflection" else "reading"
+    return (
+        f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
+        f"{what} by them: the model alone does."
+    )

@@ -1,0 +1,202 @@
+"""A live viewer beside a command: a process of its own, which the command never waits for.
+
+    command ─► bounded queue ─► thread ─► pipe ─► process: serves viewers, writes the recording
+
+Whatever becomes of viewer, recording or process, the command goes on: a full queue drops what is
+told, a dead process is reported once. The process ends when its pipe does, so that the recording
+is complete however the command ends.
+"""
+
+import contextlib
+import json
+import os
+import pickle
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from hilcal.cell import Cell
+from hilcal.measuring.progress import ArmAt
+from hilcal.present.build_story import Chapter, build_story
+from hilcal.present.live_messages import Measuring, Revised
+from hilcal.present.progress import Say
+from hilcal.store.plan import Step
+from hilcal.store.run_log import RunLog
+
+PORT = 9877
+"""Not 9876: there a viewer listens itself, and one that finds it taken opens no window."""
+MOST = 2000
+"""Messages that wait for the process at most, some 500 bytes each; a choice."""
+ARM_S = 0.2
+"""Between two places of the arm that are told, s; a choice: motion is seen, files stay small."""
+START_S = 20.0
+"""How long the process may take to start, s: it loads the viewer's library; a choice."""
+END_S = 10.0
+"""How long it may take to finish the recording, s; a choice."""
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+class LiveViewer:
+    """Tells the viewer's process what happens; no method waits for it but `start` and `close`.
+
+    Attributes:
+        record: the recording.
+        url: what a viewer opens; None where nothing is served.
+        dropped: messages that were not passed on because the process did not keep up.
+    """
+
+    def __init__(self, record: Path, say: Say, port: int = PORT) -> None:
+        """Start nothing yet.
+
+        Args:
+            record: where the recording goes; a file that is there is replaced.
+            say: told of problems, one line each, from another thread.
+            port: the first to be tried.
+        """
+        self.record, self.dropped = record, 0
+        self.url: str | None = None
+        self._say, self._port = say, port
+        self._queue: queue.Queue[tuple[float, object] | None] = queue.Queue(MOST)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._threads: list[threading.Thread] = []
+        self._ready, self._closing = threading.Event(), False
+        self._arm_told = 0.0
+
+    @property
+    def pid(self) -> int | None:
+        """Number of the process, None before it is started."""
+        return None if self._process is None else self._process.pid
+
+    def start(self) -> None:
+        """Start the process and wait until it serves; where it does not, problems are told."""
+        path = os.environ.get("PYTHONPATH")
+        environment = {
+            **os.environ,
+            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
+            "OMP_NUM_THREADS": "1",
+            "RUST_LOG": "off",
+        }
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+                (
+                    *(sys.executable, "-P", "-m", "hilcal.present.live_process"),
+                    *(str(self.record.absolute()), str(self._port)),
+                ),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                bufsize=0,
+                env=environment,
+                start_new_session=True,  # Ctrl-C is for the command
+            )
+        except OSError as error:
+            self._say(f"no live viewer: {error}; it goes on without")
+            self._closing = True
+            return
+        for work, pipe in (
+            (self._write, self._process.stdin),
+            (self._listen, self._process.stdout),
+        ):
+            thread = threading.Thread(target=work, args=(pipe,), name="live viewer", daemon=True)
+            thread.start()
+            self._threads.append(thread)
+        if not self._ready.wait(START_S):
+            self._say(f"the live viewer has not started in {START_S:.0f} s; it goes on without")
+
+    def notify(self, event: object) -> None:
+        """Pass on an event of `measuring.progress`; returns at once."""
+        now = time.time()
+        if isinstance(event, ArmAt):
+            # Readings are worth more than places of the arm, which are told five times a second.
+            if now - self._arm_told < ARM_S or self._queue.qsize() > MOST // 2:
+                return
+            self._arm_told = now
+        self._tell(now, event)
+
+    def measuring(self, name: str, cell: Cell, log: RunLog) -> None:
+        """Tell that a campaign is measured, and what it holds already."""
+        earlier = tuple(
+            (float(told["wall_s"]), Step(**told["step"]))
+            for told in log.details()
+            if "wall_s" in told
+        )
+        self._tell(
+            time.time(),
+            Measuring(
+                name, cell.arm, cell.all_targets[:, :3, 3], log.plan, earlier, cell.target_names
+            ),
+        )
+
+    def revised(self, chapter: Chapter) -> None:
+        """Tell a revision; what cannot be drawn is said, and nothing is raised."""
+        try:
+            self._tell(time.time(), Revised(build_story([chapter])))
+        except Exception as error:  # a picture must not cost the revision
+            self._say(f"revision {chapter.number} is not in the live viewer: {error}")
+
+    def close(self) -> None:
+        """Let the process finish the recording, and end it."""
+        process = self._process
+        if process is None or self._closing:
+            return
+        self._closing = True
+        with contextlib.suppress(queue.Full):
+            self._queue.put(None, timeout=END_S)
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+            self._say(f"the live viewer did not end; the end of {self.record} may be missing")
+        for thread in self._threads:
+            thread.join(END_S)
+        if self.dropped:
+            self._say(f"the live viewer did not keep up: {self.dropped} messages are not recorded")
+
+    def _tell(self, wall: float, what: object) -> None:
+        if self._closing or self._process is None or self._process.poll() is not None:
+            return
+        try:
+            self._queue.put_nowait((wall, what))
+        except queue.Full:
+            self.dropped += 1
+
+    def _write(self, pipe: IO[bytes]) -> None:
+        """Thread: write messages to the process; ends with it, or at `close`."""
+        with contextlib.suppress(OSError), pipe:
+            while (message := self._queue.get()) is not None:
+                content = memoryview(pickle.dumps(message))
+                while content:
+                    content = content[pipe.write(content) :]
+
+    def _listen(self, pipe: IO[bytes]) -> None:
+        """Thread: pass on what the process says; its end is the last word."""
+        with pipe:
+            for line in pipe:
+                told: dict[str, Any] = json.loads(line)
+                if "url" in told:
+                    self.url = told["url"]
+                    self._ready.set()
+                if "problem" in told:
+                    self._say(told["problem"])
+        if not self._closing:
+            self._say("the live viewer has ended; everything else goes on")
+        self._ready.set()
+
+
+class Several:
+    """A watcher that passes each event on to several."""
+
+    def __init__(self, watchers: Sequence[Any]) -> None:
+        """Pass on to these."""
+        self._watchers = watchers
+
+    def notify(self, event: object) -> None:
+        """Pass on."""
+        for watcher in self._watchers:
+            watcher.notify(event)

@@ -1,0 +1,163 @@
+"""The recording of a fleet: which arm is unlike its type, in which joint, and since when."""
+
+import hashlib
+import uuid
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hilcal import numbers
+from hilcal.present.text_fleet import type_lines
+from hilcal.present.viewer import flat, fleet_scene, layout, style
+from hilcal.present.viewer.fleet_digest import TypeDigest, type_digest
+from hilcal.present.viewer.stream import flush, opened, require_folder, write
+
+if TYPE_CHECKING:  # above this layer
+    from hilcal.transfer.fleet import Fleet
+
+_LEAST_RANGE_S = 86400.0
+GUIDE = """### How to read this
+- **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
+  in a red frame. Amber: beyond 3 σ, which chance does to one parameter in some hundred.
+- **Parameters**: a dot for each arm, in σ of the type: the spread from arm to arm together with the
+  uncertainty of the arm's own campaigns.
+- **By date**: the same of each campaign. A line that leaves the others has changed; lines that go
+  the same way are wear.
+"""
+
+
+def record_fleet(fleet: "Fleet", path: Path) -> None:
+    """Write what is known of a fleet as a recording file; equal fleets give equal recordings.
+
+    Raises:
+        InputError: the folder is missing.
+        HilcalError: the file cannot be written.
+    """
+    path = Path(path)
+    require_folder(path)
+    types = [type_digest(t, fleet.members) for t in fleet.types]
+    rec = opened(_recording_id(types))
+    write(rec, _blueprint(types), lambda: _log(rec, types), path)
+
+
+def _log(rec: rr.RecordingStream, types: list[TypeDigest]) -> None:
+    arms = sum(len(d.pooled.arms) for d in types)
+    rec.send_recording_name(f"hilcal fleet: {arms} arms")
+    for i, d in enumerate(types):
+        fleet_scene.arms(rec, f"arms{i}", d)
+        fleet_scene.parameters(rec, f"parameters{i}", d)
+        fleet_scene.drift(rec, f"date{i}", d)
+        rec.log(f"words/type{i}", _markdown(_told(d)), static=True)
+        rec.log(f"words/table{i}", _markdown(_table(d)), static=True)
+    rec.log("words/guide", _markdown(GUIDE), static=True)
+    flush(rec)
+
+
+def _told(d: TypeDigest) -> str:
+    t = d.pooled
+    odd = list(dict.fromkeys(o.arm for o in t.odd))
+    verb = "is" if len(odd) == 1 else "are"
+    title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
+    lines = [f"### {style.escaped(title)}"]
+    lines += [f"{style.escaped(t.type)}: {len(t.arms)} arms, {len(t.campaigns)} campaigns.", ""]
+    lines += [f"{style.escaped(line)}  " for line in type_lines(t)]
+    return "\n".join(lines)
+
+
+def _table(d: TypeDigest) -> str:
+    lines = ["| parameter | mean | ± | from arm to arm |", "| --- | ---: | ---: | ---: |"]
+    for p in d.pooled.parameters:
+        unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
+        mean, std = numbers.with_std(factor * p.mean, factor * p.mean_std)
+        between = f"{numbers.digits(factor * p.between)} {unit}"
+        cells = (p.parameter, mean, std, between)
+        lines.append("| " + " | ".join(style.escaped(c) or " " for c in cells) + " |")
+    return "\n".join(lines)
+
+
+def _markdown(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
+    """Left: the arms over their campaigns by date. Right: the verdict over the parameters."""
+    many = len(types) > 1
+    of = [f"{d.pooled.type}: " if many else "" for d in types]
+    arms = [_arms(f"arms{i}", of[i], d) for i, d in enumerate(types)]
+    dates = [
+        rrb.TimeSeriesView(
+            origin=f"date{i}/{k}",
+            name=f"{of[i]}{d.names[k]} by date [σ]",
+            plot_legend=rrb.PlotLegend(visible=False),
+            axis_x=_whole(d),
+        )
+        for i, d in enumerate(types)
+        for k in sorted(fleet_scene.rows(d), key=lambda k: (not d.odd[:, k].any(), k))
+    ]
+    words = [
+        rrb.TextDocumentView(origin=f"words/type{i}", name=f"{of[i]}Unlike the type")
+        for i in range(len(types))
+    ]
+    words += [
+        rrb.TextDocumentView(origin=f"words/table{i}", name=f"{of[i]}In common")
+        for i in range(len(types))
+    ]
+    words.append(rrb.TextDocumentView(origin="words/guide", name="How to read this"))
+    dots = [
+        rrb.Spatial2DView(
+            origin=f"parameters{i}",
+            name=f"{of[i]}Each arm against its type [σ]; red: unlike",
+            background=layout.BACKGROUND,
+            visual_bounds=rrb.VisualBounds2D(x_range=(-6.0, flat.WIDTH + 6.0), y_range=flat.BOUNDS),
+        )
+        for i in range(len(types))
+    ]
+    left = rrb.Vertical(rrb.Tabs(*arms), rrb.Tabs(*dates), row_shares=[3, 2])
+    right = rrb.Vertical(rrb.Tabs(*words), rrb.Tabs(*dots), row_shares=[2, 3])
+    return rrb.Blueprint(
+        rrb.Horizontal(left, right, column_shares=[3, 2]),
+        rrb.TimePanel(timeline="date", state="collapsed", play_state="paused"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _whole(d: TypeDigest) -> rrb.TimeAxis:
+    """Return the range of all dates, with a margin."""
+    low, high = float(d.seconds.min()), float(d.seconds.max())
+    wide = max(0.05 * (high - low), _LEAST_RANGE_S)
+    ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in (low - wide, high + wide)]
+    return rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
+
+
+def _arms(origin: str, of: str, d: TypeDigest) -> rrb.Spatial3DView:
+    at, reach = fleet_scene.places(d), max(d.arm.reach, 0.1)
+    middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * reach])
+    size = float(np.ptp(at, axis=0).max()) + reach
+    return rrb.Spatial3DView(
+        origin=origin,
+        name=f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where",
+        background=layout.BACKGROUND,
+        line_grid=layout.GRID,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital,
+            position=middle + size * np.array([0.68, 0.0, 0.36]),
+            look_target=middle,
+            eye_up=(0.0, 0.0, 1.0),
+        ),
+    )
+
+
+def _recording_id(types: list[TypeDigest]) -> str:
+    """Return an identifier that depends on the content of the recording alone."""
+    sha = hashlib.sha256()
+    for d in types:
+        sha.update(repr((d.pooled.type, d.pooled.arms, d.pooled.odd, d.names)).encode())
+        for array in (d.units, d.seconds, d.campaigns):
+            sha.update(np.ascontiguousarray(array).tobytes())
+    return str(uuid.UUID(bytes=sha.digest()[:16]))

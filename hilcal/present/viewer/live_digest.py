@@ -1,0 +1,173 @@
+"""What is known of a campaign while it is measured: places of its readings, and a tally."""
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy import stats
+
+from hilcal.measuring.progress import LiveResidual, ReadingStored
+from hilcal.present.live_messages import Measuring
+from hilcal.present.viewer import style
+from hilcal.robot.body import body_poses
+from hilcal.store.plan import UNLOADED, Step
+from hilcal.types import Floats
+
+SIGMA_LENGTH = 0.02
+"""One σ of a residual is drawn this long, m; a choice."""
+ARROW_CAP = 0.4
+"""Longest arrow, m; a choice."""
+BALL = SIGMA_LENGTH * style.BALL_SIGMAS
+"""Radius of the ball that holds 99 % of the readings where the model is right, m."""
+LIMIT = style.BALL_SIGMAS / 3**0.5
+"""The same in the σ of a reading."""
+ALARM = 0.001
+"""Chance that noise alone leaves as many readings outside their balls as is called wrong."""
+WORST = 3
+FLUENT = 1000
+"""Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
+processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
+GROUPS = 150
+"""Groups that more of them are divided into: as many as a finished recording has bars."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A reading against the model.
+
+    Attributes:
+        step: its step.
+        target: name of the target; empty where there is one.
+        length: of the residual r, m.
+        norm2: rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom.
+        stands_out: whether it is the worst of its group so far, see `LiveDigest.group`.
+    """
+
+    step: Step
+    target: str
+    length: float
+    norm2: float
+    stands_out: bool = True
+
+    @property
+    def sigma(self) -> float:
+        """sqrt(rᵀ V⁻¹ r / 3), as the terminal has it: 1 where the model is right."""
+        return float(np.sqrt(self.norm2 / 3))
+
+    @property
+    def level(self) -> int:
+        """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
+        return int(style.levels(np.array([self.norm2]))[0])
+
+
+@dataclass(slots=True, eq=False)
+class LiveDigest:
+    """A campaign that is being measured.
+
+    Attributes:
+        told: what is measured.
+        bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan.
+        anchor: (P, T, 3) nominal position of each target at each pose, base axes, m.
+        done: readings that are stored.
+        left: real seconds that the rest takes.
+        phase: what is being done.
+        last: the last reading.
+        judged: how many readings were compared with a model.
+        outside: of these how many are outside their ball, by load; and all of them.
+        worst: those that are farthest from the model.
+        remarks: that people should look at, newest last.
+        places: index of each pose by its name; filled when it is first asked for.
+        group_worst: largest `Judged.norm2` of the group that is being measured.
+    """
+
+    told: Measuring
+    bodies: Floats
+    anchor: Floats
+    done: int = 0
+    left: float = 0.0
+    phase: str = ""
+    last: ReadingStored | None = None
+    judged: int = 0
+    outside: int = 0
+    loads: dict[str, list[int]] = field(default_factory=dict)
+    worst: list[Judged] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    places: dict[str, int] = field(default_factory=dict)
+    group_worst: float = 0.0
+
+    @classmethod
+    def of(cls, told: Measuring) -> "LiveDigest":
+        """Return that of a campaign that begins, or goes on."""
+        bodies = body_poses(told.arm, told.plan.q)
+        flange = bodies[:, None, -1]
+        anchor = flange[..., :3, 3] + np.einsum("pkij,tj->pti", flange[..., :3, :3], told.targets)
+        done = len({step for _, step in told.earlier})
+        return cls(told, bodies, anchor, done)
+
+    @property
+    def total(self) -> int:
+        """Readings that are planned."""
+        return len(self.told.plan.steps)
+
+    @property
+    def group(self) -> int:
+        """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
+        planned = self.total * len(self.told.targets)
+        return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
+
+    def place(self, step: Step, target: int = 0) -> Floats:
+        """(3,) where the nominal arm holds a target, m."""
+        if not self.places:
+            self.places.update({name: k for k, name in enumerate(self.told.plan.pose_names)})
+        return np.asarray(self.anchor[self.places[step.pose], target])
+
+    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, Judged | None]]:
+        """Take note of a reading.
+
+        Returns:
+            Each target that was read, with its residual; judged, or None without a model yet.
+        """
+        self.last, self.done, self.left = event, event.done, event.left_real
+        read = ((event.target, event.live), *event.others)
+        return [(k, live, self._judge(event.step, k, live)) for k, live in read]
+
+    def _judge(self, step: Step, target: int, live: LiveResidual) -> Judged | None:
+        found = judged(step, live, self.told.names[target] if self.told.names else "")
+        if found is None:
+            return None
+        self.judged += 1
+        of_load = self.loads.setdefault(step.load, [0, 0])
+        of_load[0] += 1
+        if found.level > 0:
+            self.outside += 1
+            of_load[1] += 1
+        self.worst = sorted([*self.worst, found], key=lambda j: -j.norm2)[:WORST]
+        begins = (self.judged - 1) % self.group == 0
+        found = replace(found, stands_out=begins or found.norm2 > self.group_worst)
+        self.group_worst = max(found.norm2, 0.0 if begins else self.group_worst)
+        return found
+
+    @property
+    def wrong(self) -> bool:
+        """Whether more readings are outside than noise leaves there, see `ALARM`."""
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
+        return self.outside > 0 and bool(chance < ALARM)
+
+    @property
+    def loaded(self) -> bool:
+        """Whether any load is planned."""
+        return any(step.load != UNLOADED for step in self.told.plan.steps)
+
+
+def judged(step: Step, live: LiveResidual, target: str = "") -> Judged | None:
+    """Return a reading as `Judged`; None where it was not compared."""
+    if live.vector is None or live.covariance is None:
+        return None
+    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
+    return Judged(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+
+
+def arrow(live: LiveResidual, found: Judged) -> Floats:
+    """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
+    length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
+    return np.asarray(length / (found.length or 1.0) * np.array(live.vector))

@@ -1,0 +1,112 @@
+"""The blueprint of a plan's recording: which view stands where, and what its title says."""
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from hilcal import numbers
+from hilcal.present.viewer import eye, plan_charts, plan_scene
+from hilcal.present.viewer.plan_digest import PlanDigest
+from hilcal.types import Floats
+
+_FPS = 2.0
+_LOOKED_AT = 20
+"""Steps whose arm is to be seen from the eye."""
+# Views that draw with light colours stay dark in the light theme too.
+_DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
+STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
+TRACKER = "From the tracker"
+SCHEDULE = "Schedule: minute of each reading by step, colour by load"
+
+
+def blueprint(d: PlanDigest) -> rrb.Blueprint:
+    """Left: 3-D over the schedule. Right: the plan in words over the curve, with tables."""
+    scenes = [_steps(d)]
+    if d.tracker is not None:
+        scenes.append(_from_tracker(d, d.tracker))
+    left = rrb.Vertical(rrb.Tabs(*scenes), _schedule(), row_shares=[7, 2])
+    right: list[rrb.View | rrb.Container] = [
+        rrb.Tabs(
+            rrb.TextDocumentView(origin="words/plan", name="Plan"),
+            rrb.TextDocumentView(origin="words/step", name="This step"),
+            rrb.TextDocumentView(origin="words/notes", name="Notes"),
+            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
+        )
+    ]
+    details = _details(d)
+    if details:
+        right.append(rrb.Tabs(*details))
+    shares = [5, 4][: len(right)]
+    return rrb.Blueprint(
+        rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
+        rrb.TimePanel(timeline="step", state="collapsed", fps=_FPS, play_state="paused"),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def curve_title(d: PlanDigest) -> str:
+    """Return the title of the sample-size curve, with its unit."""
+    unit = plan_charts.curve_unit(d.summary)[0]
+    return f"Position ± [{unit}] by number of poses; blue: nearest to this plan"
+
+
+def _details(d: PlanDigest) -> list[rrb.View]:
+    out: list[rrb.View] = []
+    if d.summary.curve:
+        out.append(
+            rrb.BarChartView(
+                origin="curve", name=curve_title(d), plot_legend=rrb.PlotLegend(visible=False)
+            )
+        )
+    if d.summary.criteria:
+        out.append(rrb.TextDocumentView(origin="words/criteria", name="Criteria"))
+    if d.summary.parameters:
+        out.append(rrb.TextDocumentView(origin="words/parameters", name="Parameters"))
+    return out
+
+
+def _steps(d: PlanDigest) -> rrb.Spatial3DView:
+    middle, size = plan_scene.framed(d)
+    return _view3d(STEPS, ["+ $origin/**"], middle + size * _eye(d, middle, size), middle)
+
+
+def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
+    contents = ["+ $origin/**"]
+    contents += [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
+    at = d.target.mean(axis=0)
+    far = float(np.linalg.norm(place - at))
+    return _view3d(f"{TRACKER}, {numbers.length(far)} away", contents, place, at)
+
+
+def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
+    """Direction to the eye: across the beam where there is one, and where no obstacle hides."""
+    turn = float(np.deg2rad(-52.0))
+    if d.tracker is not None:
+        beam = d.tracker - middle
+        turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
+    some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
+    points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
+    return eye.direction(turn, middle, size, points, d.config.obstacles)
+
+
+def _view3d(name: str, contents: list[str], place: Floats, look: Floats) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        origin="world",
+        contents=contents,
+        name=name,
+        background=_DARK,
+        line_grid=rrb.LineGrid3D(
+            visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 60)
+        ),
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
+        ),
+    )
+
+
+def _schedule() -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin="schedule", name=SCHEDULE, plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom)
+    )

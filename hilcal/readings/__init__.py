@@ -1,0 +1,1 @@
+"""States and readings, every term of a reading's covariance, whitening."""

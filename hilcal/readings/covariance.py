@@ -1,0 +1,211 @@
+"""The covariance of a reading: the one place where its parts are made and added.
+
+    V = s Σ̄ + R / K + R_sensor_base J Σ_q Jᵀ R_sensor_baseᵀ
+
+with Σ the instrument's covariance of one sample (`tracker_covariance`), s its systematic share
+and R the random covariance of the K samples of a reading (`covariance_of_mean`); Σ_q = diag(σ_q²)
+the scatter of the joints from one arrival to the next, J the Jacobian of the target
+(`joint_scatter`).
+
+The third term needs the registration; it is added when the readings are opened
+(`identification.full_covariance`), with σ_q from [repeatability]. What the stored covariances
+cover, the file states (`COVERS`):
+
+- a measured campaign stores the first two terms: `INSTRUMENT`, the third is added;
+- an imported campaign stores what its table states, or `tracker_covariance` where the table states
+  none. Both are taken as the instrument's: `INSTRUMENT`, the third is added. Where the table's
+  covariances include the arm's scatter, its column `covers` says so ("instrument+arm", which
+  `hilcal export` writes), or the cell does ([repeatability] in_tables = true): `WHOLE`, and nothing
+  is added;
+- a campaign imported before the file stated it is read as it was: nothing is added.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from hilcal.config import Tracker
+from hilcal.errors import InputError
+from hilcal.types import Bools, Floats
+
+COVERS = "covariance"
+"""Key among the texts about a campaign: what the stored covariances cover."""
+FROM = "covariance from"
+"""Key of `TRACKER` where they were made from the noise in [tracker]; absent elsewhere."""
+TRACKER = "tracker"
+INSTRUMENT = "instrument"
+"""They cover the instrument alone, not the arm's repeatability."""
+WHOLE = "instrument+arm"
+"""They include the arm's repeatability."""
+ROUNDING = "+rounding"
+"""End of either word in a table, where the covariances also include the rounding of positions."""
+PRIOR_REPEATS = 20.0
+"""ν0: how many repeats the stated covariance is worth as a prior; a guess, no study set it."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerNoise:
+    """A specification: standard deviations a + b d of a spherical instrument at distance d.
+
+    Attributes:
+        range_std: along the beam at zero distance, m.
+        range_std_per_m: its growth with distance, m/m.
+        transverse_std: across the beam at zero distance, m.
+        transverse_std_per_m: its growth with distance (an angle), m/m.
+        orientation_std: of a small rotation about any axis, rad; 0 where only positions are read.
+    """
+
+    range_std: float
+    range_std_per_m: float
+    transverse_std: float
+    transverse_std_per_m: float
+    orientation_std: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what no instrument can have.
+
+        Raises:
+            InputError: a figure is negative or not finite, or a position has no noise at all.
+        """
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if not np.isfinite(value) or value < 0:
+                raise InputError(f"tracker noise {f.name} = {value}: must be a number >= 0")
+        if self.range_std + self.range_std_per_m == 0:
+            raise InputError("tracker noise: range_std and range_std_per_m are both 0")
+        if self.transverse_std + self.transverse_std_per_m == 0:
+            raise InputError("tracker noise: transverse_std and transverse_std_per_m are both 0")
+
+
+def tracker_noise(section: Tracker) -> TrackerNoise:
+    """Return the specification that the section [tracker] of a configuration states."""
+    return TrackerNoise(
+        section.range_std_m,
+        section.range_std_per_m,
+        section.transverse_std_m,
+        section.transverse_std_per_m,
+        section.orientation_std_rad,
+    )
+
+
+def tracker_covariance(
+    position: Floats,
+    noise: TrackerNoise,
+    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),
+    m: int = 3,
+) -> Floats:
+    """Instrument covariance of one sample: an ellipsoid that turns with the line of sight.
+
+    With d the distance from the station and u the beam's direction,
+
+        Cov = J diag(σ_az², σ_el², (a + b d)²) Jᵀ = (c + e d)² (I - u uᵀ) + (a + b d)² u uᵀ
+
+    where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d.
+    The rotation of a pose (m = 6) has the covariance σ_o² I, independent of the position.
+
+    Args:
+        position: (N, 3) positions in the frame of `station`, m.
+        noise: the instrument's figures.
+        station: (3,) where the beam starts, m.
+        m: 3 for positions, 6 for poses.
+
+    Returns:
+        (N, m, m) covariances, m² and rad², exactly symmetric.
+
+    Raises:
+        InputError: a position lies at the station, where the beam has no direction; m = 6 with
+            `orientation_std` 0.
+    """
+    beam = np.asarray(position, dtype=float) - np.asarray(station, dtype=float)
+    distance = np.linalg.norm(beam, axis=1)
+    if np.any(distance == 0):
+        k = int(np.argmin(distance))
+        raise InputError(f"reading {k + 1} lies at the tracker's station: no line of sight")
+    u = beam / distance[:, None]
+    along = (noise.range_std + noise.range_std_per_m * distance) ** 2
+    across = (noise.transverse_std + noise.transverse_std_per_m * distance) ** 2
+    if m == 6 and noise.orientation_std == 0:
+        raise InputError("tracker noise: orientation_std is 0, but orientations were read")
+    cov = np.zeros((len(u), m, m))
+    cov[:, :3, :3] = (along - across)[:, None, None] * (u[:, :, None] * u[:, None, :])
+    cov[:, :3, :3] += across[:, None, None] * np.eye(3)
+    cov[:, 3:, 3:] = noise.orientation_std**2 * np.eye(m - 3)
+    return cov
+
+
+def covariance_of_mean(
+    stated: Floats, deviations: Floats, systematic_share: float = 0.0, factor: float = 1.0
+) -> Floats:
+    """Covariance (m, m) of the mean of K samples of one target at rest.
+
+        R = (ν0 (1 - s) τ Σ̄ + Σ_k r_k r_kᵀ) / (ν0 + K - 1)        Cov = s Σ̄ + R / K
+
+    The share s of Σ̄ is the same in all samples: it does not show in their scatter, and averaging
+    does not reduce it. R is the posterior mean of the random covariance with the stated one as an
+    inverse Wishart prior worth ν0 = `PRIOR_REPEATS` repeats (Gelman et al., *Bayesian Data
+    Analysis*, section 3.6): a few repeats are a poor estimate of six or more variances, but a
+    specification describes a kind of instrument, not the air of the day.
+
+    Args:
+        stated: (m, m) Σ̄, the instrument's covariance of one sample.
+        deviations: (K, m) r_k of the samples from their mean.
+        systematic_share: s, 0 to 1.
+        factor: τ, by which the stated random variance is multiplied; 1 unless it is disproved.
+    """
+    count = len(deviations)
+    prior = PRIOR_REPEATS * (1 - systematic_share) * factor * stated
+    random = (prior + deviations.T @ deviations) / (PRIOR_REPEATS + count - 1)
+    covariance = systematic_share * stated + random / count
+    return np.asarray((covariance + covariance.T) / 2)
+
+
+def expected_share_of_mean(samples: int, systematic_share: float) -> float:
+    """Share of Σ̄ that the mean of K samples is expected to keep: s + (1 - s) / K."""
+    return systematic_share + (1.0 - systematic_share) / samples
+
+
+def joint_scatter(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
+    """Covariance (..., m, m) of a reading from the scatter of the joints: R J Σ_q Jᵀ Rᵀ."""
+    turned = scatter_factor(jacobian, joint_std, rotation, m)
+    return np.asarray(turned @ np.swapaxes(turned, -1, -2))
+
+
+def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int) -> Floats:
+    """Factor F = R J Σ_q^½ (..., m, n) of the scatter of the joints.
+
+    F_i F_jᵀ is the covariance of two readings i, j of one arrival of the arm.
+
+    Args:
+        jacobian: (..., 6, n) of the target, translation then rotation, base axes.
+        joint_std: (n,) standard deviations σ_q from one arrival to the next, rad.
+        rotation: (..., 3, 3) R_sensor_base.
+        m: 3 for positions, 6 for poses.
+    """
+    moved = jacobian * joint_std
+    turned = np.concatenate([rotation @ moved[..., :3, :], rotation @ moved[..., 3:, :]], axis=-2)
+    return np.asarray(turned[..., :m, :])
+
+
+def smallest_correlation(covariance: Floats) -> Floats:
+    """Return the smallest eigenvalue (N,) of the correlation matrices of covariances (N, m, m).
+
+    −∞ where a variable without variance has a covariance with another, a variance is negative, or a
+    correlation is beyond ±1 (its eigenvalues need not be computable).
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    scale = 1.0 / np.sqrt(np.where(variance > 0, variance, 1.0))
+    correlation = scale[:, :, None] * covariance * scale[:, None, :]
+    beyond = ~(np.abs(correlation) <= 1.0 + 1e-9)
+    undefined = ((variance <= 0)[:, :, None] & (covariance != 0)) | beyond
+    correlation = np.where(undefined, 0.0, correlation)
+    smallest = np.linalg.eigvalsh(correlation)[:, 0]
+    return np.where(np.any(undefined, axis=(1, 2)), -np.inf, smallest)
+
+
+def is_covariance(covariance: Floats) -> Bools:
+    """Return (N,) whether matrices (N, m, m) are symmetric and positive semi-definite."""
+    std = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)))
+    differs = np.abs(covariance - np.swapaxes(covariance, 1, 2))
+    symmetric = np.all(differs <= 1e-9 * std[:, :, None] * std[:, None, :], axis=(1, 2))
+    return np.asarray(symmetric & (smallest_correlation(covariance) >= -1e-9))

@@ -1,0 +1,139 @@
+"""Which readings are the same measurements, whatever file, order, names or units they came in.
+
+A reading is known by what was measured: the commanded joints, the position, the attitude where it
+was read, and whether a load was on. Names of poses and loads, times, covariances and the order of
+the rows do not count, for a table may be imported again with other ones; nor does the wrench,
+which changes with the configured mass of a load.
+
+Numbers agree within `LENGTH_M`, `ANGLE_RAD` and `ATTITUDE_RAD`. A tracker's scatter is far
+larger: readings that were taken again at the same pose differ by more in some element, unless the
+instrument's last digit is coarser than its scatter. A digest of rounded numbers would not do: two
+copies on both sides of a rounding boundary have different digests, however fine the rounding is.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hilcal.readings.readings import Readings
+from hilcal.types import Bools, Floats
+
+LENGTH_M = 1e-7
+"""A table in mm with four decimals is off by half of that; a choice."""
+ANGLE_RAD = 1e-5
+"""A table in degrees with three decimals is off by 0.9e-5; a choice."""
+ATTITUDE_RAD = 2e-5
+"""Three such angles together make an attitude; a choice."""
+SHARED = 0.1
+"""Share of a campaign's readings that are another's, from which both are of one measurement; a
+choice: where a table's last digit is as coarse as the scatter, some hundredths agree by chance."""
+_APART = 10.0
+"""Distance of loaded from unloaded readings, in units of the tolerance."""
+
+
+def already(readings: Readings, others: Readings) -> Bools:
+    """(N,) which readings are among others.
+
+    Args:
+        readings: N readings; where one of both has positions alone, these are compared.
+        others: any number of readings.
+    """
+    if not len(readings) or not len(others):
+        return np.zeros(len(readings), dtype=np.bool_)
+    if readings.states.q.shape[1] != others.states.q.shape[1]:
+        return np.zeros(len(readings), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # slow to import
+
+    attitude = readings.m == others.m == 6
+    tree = cKDTree(_coordinates(others, attitude))
+    distance, _ = tree.query(
+        _coordinates(readings, attitude), p=np.inf, distance_upper_bound=1.0 + 1e-9
+    )
+    return np.asarray(np.isfinite(distance))
+
+
+def prints(readings: Readings) -> Floats:
+    """(N, n + 4) what a reading is known by without its attitude: joints, position, whether loaded.
+
+    To be kept where the readings themselves are not; see `among`.
+    """
+    return _coordinates(readings, attitude=False)
+
+
+def among(readings: Readings, kept: Floats) -> Bools:
+    """(N,) which readings are among those whose `prints` (M, n + 4) were kept."""
+    own = prints(readings)
+    if not len(own) or not len(kept) or own.shape[1] != kept.shape[1]:
+        return np.zeros(len(readings), dtype=np.bool_)
+    from scipy.spatial import cKDTree  # slow to import
+
+    distance, _ = cKDTree(kept).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+    return np.asarray(np.isfinite(distance))
+
+
+def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
+    """Return the numbers of two campaigns that share readings; None where all are their own.
+
+    Args:
+        campaigns: (N, n + 4) `prints` of each; of another number of joints are other arms.
+    """
+    from scipy.spatial import cKDTree  # slow to import
+
+    for width in sorted({of.shape[1] for of in campaigns}):
+        own = [(k, np.unique(of, axis=0)) for k, of in enumerate(campaigns) if of.shape[1] == width]
+        of = np.concatenate([np.full(len(rows), k) for k, rows in own])
+        rows = np.concatenate([rows for _, rows in own])
+        if len(rows) < 2:
+            continue
+        tree = cKDTree(rows)
+        told = tree.query(rows, k=2, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+        here, (distance, nearest) = np.arange(len(rows)), map(np.asarray, told)
+        second = (nearest[:, 0] == here).astype(int)  # one of the two is the reading itself
+        distance, nearest = distance[here, second], nearest[here, second]
+        found = np.isfinite(distance)
+        other = np.full(len(rows), -1)
+        other[found] = of[nearest[found]]
+        for k, unique in own:
+            others = other[of == k]
+            others = others[(others >= 0) & (others != k)]
+            if len(others) > SHARED * len(unique):
+                return k, int(np.bincount(others).argmax())
+    return None
+
+
+def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tuple[Bools, Bools]:
+    """Return (N,) which readings were fitted, and (N,) which can be predicted as unseen ones.
+
+    A deflection is unseen if neither its loaded nor an unloaded reading of it was fitted.
+
+    Args:
+        readings: N readings.
+        fitted: those that a model was fitted to.
+        deflections: whether deflections are to be predicted.
+    """
+    known = already(readings, fitted)
+    if not deflections:
+        return known, ~known
+    keys = np.stack([readings.pose, readings.cycle, readings.target], axis=1)
+    _, group = np.unique(keys, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    spoilt = np.zeros(group.max(initial=-1) + 1, dtype=np.bool_)
+    spoilt[group[known & readings.unloaded]] = True
+    unseen = ~known & ~spoilt[group]
+    loaded = np.zeros(len(spoilt), dtype=np.bool_)
+    loaded[group[unseen & ~readings.unloaded]] = True
+    return known, unseen & loaded[group]
+
+
+def _coordinates(r: Readings, attitude: bool) -> Floats:
+    """(N, K) coordinates in which equal readings differ by 1 at most."""
+    parts = [
+        r.states.q / ANGLE_RAD,
+        r.value[:, :3] / LENGTH_M,
+        np.where(r.unloaded, 0.0, _APART)[:, None],
+    ]
+    if attitude:  # as a matrix, since the rotation vector jumps at half a turn
+        from scipy.spatial.transform import Rotation  # slow to import
+
+        parts.append(Rotation.from_rotvec(r.value[:, 3:]).as_matrix().reshape(-1, 9) / ATTITUDE_RAD)
+    return np.concatenate(parts, axis=1)

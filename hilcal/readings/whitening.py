@@ -1,0 +1,386 @@
+"""Task-variable scaling: the one place where noise enters.
+
+A scaling matrix G multiplies both sides of A c = ΔX so that the errors G ε become
+independent, of unit spread, and pure numbers. G is block diagonal: one block per reading
+(absolute) or per pose group (deflections of one pose share their unloaded reading). Where several
+targets were read in one arrival of the arm, they share its scatter F_i F_jᵀ (`Readings.common`):
+absolute readings have one block per arrival, deflections one per pose and cycle, all targets
+together. The blocks are kept stacked by size; nothing of size (readings)² exists. Noise that is
+correlated along the order of the readings (`Readings.serial`) makes blocks of runs of them, up to
+`RUN` measurements; what it has in common across the ends of a run is neglected. Their S is
+Cholesky's factor: the whitened rows of a measurement are what earlier ones do not predict of it.
+
+    none   G = I
+    gu     G = diag(1/M_ik), M_ik the standard deviation of element k of measurement i
+    gc     G = blockdiag(S_i⁻¹), V_i = S_i S_iᵀ
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.linalg import solve_triangular
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.readings.reading_groups import arrival_groups, deflection_groups, has_unloaded, runs
+from hilcal.readings.readings import Readings
+from hilcal.robot import se3
+from hilcal.robot.batch import chunks
+from hilcal.types import Floats, Ints
+
+Scaling = Literal["none", "gu", "gc"]
+Mode = Literal["deflection", "absolute"]
+SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
+MODES: tuple[Mode, ...] = ("deflection", "absolute")
+RANK_TOLERANCE = 1e-10
+CACHED = 64_000
+"""Numbers that are whitened at a time, half a megabyte; a choice by timing."""
+MANY = 1000
+"""Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
+rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
+timing."""
+
+RUN = 200
+"""Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
+larger ones the whitening costs as much as predicting."""
+
+
+def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:
+    """Whitening matrices S⁻¹ (..., k, k) of covariances (..., k, k).
+
+    For `gc`, V = D C D with D the standard deviations and C = U Λ Uᵀ the correlation matrix;
+    S = D U Λ^½, so that S Sᵀ = V and S⁻¹ ε does not depend on the units of ε. (The
+    eigenvectors of V itself would turn with the units; every S with S Sᵀ = V gives the same
+    estimate. Of `MANY` blocks, those of full rank take S = D L with C = L Lᵀ.)
+
+    Rule for rank-deficient V: an element of zero variance, or a direction whose eigenvalue
+    of C is below 1e-10 of the largest, has no stated noise to weigh it by. It is left out:
+    its row of S⁻¹ is zero, and does not count as a degree of freedom.
+    """
+    k = covariance.shape[-1]
+    if scaling == "none":
+        return np.broadcast_to(np.eye(k), covariance.shape)
+    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+    seen = variance > 0
+    per_std = np.where(seen, 1.0, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
+    if scaling == "gu":
+        return np.asarray(per_std[..., None] * np.eye(k))
+    if covariance.ndim == 3 and len(covariance) >= MANY:
+        return _triangular_roots(covariance, per_std)
+    return _eigenvalue_roots(covariance, per_std)
+
+
+def _eigenvalue_roots(covariance: Floats, per_std: Floats) -> Floats:
+    """S⁻¹ (..., k, k) by eigenvalues of the correlation matrix, the rule applied."""
+    correlation = covariance * per_std[..., :, None] * per_std[..., None, :]
+    values, vectors = np.linalg.eigh((correlation + np.swapaxes(correlation, -1, -2)) / 2)
+    kept = values > RANK_TOLERANCE * values[..., -1:]
+    per_root = np.where(kept, 1.0, 0.0) / np.sqrt(np.where(kept, values, 1.0))
+    rows = per_root[..., :, None] * np.swapaxes(vectors, -1, -2)
+    return np.asarray(rows * per_std[..., None, :])
+
+
+def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
+    """S⁻¹ (N, k, k) by Cholesky's factor; by eigenvalues where the rule may leave something out.
+
+    The correlation matrix has trace k, so that λ_max ≤ k, and the product of the k − 1 largest
+    eigenvalues is at most (k/(k − 1))^(k − 1) < e: λ_min > det/e. Blocks with
+    det > e k `RANK_TOLERANCE` have no eigenvalue that the rule leaves out.
+    """
+    k = covariance.shape[-1]
+    out = np.zeros(covariance.shape)
+    for rows in chunks(len(covariance)):
+        v, d, root = covariance[rows], np.asfortranarray(per_std[rows]), out[rows]
+        low: dict[tuple[int, int], Floats] = {}
+        inverse: dict[tuple[int, int], Floats] = {}
+        det = np.ones(len(v))
+        for i in range(k):
+            for j in range(i + 1):
+                rest = 0.5 * (v[:, i, j] + v[:, j, i]) * (d[:, i] * d[:, j])
+                for n in range(j):
+                    rest -= low[i, n] * low[j, n]
+                if j < i:
+                    low[i, j] = rest * inverse[j, j]
+            det *= np.maximum(rest, 0.0)
+            inverse[i, i] = 1.0 / np.sqrt(np.maximum(rest, RANK_TOLERANCE))
+            for j in range(i):
+                total = sum(low[i, n] * inverse[n, j] for n in range(j, i))
+                inverse[i, j] = -total * inverse[i, i]
+        for (i, j), x in inverse.items():
+            np.multiply(x, d[:, j], out=root[:, i, j])
+        doubtful = ~(det > math.e * k * RANK_TOLERANCE)
+        if doubtful.any():
+            root[doubtful] = _eigenvalue_roots(v[doubtful], d[doubtful])
+    return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Bucket:
+    """G groups of one shape: L measurements each, and the U unloaded readings they share.
+
+    Attributes:
+        loaded: (G, L) rows of the readings.
+        reference: (G, U) rows of the unloaded readings; U = 0 for absolute readings.
+        factor: (G, L·m, L·m) scaling matrices.
+        weights: (L, U) of the unloaded readings in the mean that each deflection is taken from:
+            those of its target.
+    """
+
+    loaded: Ints
+    reference: Ints
+    factor: Floats
+    weights: Floats
+
+    @property
+    def shared(self) -> bool:
+        """Whether all deflections are taken from the same unloaded readings."""
+        return bool(np.all(self.weights == self.weights[:1]))
+
+    def reference_mean(self, x: Floats, groups: slice = slice(None)) -> Floats:
+        """(G, L or 1, ...) means of the unloaded of x (N, ...), of some groups."""
+        unloaded = x[self.reference[groups]]
+        if unloaded.shape[1] == 1:
+            return np.asarray(unloaded)
+        if self.shared:
+            return np.asarray(unloaded.mean(axis=1)[:, None])
+        return np.asarray(np.einsum("lu,gu...->gl...", self.weights, unloaded))
+
+    def reference_covariance(self, v: Floats) -> Floats:
+        """(G, L or 1, m, m) covariance of those means, from covariances (N, m, m)."""
+        square = (self.weights[:1] if self.shared else self.weights) ** 2
+        return np.asarray(np.einsum("lu,guij->glij", square, v[self.reference]))
+
+    def own_covariance(self, v: Floats) -> Floats:
+        """(G, L, m, m) covariance of each measurement, from covariances (N, m, m)."""
+        loaded = v[self.loaded]
+        if self.reference.shape[1]:
+            loaded += self.reference_covariance(v)
+        return np.asarray(loaded)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Whitening:
+    """The scaled regression: from readings to stacked whitened rows.
+
+    Attributes:
+        mode: "absolute" or "deflection".
+        scaling: "none", "gu" or "gc".
+        m: elements per reading.
+        buckets: groups by shape.
+        reading: (D,) row of the reading behind each measurement, in the stacked order.
+        covariance: (D, m, m) covariance of each measurement by itself.
+        group: (D,) pose of each measurement.
+        rank: number of whitened rows that carry information.
+    """
+
+    mode: Mode
+    scaling: Scaling
+    m: int
+    buckets: tuple[Bucket, ...]
+    reading: Ints
+    covariance: Floats
+    group: Ints
+    rank: int
+
+    def __len__(self) -> int:
+        """Return the number of measurements D (readings or deflections)."""
+        return len(self.reading)
+
+    @property
+    def by_reading(self) -> bool:
+        """Whether each reading is a measurement, in its order, and none shares an error."""
+        return self.mode == "absolute" and _each_alone(self.buckets)
+
+    def raw(self, x: Floats) -> Floats:
+        """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
+        if self.mode == "absolute":
+            return x if _each_alone(self.buckets) else x[self.reading]
+        parts = [_difference(b, x).reshape(b.loaded.size, *x.shape[1:]) for b in self.buckets]
+        return np.concatenate(parts)
+
+    def whiten(self, raw: Floats) -> Floats:
+        """Whitened rows (D·m, P) of measurements (D, m) or (D, m, P)."""
+        return self._whiten(raw, np.empty((len(raw) * self.m, *raw.shape[2:])))
+
+    def whitened(self, x: Floats) -> Floats:
+        """Whitened rows (D·m, P) of values at the readings (N, m, P), which stay as they are.
+
+        A few groups at a time: their differences stay in the processor's cache.
+        """
+        width = math.prod(x.shape[2:])
+        out = np.empty((len(self) * self.m, width))
+        values = x.reshape(len(x), self.m, width)
+        alone, start = self.mode == "absolute" and _each_alone(self.buckets), 0
+        for b in self.buckets:
+            size = b.factor.shape[-1]
+            for groups in _blocks(len(b.loaded), CACHED // max(size * width, 1)):
+                factor = b.factor[groups]
+                own = values[groups] if alone else _difference(b, values, groups)
+                rows = slice(start + groups.start * size, start + groups.stop * size)
+                to = out[rows].reshape(len(factor), size, width)
+                np.matmul(factor, own.reshape(len(factor), size, width), out=to)
+            start += len(b.loaded) * size
+        return out.reshape(len(out), *x.shape[2:])
+
+    def whiten_readings(self, x: Floats) -> Floats:
+        """Whitened rows (D·m, P) of values at the readings (N, m, P), which are overwritten.
+
+        There is no second array of that size, which a Jacobian of many parameters can be.
+        """
+        raw = np.ascontiguousarray(self.raw(x))
+        return self._whiten(raw, raw.reshape(len(raw) * self.m, *raw.shape[2:]))
+
+    def _whiten(self, raw: Floats, out: Floats) -> Floats:
+        """Write the whitened rows of measurements (D, m, ...) to `out`, which may be the same."""
+        width = math.prod(out.shape[1:])
+        flat, to = raw.reshape(len(out), width), out.reshape(len(out), width)
+        start = 0
+        for b in self.buckets:
+            size = b.factor.shape[-1]
+            for groups in chunks(len(b.loaded), size * width):
+                factor = b.factor[groups]
+                rows = slice(start + groups.start * size, start + groups.stop * size)
+                block = flat[rows].reshape(len(factor), size, -1)
+                to[rows] = (factor @ block).reshape(len(factor) * size, -1)
+            start += len(b.loaded) * size
+        return out
+
+    def rows_of(self, measurements: Ints) -> Ints:
+        """Repeat a number per measurement (D,) for each of its rows (D·m,)."""
+        return np.repeat(measurements, self.m)
+
+
+def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whitening:
+    """Prepare the scaling of the readings in one mode.
+
+    Raises:
+        InputError: where there are no readings; in deflection mode, where a pose has no
+            unloaded reading or there is no loaded reading at all.
+    """
+    if not len(readings):
+        raise InputError("there are no readings to fit; measure or import some")
+    v, m = readings.covariance, readings.m
+    buckets = []
+    rank = 0
+    groups = (deflection_groups if mode == "deflection" else arrival_groups)(readings)
+    serial = readings.serial is not None and scaling == "gc"
+    for loaded, reference, weights in runs(readings, groups, RUN) if serial else groups:
+        limits.check_shared(loaded.shape[1], m, len(loaded))
+        covariance = _group_covariance(readings, loaded, reference, weights)
+        factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
+        rank += int(np.count_nonzero(factor.any(axis=-1)))
+        buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
+    reading = np.concatenate([b.loaded.ravel() for b in buckets])
+    own = np.concatenate([b.own_covariance(v).reshape(-1, m, m) for b in buckets])
+    return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
+
+
+def _innovations(covariance: Floats) -> Floats:
+    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule.
+
+    The rule for rank-deficient V is kept for elements without variance; for directions without,
+    C has `RANK_TOLERANCE` more on its diagonal, in place of leaving out what has no row of its own.
+    """
+    std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    seen = std > 0
+    per = np.where(seen, 1.0, 0.0) / np.where(seen, std, 1.0)
+    c = covariance * per[:, :, None] * per[:, None, :]
+    c += np.where(seen, RANK_TOLERANCE, 1.0)[:, :, None] * np.eye(c.shape[1])
+    lower = np.linalg.cholesky(c)[0]
+    inverse = solve_triangular(lower, np.diag(per[0]), lower=True, check_finite=False)
+    return np.asarray(inverse[None])
+
+
+def measured(readings: Readings, w: Whitening) -> Floats:
+    """What was measured (D, m): values, or deflections (rotation part: Log(R_l R_uᵀ))."""
+    raw = w.raw(readings.value).copy()
+    if w.m == 6 and w.mode == "deflection":
+        raw[:, 3:] = relative_rotation(se3.rotation(readings.value[:, 3:]), w)
+    return raw
+
+
+def relative_rotation(r: Floats, w: Whitening) -> Floats:
+    """Rotation vectors (D, 3) of the loaded against the mean unloaded attitudes."""
+    out = []
+    for b in w.buckets:
+        turn = np.empty((*b.loaded.shape, 3))
+        for weights in np.unique(b.weights, axis=0):
+            mine = np.all(b.weights == weights, axis=1)
+            reference = b.reference[:, weights > 0]
+            first = r[reference[:, :1]]
+            apart = se3.rotation_vector(r[reference] @ np.swapaxes(first, -1, -2))
+            mean = se3.rotation(apart.mean(axis=1, keepdims=True)) @ first
+            turn[:, mine] = se3.rotation_vector(r[b.loaded[:, mine]] @ np.swapaxes(mean, -1, -2))
+        out.append(turn.reshape(-1, 3))
+    return np.concatenate(out)
+
+
+def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
+    """Whether no absolute readings share an error, so that they are in their own order."""
+    return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
+
+
+def _difference(b: Bucket, x: Floats, groups: slice = slice(None)) -> Floats:
+    """(G, L, ...) loaded minus the mean of the unloaded, of some groups."""
+    loaded = x[b.loaded[groups]]
+    if b.reference.shape[1]:
+        loaded -= b.reference_mean(x, groups)
+    return np.asarray(loaded)
+
+
+def _blocks(count: int, size: int) -> Iterator[slice]:
+    """Yield slices that cover `count` groups, of `size` each, at least 1."""
+    for start in range(0, count, max(size, 1)):
+        yield slice(start, min(start + max(size, 1), count))
+
+
+def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
+    """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
+
+    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
+    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`.
+    """
+    rows = np.concatenate([loaded, reference], axis=1)
+    groups, count = rows.shape
+    m = readings.m
+    c = np.zeros((groups, count, m, count, m))
+    if readings.common is not None and count > 1:
+        f, arrival = readings.common[rows], readings.arrivals[rows]
+        together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
+        np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
+    each = np.arange(count)
+    if readings.serial is not None and readings.along is not None:
+        root = readings.instrument_root()[rows]
+        shared = readings.serial.share * readings.serial.correlation(readings.along[rows])
+        c += np.einsum("gaik,gab,gbjk->gaibj", root, shared, root, optimize=True)
+    c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
+    if reference.shape[1]:
+        d = np.concatenate([np.eye(len(weights)), -weights], axis=1)
+        c = np.einsum("pa,gaibj,qb->gpiqj", d, c, d, optimize=True)
+    size = len(weights) * m
+    return c.reshape(groups, size, size)
+
+
+def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
+    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
+
+    Args:
+        readings: those of the scaling, with any covariance.
+        w: the scaling.
+    """
+    return [_group_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
+
+
+def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
+    """Deflections where every loaded reading has an unloaded one in its pose and cycle.
+
+    Args:
+        readings: the readings.
+        planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
+    """
+    if planned == "absolute" or readings.unloaded.all():
+        return "absolute"
+    return "deflection" if has_unloaded(readings).all() else "absolute"

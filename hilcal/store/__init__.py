@@ -1,0 +1,1 @@
+"""The campaign file: readings that never change, revisions that are appended."""

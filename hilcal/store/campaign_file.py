@@ -1,0 +1,451 @@
+"""RUN.hilcal: one SQLite file with immutable readings and appended model revisions."""
+
+import json
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from hilcal import __version__, limits
+from hilcal.errors import HilcalError, InputError, MovedFileError
+from hilcal.names import quoted
+from hilcal.readings.readings import Readings
+from hilcal.store import rows, schema
+from hilcal.store.command_line import typed_now
+from hilcal.store.in_place import identity, moved_to, rescued
+from hilcal.store.new_campaign import new_campaign
+from hilcal.store.records import Layout, content_hash, layout_of, read_layout
+from hilcal.store.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
+from hilcal.store.robot_file import robot_file_of
+from hilcal.store.stored_priors import join, split
+
+_TARGETS = "targets"
+ACCEPTED = "accepted {}"
+"""Keys of the acceptances, numbered from 1; the last one holds."""
+_MEANWHILE = 1000
+"""Readings that were appended during a fit, at most; a choice: each takes a second."""
+_HASHED = 1_000_000
+"""Readings that are hashed, at most, to find how many they were; a choice: it takes seconds."""
+_OTHER_READINGS = (
+    "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
+)
+_META = ("config", "base_dir", "source", "created", "program_version")
+
+
+class CampaignFile:
+    """An open campaign file; use it in a `with` statement.
+
+    What `append_readings` and `append_revision` have returned from survives a kill of the
+    process and a loss of power. Readings and revisions cannot be changed or deleted.
+    """
+
+    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+        """Take over an open connection; use `create` or `open`."""
+        self.path = path
+        self._connection = connection
+        self._identity = identity(path)
+        self._now: Path | None = None
+        self._written = False
+        self._meta = self._read_meta()
+
+    @classmethod
+    def create(
+        cls,
+        path: str | Path,
+        config_json: str,
+        base_dir: str,
+        source: str,
+        *,
+        overwrite: bool = False,
+        more: Mapping[str, str] | None = None,
+        readings: Readings | None = None,
+    ) -> Self:
+        """Make a campaign; the file appears only when it is complete.
+
+        Args:
+            path: the file to make.
+            config_json: the cell's configuration.
+            base_dir: the directory to which its relative paths refer.
+            source: where the readings come from, in words.
+            overwrite: replace an existing campaign (never a file of another kind).
+            more: further texts about it, see `about`.
+            readings: the first ones; none unless given.
+
+        Raises:
+            InputError: the file exists, or cannot be written; see `append_readings`.
+            DeviceError: the disk is full or failed.
+        """
+        path = Path(path)
+        meta = dict(
+            zip(_META, (config_json, base_dir, source, utc_now(), __version__), strict=True)
+        )
+        meta |= {**typed_now(), **robot_file_of(config_json, base_dir), **(more or {})}
+        with new_campaign(path, meta, overwrite) as connection:
+            if readings is not None:
+                cls(path, connection).insert(readings)
+        return cls.open(path)
+
+    @classmethod
+    def open(
+        cls, path: str | Path, *, read_only: bool = False, check_revisions: bool = True
+    ) -> Self:
+        """Open a campaign and check that it is whole.
+
+        Args:
+            path: the file.
+            read_only: write nothing, see `schema.connect`.
+            check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
+                measure on, does not.
+
+        Raises:
+            InputError: no such file, another format, a newer version, damaged or truncated.
+        """
+        path = Path(path)
+        if path.exists() and not (path.is_file() or path.is_dir()):
+            raise InputError(f"{path}: a device or a pipe; valid: a campaign file")
+        try:
+            with path.open("rb") as stream:
+                head = stream.read(len(schema.HEADER))
+        except FileNotFoundError as e:
+            raise InputError(f"{path}: no such campaign file") from e
+        except OSError as e:
+            raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+        if head != schema.HEADER:
+            what = "is empty" if not head else "is not a hilcal campaign (not an SQLite file)"
+            raise InputError(f"{path}: the file {what}")
+        with schema.sqlite_errors(path):
+            connection = schema.connect(path, read_only)
+            try:
+                schema.check_file(connection, path)
+                file = cls(path, connection)
+                if check_revisions and (bad := file.bad_revision()) is not None:
+                    raise InputError(f"{path}: {bad[1]}; {_mend(path)}")
+                return file
+            except BaseException:
+                connection.close()
+                raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def __enter__(self) -> Self:
+        """Return the campaign."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the file; what was written is not left in one that is not in its place."""
+        try:
+            if self._written and self._now is None:
+                self.check_place()
+        finally:
+            self.close()
+
+    @property
+    def n_readings(self) -> int:
+        """Number of readings."""
+        with schema.sqlite_errors(self.path):
+            (count,) = self._connection.execute("SELECT count(*) FROM readings").fetchone()
+        return int(count)
+
+    @property
+    def config_json(self) -> str:
+        """The cell's configuration."""
+        return self._meta["config"]
+
+    @property
+    def base_dir(self) -> str:
+        """The directory to which the configuration's relative paths refer."""
+        return self._meta["base_dir"]
+
+    @property
+    def source(self) -> str:
+        """Where the readings come from."""
+        return self._meta["source"]
+
+    @property
+    def created(self) -> str:
+        """When the campaign was made, ISO 8601, UTC."""
+        return self._meta["created"]
+
+    def about(self, key: str) -> str | None:
+        """A further text about the campaign, as given to `create`; None where there is none."""
+        return self._meta.get(key)
+
+    @property
+    def connection(self) -> sqlite3.Connection:
+        """The open file, for the other modules of this package."""
+        return self._connection
+
+    @contextmanager
+    def transaction(self) -> Iterator[sqlite3.Connection]:
+        """Store everything of a block, or nothing.
+
+        Raises:
+            InputError: it cannot be stored.
+            DeviceError: the disk is full or failed, or see `check_place`.
+        """
+        self._written = True
+        try:
+            with schema.sqlite_errors(self.path), schema.transaction(self._connection) as found:
+                yield found
+        except HilcalError:
+            self.check_place()  # which is why
+            raise
+        self.check_place()
+
+    def check_place(self) -> None:
+        """Refuse to go on where the open file is not the one of its name any more.
+
+        Raises:
+            MovedFileError: it was deleted, replaced or moved; says where its readings are.
+        """
+        if identity(self.path) == self._identity:
+            return
+        if self._now is None:
+            self._now = moved_to(self._identity) or rescued(self._connection, self.path)
+        raise MovedFileError(
+            f"{self.path}: deleted, replaced or moved while it was open; all {self.n_readings} "
+            f"readings stored so far are in {self._now}: move that back to {self.path} first"
+        )
+
+    def append_readings(self, readings: Readings) -> int:
+        """Append readings in one transaction; names already known keep their numbers.
+
+        Returns:
+            The number of readings in the campaign.
+
+        Raises:
+            InputError: other quantities, joints or elements than the readings before; a known
+                pose with other commanded joints; not finite; the file cannot be written.
+        """
+        with self.transaction():
+            return self.insert(readings)
+
+    def insert(self, readings: Readings) -> int:
+        """Do the same inside a transaction that the caller has begun.
+
+        Covariances are stored exactly symmetric, as tables hold them, whatever rounding made them.
+        """
+        cov = readings.covariance
+        readings = replace(readings, covariance=0.5 * (cov + np.swapaxes(cov, -1, -2)))
+        if len(readings):
+            self._claim_layout(layout_of(readings))
+            readings = self._numbered_targets(readings)
+            limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
+        rows.check_poses(self._connection, self.path, readings)
+        return rows.insert_readings(self._connection, readings)
+
+    def readings(self) -> Readings:
+        """All readings in the order in which they were appended.
+
+        Raises:
+            InputError: there are none yet, or they are damaged.
+        """
+        layout = self._layout()
+        if layout is None:
+            raise InputError(f"{self.path}: the campaign holds no readings yet")
+        with schema.sqlite_errors(self.path):
+            names = self._target_names()
+            return rows.fetch_readings(self._connection, self.path, layout, names)
+
+    def data_hash(self, count: int | None = None) -> str:
+        """SHA-256 of the readings, or of the first ones; see `content_hash`."""
+        return content_hash(self.readings()[:count])
+
+    def append_revision(self, record: RevisionRecord) -> int:
+        """Append a model revision.
+
+        Returns:
+            Its number, 1, 2, ...; `record.number` is not looked at.
+
+        Raises:
+            InputError: the file cannot be written.
+            ValueError: a number in it is not finite.
+        """
+        with self.transaction():
+            return self.insert_revision(record)
+
+    def insert_revision(self, record: RevisionRecord) -> int:
+        """Do the same inside a transaction that the caller has begun."""
+        (last,) = self._connection.execute("SELECT ifnull(max(id), 0) FROM revisions").fetchone()
+        number = int(last) + 1
+        if record.parent == last and replace(record, parent=None).follows:
+            record = replace(record, parent=None)
+        record, key, posterior = split(record)
+        text = to_text(record)
+        if record.parent is not None:
+            schema.require(self._connection, schema.CHOSEN_REVISION)
+        if key is not None:
+            if key not in self._read_meta():
+                rows.insert_meta(self._connection, key, posterior)
+            schema.require(self._connection, schema.CARRIED_PRIOR)
+        if record.cell:
+            schema.require(self._connection, schema.CHANGED_CELL)
+        row = (number, text, rows.text_crc(str(number), text))
+        rows.insert(self._connection, "revisions", [row])
+        return number
+
+    def accepted(self) -> int | None:
+        """Number of the accepted revision; None where the latest one is used."""
+        found = self.acceptances()
+        return found[-1] if found else None
+
+    def accept(self, number: int | None) -> None:
+        """Make a revision the one that is used; None lets the latest one be used again.
+
+        Raises:
+            InputError: no such revision, or the file cannot be written.
+        """
+        if number is not None:
+            self.revision(number)
+        with self.transaction():
+            key = ACCEPTED.format(len(self.acceptances()) + 1)
+            rows.insert_meta(self._connection, key, json.dumps(number))
+            schema.require(self._connection, schema.CHOSEN_REVISION)
+
+    def acceptances(self) -> list[int | None]:
+        """All that was accepted, in order."""
+        with schema.sqlite_errors(self.path):
+            meta = self._read_meta()
+        found: list[int | None] = []
+        while (text := meta.get(ACCEPTED.format(len(found) + 1))) is not None:
+            number = rows.stored_json(self.path, text)
+            if number is not None and not isinstance(number, int):
+                raise InputError(f"{self.path}: the campaign file is damaged (an acceptance)")
+            found.append(number)
+        return found
+
+    def revisions(self) -> tuple[RevisionRecord, ...]:
+        """All revisions, oldest first.
+
+        Raises:
+            InputError: they are damaged.
+        """
+        records, damaged = self._sound_revisions()
+        if damaged is not None:
+            raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
+        return records
+
+    def _sound_revisions(self) -> tuple[tuple[RevisionRecord, ...], tuple[int, str] | None]:
+        """Return the revisions before the first damaged one; and its number, and what it is."""
+        records: list[RevisionRecord] = []
+        with schema.sqlite_errors(self.path), limits.memory(str(self.path)):
+            stored = self._connection.execute("SELECT id, content, crc FROM revisions ORDER BY id")
+            meta = self._read_meta()
+            for expected, (number, text, crc) in enumerate(stored.fetchall(), start=1):
+                try:
+                    if number != expected or rows.text_crc(str(number), text) != crc:
+                        raise ValueError
+                    records.append(join(from_text(text, number), meta))
+                except InputError as error:
+                    return tuple(records), (expected, str(error))
+                except (ValueError, TypeError, AttributeError) as error:
+                    what = f"the campaign is damaged at revision {expected}"
+                    why = f" ({error})" if str(error) else ""
+                    return tuple(records), (expected, what + why)
+        return tuple(records), None
+
+    def revision(self, number: int) -> RevisionRecord:
+        """One revision.
+
+        Raises:
+            InputError: there is none of this number; names the valid ones.
+        """
+        records = self.revisions()
+        if not 1 <= number <= len(records):
+            valid = f"there are 1 to {len(records)}" if records else "there are none yet"
+            raise InputError(f"{self.path}: no revision {number}; {valid}")
+        return records[number - 1]
+
+    def bad_revision(self) -> tuple[int, str] | None:
+        """Return the first revision that is damaged, or was fitted to other readings, and why.
+
+        The hash of a revision is that of the first readings: of those that it was fitted to, or, as
+        programs before stored it, of some more, which were appended while it was fitted. Either
+        proves that the readings which it was fitted to are as they were.
+        """
+        records, damaged = self._sound_revisions()
+        fitted = [(r.number, *told) for r in records if (told := fitted_to(r)) is not None]
+        readings = self.readings() if fitted else None
+        hashes: dict[int, str] = {}
+        for number, count, stored in fitted:
+            assert readings is not None  # noqa: S101
+            for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
+                if n > count and sum(hashes) > _HASHED:
+                    return number, _OTHER_READINGS.format(number)
+                if n not in hashes:
+                    hashes[n] = content_hash(readings[:n])
+                if hashes[n] == stored:
+                    break
+            else:
+                return number, _OTHER_READINGS.format(number)
+        return damaged
+
+    def _read_meta(self) -> dict[str, str]:
+        meta = rows.fetch_meta(self._connection, self.path)
+        if missing := sorted(set(_META) - set(meta)):
+            raise InputError(f"{self.path}: the campaign file is damaged (no {missing[0]})")
+        return meta
+
+    def _layout(self) -> Layout | None:
+        with schema.sqlite_errors(self.path):
+            text = self._read_meta().get("layout")
+        try:
+            return None if text is None else read_layout(text)
+        except ValueError as e:
+            raise InputError(f"{self.path}: the campaign file is damaged ({e})") from e
+
+    def _target_names(self) -> list[str]:
+        return self._names_in(self._read_meta().get(_TARGETS, "[]"))
+
+    def _names_in(self, text: str) -> list[str]:
+        names = rows.stored_json(self.path, text)
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{self.path}: the campaign file is damaged (its targets)")
+        return names
+
+    def _claim_layout(self, layout: Layout) -> None:
+        """Fix the quantities of a reading with the first ones; refuse others later."""
+        known = self._layout()
+        if known is None:
+            rows.insert_meta(self._connection, "layout", json.dumps(layout))
+        elif known != layout:
+            differ = sorted({name for name, _ in set(known) ^ set(layout)})
+            raise InputError(
+                f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
+                f"a campaign holds one kind of reading, start another for these"
+            )
+
+    def _numbered_targets(self, readings: Readings) -> Readings:
+        """Return the readings with targets numbered as in the file; the first ones name them."""
+        if readings.states.target is None:
+            return readings
+        text = self._read_meta().get(_TARGETS)
+        if text is None:
+            text = json.dumps(readings.target_names)
+            rows.insert_meta(self._connection, _TARGETS, text)
+            schema.require(self._connection, schema.SEVERAL_TARGETS)
+        names = self._names_in(text)
+        new = [name for name in readings.target_names if name not in names]
+        if new:
+            raise InputError(
+                f"{self.path}: target {new[0]!r} is not one of this campaign: {', '.join(names)}"
+            )
+        number = np.array([names.index(name) for name in readings.target_names])
+        states = replace(readings.states, target=number[readings.target])
+        return replace(readings, states=states, target_names=tuple(names))
+
+
+def _mend(path: Path) -> str:
+    return f"valid: an untouched copy; or set the revision aside: hilcal repair {quoted(path)}"

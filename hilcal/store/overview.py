@@ -1,0 +1,196 @@
+"""What a campaign file holds, read from it alone: nothing is fitted, no effect is needed."""
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from hilcal.config import CellConfig
+from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.command_line import COMMAND
+from hilcal.store.revision import RevisionRecord
+from hilcal.store.run_log import PLAN, RunLog
+from hilcal.types import Floats
+
+_SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Instrument:
+    """A device that measured, as it answered when a session began.
+
+    Attributes:
+        part: of the cell, e.g. "tracker".
+        driver: name of its driver.
+        name: as it told it.
+        serial: its serial number; None where it told none.
+        facts: what else it told, by name.
+        utc: when it answered first, ISO 8601.
+    """
+
+    part: str
+    driver: str
+    name: str
+    serial: str | None
+    facts: Mapping[str, str]
+    utc: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tare:
+    """A zero of the force sensor.
+
+    Attributes:
+        utc: when, ISO 8601.
+        wrench: (6,) what it read with nothing on the hook, sensor axes, N and N·m.
+    """
+
+    utc: str
+    wrench: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Return:
+    """A return to the reference pose.
+
+    Attributes:
+        utc: when, ISO 8601.
+        metres: (3,) shift since the first reading there, sensor axes, m.
+        sigma: its size in standard deviations.
+        over: whether it was over the limit of [acquire] drift_limit_sigma.
+    """
+
+    utc: str
+    metres: Floats
+    sigma: float
+    over: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overview:
+    """A campaign at a glance.
+
+    Attributes:
+        created: when the file was made, ISO 8601, UTC.
+        program_version: of the program that made it.
+        source: where the readings come from.
+        command: that made the file, as it was typed; empty where it is not kept.
+        config: the cell's configuration.
+        readings: all of them, with the covariances as stored; None before the first.
+        loads: number of readings by load.
+        targets: number of readings by target, where there are several.
+        planned: number of planned steps; None for an imported campaign.
+        measured: of them those that were measured.
+        plans: number of plans.
+        instruments: that were connected, each once.
+        tares: of the force sensor, in order.
+        returns: to the reference pose, in order.
+        tool: as the force sensor found it last: mass_kg, com_m, ...; None where it did not.
+        repeatability: as the last session found it; None where it did not.
+        events: all that happened, in order: "kind", "utc" and more.
+        revisions: all, in order.
+        accepted: number of the accepted revision, if any.
+        in_use: number of the revision that commands use, if there is any.
+    """
+
+    created: str
+    program_version: str
+    source: str
+    command: str
+    config: CellConfig
+    readings: Readings | None
+    loads: Mapping[str, int]
+    targets: Mapping[str, int]
+    planned: int | None
+    measured: int
+    plans: int
+    instruments: tuple[Instrument, ...]
+    tares: tuple[Tare, ...]
+    returns: tuple[Return, ...]
+    tool: Mapping[str, Any] | None
+    repeatability: Mapping[str, Any] | None
+    events: tuple[Mapping[str, Any], ...]
+    revisions: tuple[RevisionRecord, ...]
+    accepted: int | None
+    in_use: int | None
+
+    @property
+    def poses(self) -> int:
+        """Number of poses with readings."""
+        return 0 if self.readings is None else len(np.unique(self.readings.pose))
+
+
+def overview(file: CampaignFile) -> Overview:
+    """Return what a campaign file holds.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    log = None if file.about(PLAN) is None else RunLog(file)
+    events = () if log is None else tuple(log.events())
+    readings = file.readings() if file.n_readings else None
+    revisions, accepted = file.revisions(), file.accepted()
+    several = readings is not None and readings.states.target is not None
+    return Overview(
+        created=file.created,
+        program_version=file.about("program_version") or "",
+        source=file.source,
+        command=file.about(COMMAND) or "",
+        config=CellConfig.from_json(file.config_json),
+        readings=readings,
+        loads={} if readings is None else _count(readings.load.tolist(), readings.load_names),
+        targets=_count(readings.target.tolist(), readings.target_names)
+        if readings is not None and several
+        else {},
+        planned=None if log is None else len(log.plan.steps),
+        measured=0 if log is None else len(log.done()),
+        plans=0 if log is None else len(log.plans),
+        instruments=_instruments(events),
+        tares=tuple(
+            Tare(e["utc"], np.array(e["force"]["wrench"], dtype=float))
+            for e in events
+            if e["kind"] == "tare"
+        ),
+        returns=tuple(
+            Return(e["utc"], np.array(e["shift_m"]), float(e["sigma"]), bool(e["over"]))
+            for e in events
+            if e["kind"] == "drift"
+        ),
+        tool=_last(events, "tool"),
+        repeatability=_last(events, "repeatability"),
+        events=events,
+        revisions=revisions,
+        accepted=accepted,
+        in_use=accepted or (len(revisions) or None),
+    )
+
+
+def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
+    counts = Counter(index)
+    return {name: counts[k] for k, name in enumerate(names) if counts[k]}
+
+
+def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[Instrument, ...]:
+    found: dict[tuple[str, str], Instrument] = {}
+    for event in events:
+        for answer in event["answers"] if event["kind"] == "devices" else ():
+            facts, name = dict(answer["facts"]), str(answer["name"])
+            told = _SERIAL.search(name)
+            serial = facts.get("serial number") or (told and told[1].rstrip(",;"))
+            found.setdefault(
+                (answer["device"], name),
+                Instrument(answer["device"], answer["driver"], name, serial, facts, event["utc"]),
+            )
+    return tuple(found.values())
+
+
+def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] | None:
+    """Return what the last event of a kind says, without when."""
+    for event in reversed(events):
+        if event["kind"] == kind:
+            return {k: v for k, v in event.items() if k not in ("kind", "utc", "wall_s")}
+    return None

@@ -1,0 +1,83 @@
+"""What a calibration has done so far: entries in its campaign file, which are only appended.
+
+With the readings, plans and revisions of the same file they are the whole state of the procedure
+(`hilcal.procedure`): whatever stops the program, it goes on from what the files hold.
+"""
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+from hilcal.store import rows, schema
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan
+from hilcal.store.revision import RevisionRecord, utc_now
+from hilcal.store.run_log import PLAN, RunLog
+from hilcal.store.stored_schema import check_entry
+
+ENTRY = "calibrate {}"
+"""Keys of the entries, numbered from 1."""
+
+
+class ProcedureLog:
+    """The entries of a campaign; what a method has appended survives a kill of the process."""
+
+    def __init__(self, campaign: CampaignFile) -> None:
+        """Read and write entries of an open campaign."""
+        self._campaign = campaign
+
+    def entries(self) -> tuple[dict[str, Any], ...]:
+        """Return all entries in order: "kind", "utc" and more.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        with schema.sqlite_errors(self._campaign.path):
+            meta = rows.fetch_meta(self._campaign.connection, self._campaign.path)
+        found: list[dict[str, Any]] = []
+        while (text := meta.get(ENTRY.format(len(found) + 1))) is not None:
+            found.append(rows.stored_json(self._campaign.path, text, check_entry))
+        return tuple(found)
+
+    def last(self, kind: str) -> dict[str, Any] | None:
+        """Return the last entry of a kind; None without any."""
+        return next((e for e in reversed(self.entries()) if e["kind"] == kind), None)
+
+    def append(
+        self,
+        kind: str,
+        content: dict[str, Any],
+        *,
+        plan: Plan | None = None,
+        revisions: Sequence[RevisionRecord] = (),
+    ) -> tuple[int, ...]:
+        """Append an entry, together with what it is about, or none of it.
+
+        Args:
+            kind: of the entry.
+            content: JSON.
+            plan: a further plan of the campaign, with names that it does not have yet.
+            revisions: of the model.
+
+        Returns:
+            The numbers of the revisions; they are in the entry as "revisions".
+
+        Raises:
+            InputError: the file cannot be written.
+            DeviceError: the disk is full or failed.
+        """
+        log = None if plan is None else RunLog(self._campaign)
+        with self._campaign.transaction() as connection:
+            number = len(self.entries()) + 1
+            stored = tuple(self._campaign.insert_revision(r) for r in revisions)
+            if log is not None and plan is not None:
+                key = f"{PLAN} {len(log.plans) + 1}"
+                rows.insert_meta(connection, key, plan.to_json())
+            told = {**content, "revisions": list(stored)} if stored else content
+            rows.insert_meta(connection, ENTRY.format(number), entry(kind, told))
+        return stored
+
+
+def entry(kind: str, content: dict[str, Any]) -> str:
+    """Return the text of an entry that is made now."""
+    return json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)

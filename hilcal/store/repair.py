@@ -1,0 +1,113 @@
+"""What opens a campaign again: a bad revision is set aside, a robot's file is put in."""
+
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.robot.catalogue import load_arm
+from hilcal.store import schema
+from hilcal.store.campaign_file import ACCEPTED, CampaignFile
+from hilcal.store.procedure_log import ENTRY, ProcedureLog
+from hilcal.store.robot_file import ROBOT_FILE, text_of
+from hilcal.store.rows import insert_meta
+from hilcal.whole_file import replace_file
+
+
+@dataclass(frozen=True, slots=True)
+class Repaired:
+    """What was set aside.
+
+    Attributes:
+        why: what is wrong with the first of them.
+        revisions: their numbers.
+        original: the file as it was.
+    """
+
+    why: str
+    revisions: tuple[int, ...]
+    original: Path
+
+
+def repair(path: Path) -> Repaired | None:
+    """Set aside the first bad revision, all after it, and what names one of them.
+
+    Later revisions may have been made from it. The readings have to be sound.
+
+    Returns:
+        What was done; None where no revision is bad.
+
+    Raises:
+        InputError: not a campaign, a damaged reading, or a file that cannot be written.
+    """
+    with CampaignFile.open(path, check_revisions=False) as file:
+        if file.n_readings:
+            file.readings()
+        bad = file.bad_revision()
+        if bad is None:
+            return None
+        first, why = bad
+        with file.transaction() as connection:
+            original = _free(path)
+            replace_file(original, connection.serialize(), must_be_new=True)
+            found = connection.execute(
+                "SELECT id FROM revisions WHERE id >= ? OR id < 1 ORDER BY id", (first,)
+            )
+            numbers = tuple(int(number) for (number,) in found.fetchall())
+            _delete(connection, "revisions", "id", numbers)
+            _delete(connection, "meta", "key", _naming(file, first))
+    return Repaired(why, numbers, original)
+
+
+def put_robot(path: Path, file: Path) -> None:
+    """Put the file of its robot into a campaign that does not hold it.
+
+    Raises:
+        InputError: it holds one, needs none, or that file is not one of such an arm.
+    """
+    with CampaignFile.open(path) as campaign:
+        robot = CellConfig.from_json(campaign.config_json).robot
+        if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
+            raise InputError(f"{path}: its robot is in it already; leave out --robot")
+        kept = text_of(file)
+        if not kept:
+            raise InputError(f"--robot {file}: cannot be read as text")
+        text, base, tip = kept[ROBOT_FILE], robot.base_link, robot.tip_link
+        arm = load_arm(robot.model, base_link=base, tip_link=tip, text=text)
+        n = campaign.readings().states.q.shape[1] if campaign.n_readings else arm.n
+        if arm.n != n:
+            raise InputError(f"--robot {file}: {arm.n} joints, the readings have {n}")
+        with campaign.transaction() as connection:
+            insert_meta(connection, ROBOT_FILE, text)
+
+
+def _naming(file: CampaignFile, first: int) -> tuple[str, ...]:
+    """Keys of the acceptances and of the entries of a calibration from the first that names one."""
+    accepted = [[number] for number in file.acceptances()]
+    entries = [[e.get("revision"), *e.get("revisions", ())] for e in ProcedureLog(file).entries()]
+    keys: list[str] = []
+    for key, named in ((ACCEPTED, accepted), (ENTRY, entries)):
+        bad = (k for k, of in enumerate(named) if any(n is not None and n >= first for n in of))
+        keys += [key.format(k + 1) for k in range(next(bad, len(named)), len(named))]
+    return tuple(keys)
+
+
+def _delete(
+    connection: sqlite3.Connection, table: str, key: str, values: tuple[int | str, ...]
+) -> None:
+    """Delete rows of an immutable table."""
+    guard = f"{table}_no_delete"
+    (made,) = (s for s in schema.statements() if s.startswith(f"CREATE TRIGGER {guard} "))
+    connection.execute(f"DROP TRIGGER {guard}")
+    delete = f"DELETE FROM {table} WHERE {key} = ?"  # noqa: S608
+    connection.executemany(delete, [(value,) for value in values])
+    connection.execute(made)
+
+
+def _free(path: Path) -> Path:
+    """Return a name for the file as it was."""
+    found, k = path.with_name(f"{path.name}.original"), 2
+    while found.exists():
+        found, k = path.with_name(f"{path.name}.original-{k}"), k + 1
+    return found

@@ -1,0 +1,169 @@
+"""A model revision: what was fitted, to which data, by which program, with what result."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from datetime import UTC, datetime
+from typing import Any
+
+from hilcal.config.changes import Changes
+from hilcal.errors import InputError
+from hilcal.names import check_names
+from hilcal.store.stored_schema import Options, Result, check
+from hilcal.toml import parse_json
+
+STORED = "stored_sha256"
+"""Key among the options of a revision: hash of the readings as the file stores them.
+
+`data_hash` is that of the readings with the arm's scatter in their covariance, which is computed:
+its last bits depend on the machine."""
+
+CELL = "cell"
+"""Key among the options of a revision: what was changed in the cell, see `config.changes`."""
+
+
+def utc_now() -> str:
+    """Present time, ISO 8601, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def seconds_of(date: str, where: str = "date") -> float:
+    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise.
+
+    Raises:
+        InputError: no date.
+    """
+    try:
+        found = datetime.fromisoformat(date)
+    except ValueError:
+        raise InputError(f"{where}: {date!r}; valid: a date as 2026-03-31") from None
+    return (found if found.tzinfo else found.replace(tzinfo=UTC)).timestamp()
+
+
+@dataclass(frozen=True, slots=True)
+class RevisionRecord:
+    """One fit, as a campaign file keeps it; all mappings are JSON.
+
+    Attributes:
+        effects: canonical names of the model's effects, in order.
+        added: the effect that this revision added to the one before; None for a first model.
+        options: what was chosen: scaling, kind of readings, options of the effects.
+        data_hash: `content_hash` of the readings that were fitted.
+        program_version: version of the program that fitted.
+        parameters_json: the parameters, enough to predict with the model again.
+        result_json: what `identify --json` or `diagnose --json` reported.
+        created: ISO 8601, UTC.
+        number: 1, 2, ... in one campaign; the campaign gives it.
+        removed: the effect that this revision took out of the one before.
+        parent: number of the revision that it was made from; None where that is the one before, or
+            where it was made from none.
+    """
+
+    effects: tuple[str, ...]
+    added: str | None
+    options: Mapping[str, Any]
+    data_hash: str
+    program_version: str
+    parameters_json: Mapping[str, Any]
+    result_json: Mapping[str, Any]
+    created: str = field(default_factory=utc_now)
+    number: int = 0
+    removed: str | None = None
+    parent: int | None = None
+
+    @property
+    def cell(self) -> Changes:
+        """What was changed in the campaign's cell before this was fitted; nothing as a rule."""
+        found: Changes = self.options.get(CELL, {})
+        return found
+
+    @property
+    def made_from(self) -> int | None:
+        """Number of the revision that it was made from; None for a first model."""
+        if not self.follows or self.number <= 1:
+            return None
+        return self.number - 1 if self.parent is None else self.parent
+
+    @property
+    def follows(self) -> bool:
+        """Whether it was made from another revision."""
+        changed = self.added is not None or self.removed is not None or self.scatter_alone
+        return changed or self.parent is not None
+
+    @property
+    def scatter_alone(self) -> bool:
+        """Whether it changed the covariance alone, by the arm's scatter as estimated."""
+        taken = self.parameters_json.get("arm_scatter") is not None
+        return taken and self.added is None and self.removed is None
+
+
+def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
+    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model.
+
+    Args:
+        added: an effect.
+        removed: an effect.
+        scatter: whether the arm's estimated scatter is in its covariance.
+    """
+    if scatter and added is None and removed is None:
+        return "arm's scatter"
+    parts = [f"+ {added}"] if added else []
+    return " ".join([*parts, f"− {removed}"] if removed else parts)
+
+
+def to_text(record: RevisionRecord) -> str:
+    """JSON text of a record without its number; floats keep their exact value.
+
+    Raises:
+        ValueError: a number is NaN or infinite, which JSON cannot hold (use null).
+        TypeError: a value is not of JSON.
+    """
+    content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
+    if record.parent is None:
+        del content["parent"]
+    return json.dumps(content, allow_nan=False, sort_keys=True, ensure_ascii=False)
+
+
+def from_text(text: str, number: int) -> RevisionRecord:
+    """Record from its JSON text.
+
+    Raises:
+        ValueError: not such a text.
+        InputError: a name in it is none.
+    """
+    try:
+        content = parse_json(text)
+        content["effects"] = tuple(content["effects"])
+        record = RevisionRecord(**content, number=number)
+        _check(record)
+        return record
+    except (LookupError, TypeError, AttributeError) as e:
+        raise ValueError(str(e)) from e
+
+
+def _check(record: RevisionRecord) -> None:
+    """Refuse a record whose entries are of other kinds."""
+    if not isinstance(record.parameters_json, dict):
+        raise TypeError("parameters_json is no document")
+    texts = (*record.effects, record.data_hash, record.program_version, record.created)
+    named = (t for t in (record.added, record.removed) if t is not None)
+    if not all(isinstance(text, str) for text in (*texts, *named)):
+        raise TypeError("a name is no text")
+    check_names([*texts, *named], f"revision {record.number}, name")
+    check(Options, record.options)
+    check(Result, record.result_json)
+    if record.parent is not None and not isinstance(record.parent, int):
+        raise TypeError("parent is no number")
+
+
+def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
+    """Return how many readings a revision was fitted to, the first ones, and their stored hash.
+
+    None where the record does not say.
+    """
+    identified = record.result_json.get("identify")
+    count = identified.get("n_readings") if isinstance(identified, dict) else None
+    stored = record.options.get(STORED)
+    if not isinstance(count, int) or not isinstance(stored, str):
+        return None
+    return count, stored

@@ -1,0 +1,269 @@
+"""A measured campaign's plan, raw details of every reading, and what happened on the way."""
+
+import json
+import sqlite3
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.readings import Readings
+from hilcal.store import rows, schema
+from hilcal.store.appended import joined, with_new_names
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.plan import Plan, Step, read_plan
+from hilcal.store.revision import utc_now
+from hilcal.store.robot_file import ROBOT_FILE, robot_file_of
+from hilcal.store.stored_schema import Detail, check, check_event
+
+PLAN = "plan"
+"""Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
+
+
+SAME = ("robot", "tool", "loads")
+"""Sections of the configuration that stay as they are for a whole campaign ..."""
+ADDRESSES = {"driver", "host", "port", "baud", "options"}
+"""... but for these keys of them."""
+
+
+def create_run(
+    path: Path,
+    config: CellConfig,
+    base_dir: Path,
+    plan: Plan,
+    overwrite: bool = False,
+    *,
+    source: str = "measured by hilcal run",
+    more: Mapping[str, str] | None = None,
+) -> CampaignFile:
+    """Make the empty campaign of a run, its plan inside.
+
+    Args:
+        path: the file.
+        config: the cell's configuration.
+        base_dir: the directory to which its relative paths refer.
+        plan: what is measured.
+        overwrite: replace an existing campaign.
+        source: where the readings come from, in words.
+        more: further texts about it; that of the key `COVERS` where readings are stored with
+            another covariance than the instrument's.
+
+    Raises:
+        InputError: it cannot be written, or is there already.
+    """
+    texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
+    return CampaignFile.create(
+        path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
+    )
+
+
+def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) -> None:
+    """Refuse to continue a campaign in another cell.
+
+    Args:
+        campaign: what was begun.
+        config: the cell as it is told now.
+        base_dir: directory to which relative paths in it refer.
+
+    Raises:
+        InputError: names the section, or the robot's file, that differs.
+    """
+    kept = campaign.about(ROBOT_FILE)
+    now = robot_file_of(config.to_json(), str(base_dir)).get(ROBOT_FILE)
+    if kept is not None and now is not None and kept != now:
+        raise InputError(
+            f"{base_dir / config.robot.model} is not what it was when {campaign.path} was begun; a "
+            "campaign is of one robot: start another one for this"
+        )
+    for section in SAME:
+        stored, given = (
+            c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})
+            for c in (CellConfig.from_json(campaign.config_json), config)
+        )
+        if stored != given:
+            raise InputError(
+                f"[{section}] differs from what {campaign.path} was begun with; a campaign is "
+                "measured in one cell: start another one for this"
+            )
+
+
+class RunLog:
+    """What a run writes into its campaign file; all of it durable before a method returns.
+
+    A reading, its step and its raw details enter together or not at all, and no step twice.
+    """
+
+    def __init__(self, campaign: CampaignFile) -> None:
+        """Write to an open campaign.
+
+        Raises:
+            InputError: the campaign was not measured by a run (it has no plan).
+        """
+        text = campaign.about(PLAN)
+        if text is None:
+            raise InputError(
+                f"{campaign.path}: the campaign was not measured with `hilcal run`; "
+                "it cannot be resumed"
+            )
+        self._campaign = campaign
+        plans = [read_plan(text, f"{campaign.path}, its plan")]
+        with schema.sqlite_errors(campaign.path):
+            meta = rows.fetch_meta(campaign.connection, campaign.path)
+        while (text := meta.get(f"{PLAN} {len(plans) + 1}")) is not None:
+            plans.append(read_plan(text, f"{campaign.path}, its plan {len(plans) + 1}"))
+        self.plans: tuple[Plan, ...] = tuple(plans)
+
+    @property
+    def plan(self) -> Plan:
+        """All plans in one; of those before the last one only what was measured."""
+        if len(self.plans) == 1:
+            return self.plans[0]
+        done, whole = self.done(), self.plans[0]
+        for further in self.plans[1:]:
+            whole = joined(whole, done, further)
+        return whole
+
+    def with_new_names(self, plan: Plan) -> Plan:
+        """Return a further plan with names and cycles that the campaign does not have yet.
+
+        Raises:
+            InputError: it does not go with the campaign, or is the last one and not done yet.
+        """
+        last, whole = self.plans[-1], self.plan
+        missing = len(last.without(self.done()).steps)
+        made = with_new_names(plan, whole, len(self.plans) + 1)
+        again = with_new_names(plan, self._before_last(), len(self.plans))
+        if missing and again.steps == last.steps and np.array_equal(again.q, last.q):
+            raise InputError(
+                f"{self._campaign.path}: this plan is in the campaign already, and {missing} of "
+                f"its {len(last.steps)} readings are missing; go on with --resume"
+            )
+        return made
+
+    def _before_last(self) -> Plan:
+        """Return what was planned before the last plan, as far as that matters for names."""
+        if len(self.plans) == 1:
+            first = self.plans[0]
+            return Plan(first.pose_names, first.q, ())
+        done, whole = self.done(), self.plans[0]
+        for further in self.plans[1:-1]:
+            whole = joined(whole, done, further)
+        kept = tuple(s for s in whole.steps if s in done)
+        return Plan(whole.pose_names, whole.q, kept)
+
+    def append(self, plan: Plan) -> None:
+        """Append a further plan, see `with_new_names`; what is missing of those before is given up.
+
+        Raises:
+            DeviceError: the disk is full or failed.
+        """
+        with self._campaign.transaction() as connection:
+            rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
+        self.plans = (*self.plans, plan)
+
+    def record(
+        self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
+    ) -> None:
+        """Append the reading of a step, with everything raw that belongs to it.
+
+        Of several targets all readings of the arrival, one detail for each, or none of them: a
+        step that is measured again is another arrival.
+
+        Raises:
+            InputError: the step is there already, or other quantities than before.
+            DeviceError: the disk is full or failed; the file is as before.
+        """
+        details = (detail, *more)
+        if len(reading) != len(details):
+            raise ValueError(f"{len(reading)} readings of one step, {len(details)} details")
+        with self._campaign.transaction() as connection:
+            last = self._campaign.insert(reading)
+            for k, content in enumerate(details):
+                number, text = last - len(details) + 1 + k, json.dumps(content, allow_nan=False)
+                key = _key(step, reading, k)
+                try:
+                    crc = rows.text_crc(f"{number}{key}", text)
+                    rows.insert(connection, "details", [(number, key, text, crc)])
+                except sqlite3.IntegrityError:
+                    raise InputError(
+                        f"{self._campaign.path}: {step} has been measured already"
+                    ) from None
+
+    def event(self, kind: str, content: dict[str, Any]) -> None:
+        """Append what happened, with the time (UTC).
+
+        Raises:
+            DeviceError: the disk is full or failed.
+        """
+        text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
+        with self._campaign.transaction() as connection:
+            (last,) = connection.execute("SELECT ifnull(max(id), 0) FROM events").fetchone()
+            number = int(last) + 1
+            row = (number, text, rows.text_crc(str(number), text))
+            rows.insert(connection, "events", [row])
+
+    def done(self) -> frozenset[Step]:
+        """Return the steps that have been measured."""
+        stored = self._select("SELECT step FROM details")
+        return frozenset(Step(*self._step(key)) for (key,) in stored)
+
+    def details(self) -> list[dict[str, Any]]:
+        """Return the raw details of all readings, in order, each with its "step".
+
+        Raises:
+            InputError: they are damaged.
+        """
+        out = []
+        for number, key, text, crc in self._select("SELECT * FROM details ORDER BY id"):
+            if rows.text_crc(f"{number}{key}", text) != crc:
+                raise InputError(
+                    f"{self._campaign.path}: the campaign is damaged at the details of "
+                    f"reading {number}"
+                )
+            pose, load, cycle = self._step(key)
+            found = rows.stored_json(self._campaign.path, text, partial(check, Detail))
+            out.append({**found, "step": {"pose": pose, "load": load, "cycle": cycle}})
+        return out
+
+    def events(self) -> list[dict[str, Any]]:
+        """Return what happened, in order: "kind", "utc" and more.
+
+        Raises:
+            InputError: it is damaged.
+        """
+        out = []
+        for number, text, crc in self._select("SELECT * FROM events ORDER BY id"):
+            if rows.text_crc(str(number), text) != crc:
+                raise InputError(
+                    f"{self._campaign.path}: the campaign is damaged at event {number}"
+                )
+            out.append(rows.stored_json(self._campaign.path, text, check_event))
+        return out
+
+    def readings(self) -> Readings | None:
+        """Return all readings, None before the first."""
+        return self._campaign.readings() if self._campaign.n_readings else None
+
+    def _step(self, key: str) -> tuple[str, str, int]:
+        found = rows.stored_json(self._campaign.path, key)
+        if not isinstance(found, list) or [type(x) for x in found[:3]] != [str, str, int]:
+            raise InputError(f"{self._campaign.path}: the campaign is damaged (step {key})")
+        return found[0], found[1], found[2]
+
+    def _select(self, statement: str) -> list[Any]:
+        path = self._campaign.path
+        with schema.sqlite_errors(path), limits.memory(str(path)):
+            return self._campaign.connection.execute(statement).fetchall()
+
+
+def _key(step: Step, reading: Readings, row: int) -> str:
+    """Key of a stored detail: the step, and the name of the target where there are several."""
+    several = reading.states.target is not None
+    target = [reading.target_names[reading.target[row]]] if several else []
+    return json.dumps([step.pose, step.load, step.cycle, *target])

@@ -1,0 +1,1 @@
+"""Readings of others: the exchange table, mappings, import."""

@@ -1,0 +1,206 @@
+"""What cannot be right in a table of readings: units, limits, covariances, names."""
+
+import re
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.readings.covariance import smallest_correlation
+from hilcal.readings.readings import SAME_POSE
+from hilcal.robot.arm import Arm
+from hilcal.tables.columns import POSITION, ROTATION, WRENCH
+from hilcal.tables.csvfile import CsvTable
+from hilcal.types import Floats, Ints
+
+MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
+MAX_STD = 3e-3  # m; cameras do better; micrometres given 1000 times too large are above it
+MAX_ANGLE_STD = 0.05  # rad, 3°; the same for an orientation, a choice
+_LIMIT_MARGIN = 1e-4  # rad; rounding of a limit written with few digits
+_TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
+_G = 9.80665
+
+
+def check_joints(table: CsvTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
+    """Refuse commanded joints beyond the arm's limits; (N, n), rad.
+
+    Raises:
+        InputError: names row, joint and limits, and remarks angles that look like degrees.
+    """
+    bad = (q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)
+    if not bad.any():
+        return
+    i, j = divmod(int(np.argmax(bad)), q.shape[1])
+    turns = float(np.max(np.maximum(np.abs(arm.q_min), np.abs(arm.q_max)))) + 1.0
+    degrees = " (looks like degrees)" if np.abs(q).max() > turns else ""
+    raise InputError(
+        f"{table.at(i, names[j])}: {q[i, j]:g} rad is beyond the limits of {arm.joint_names[j]} "
+        f"of {arm.name}, {arm.q_min[j]:g} to {arm.q_max[j]:g} rad{degrees}"
+    )
+
+
+def check_actual_joints(table: CsvTable, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
+    """Refuse encoder readings that are not near the commanded joints; (N, n), rad.
+
+    Raises:
+        InputError: names the cell.
+    """
+    bad = np.abs(actual - q) > _TRACKING
+    if bad.any():
+        i, j = divmod(int(np.argmax(bad)), q.shape[1])
+        raise InputError(
+            f"{table.at(i, names[j])}: {actual[i, j]:g} rad is not within {_TRACKING} rad of the "
+            f"commanded {q[i, j]:g} rad; expected the joint angle that was reached, in rad"
+        )
+
+
+def check_positions(table: CsvTable, position: Floats, q: Floats, arm: Arm) -> None:
+    """Refuse positions (N, 3) that cannot be metres.
+
+    No reading is further than 100 m from its instrument; all lie within a few reaches of each
+    other; and joints that move by more than 0.1 rad move the target.
+
+    Raises:
+        InputError: names the row and the unit that it looks like.
+    """
+    distance = np.linalg.norm(position, axis=1)
+    if np.any(distance > MAX_DISTANCE):
+        i = int(np.argmax(distance > MAX_DISTANCE))
+        j = int(np.argmax(np.abs(position[i])))
+        raise InputError(
+            f"{table.at(i, POSITION[j])}: {position[i, j]:g} m cannot be right"
+            f"{_looks_like(position[i], distance[i])}; positions must be in m, within "
+            f"{MAX_DISTANCE:g} m"
+        )
+    away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    if np.any(away > 5 * arm.reach):
+        i = int(np.argmax(away))
+        raise InputError(
+            f"{table.at(i)}: position is {away[i]:.3g} m from the others, the reach of {arm.name} "
+            f"is {arm.reach:.3g} m{_looks_like(position[i], distance[i])}; positions must be in m"
+        )
+    spread = float(away.max())
+    travel = float(np.ptp(q, axis=0).max())
+    if spread < 1e-3 * arm.reach and travel > 0.1 and len(np.unique(q, axis=0)) >= 5:
+        raise InputError(
+            f"{table.path}: columns {', '.join(POSITION)}: the joints move by {travel:.2g} rad but "
+            f"all positions lie within {spread:.2g} m; expected the measured positions in m"
+        )
+
+
+def _looks_like(position: Floats, distance: float) -> str:
+    """Say what a position (3,) that cannot be may be: in millimetres, or a gap such as -9999."""
+    if any(re.fullmatch("9{4,}", f"{abs(v):.12g}".replace(".", "")) for v in position):
+        return " (nines for no value? leave the row out, or name them as missing in a mapping)"
+    return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
+
+
+def check_rotations(table: CsvTable, rotation: Floats) -> None:
+    """Refuse rotation vectors (N, 3) of more than a turn.
+
+    Raises:
+        InputError: names the row.
+    """
+    angle = np.linalg.norm(rotation, axis=1)
+    if np.any(angle > 2 * np.pi + 1e-6):
+        i = int(np.argmax(angle > 2 * np.pi + 1e-6))
+        raise InputError(
+            f"{table.at(i)}: rotation vector {', '.join(ROTATION)} has a length of {angle[i]:.4g}, "
+            f"more than a turn (looks like degrees); expected axis times angle in rad"
+        )
+
+
+def check_covariances(table: CsvTable, covariance: Floats) -> None:
+    """Refuse covariances (N, m, m) that no error can have.
+
+    A covariance is positive semi-definite; tested on the correlation matrix D V D with
+    D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
+
+    Raises:
+        InputError: zero, a negative variance, not positive semi-definite, or a standard
+            deviation above 3 mm or 0.05 rad; names the row.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    for i in np.flatnonzero(np.any(variance < 0, axis=1))[:1]:
+        j = int(np.argmax(variance[i] < 0))
+        raise InputError(
+            f"{table.at(int(i))}: variance {j + 1} of the covariance is {variance[i, j]:g}; "
+            f"a variance is >= 0"
+        )
+    for i in np.flatnonzero(~np.any(covariance, axis=(1, 2)))[:1]:
+        raise InputError(
+            f"{table.at(int(i))}: the covariance is zero; give the reading's covariance in m², or "
+            f"leave out all covariance columns to use the tracker's specification"
+        )
+    smallest = smallest_correlation(covariance)
+    for i in np.flatnonzero(smallest < -1e-9)[:1]:
+        why = f"smallest eigenvalue of the correlation matrix {smallest[i]:.3g}"
+        if np.isinf(smallest[i]):
+            why = "a covariance is larger than its two variances allow"
+        raise InputError(
+            f"{table.at(int(i))}: the covariance is not positive semi-definite ({why})"
+        )
+    std = np.sqrt(variance[:, :3].max(axis=1))
+    for i in np.flatnonzero(std > MAX_STD)[:1]:
+        raise InputError(
+            f"{table.at(int(i))}: a standard deviation of {std[i]:.3g} m cannot calibrate an arm; "
+            f"covariances must be in m², m·rad and rad² (1 mm² = 1e-6 m²)"
+        )
+    turn = np.sqrt(variance[:, 3:].max(axis=1, initial=0.0))
+    for i in np.flatnonzero(turn > MAX_ANGLE_STD)[:1]:
+        raise InputError(
+            f"{table.at(int(i))}: a standard deviation of {turn[i]:.3g} rad cannot calibrate an "
+            f"arm; covariances must be in m², m·rad and rad² (1 deg² = 3.05e-4 rad²)"
+        )
+
+
+def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
+    """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm.
+
+    Raises:
+        InputError: names the cell.
+    """
+    unloaded = np.array([name == "none" for name in names])[load]
+    loaded = unloaded[:, None] & (wrench != 0)
+    limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
+    heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
+    for bad, why in (
+        (loaded, "the load is 'none', so the wrench must be 0"),
+        (heavy, f"beyond 20 times the payload of {arm.name}; expected N and N·m"),
+    ):
+        if bad.any():
+            i, j = divmod(int(np.argmax(bad)), 6)
+            raise InputError(f"{table.at(i, WRENCH[j])}: {wrench[i, j]:g}: {why}")
+
+
+def check_names(table: CsvTable) -> None:
+    """Refuse empty poses and loads, and other spellings of `none`.
+
+    Raises:
+        InputError: names the row.
+    """
+    for column in ("pose", "load"):
+        if "" in table.text[column]:
+            i = table.text[column].index("")
+            valid = "; write 'none' where there is no load" if column == "load" else ""
+            raise InputError(f"{table.at(i, column)}: the cell is empty{valid}")
+    odd = sorted(n for n in set(table.text["load"]) if n != "none" and n.lower() == "none")
+    if odd:
+        i = table.text["load"].index(odd[0])
+        raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
+
+
+def check_same_pose(table: CsvTable, pose: Ints, names: list[str], q: Floats) -> None:
+    """Refuse a pose whose commanded joints (N, n) differ between its rows.
+
+    Raises:
+        InputError: names both rows.
+    """
+    first = np.unique(pose, return_index=True)[1]
+    bad = np.abs(q - q[first][pose]) > SAME_POSE
+    if bad.any():
+        i, j = divmod(int(np.argmax(bad)), q.shape[1])
+        k = int(first[pose[i]])
+        raise InputError(
+            f"{table.at(i)}: pose '{names[pose[i]]}' commands joint {j + 1} to {q[i, j]:.9g} rad, "
+            f"row {table.rows[k]} to {q[k, j]:.9g}; give another pose another name"
+        )

@@ -1,0 +1,1 @@
+"""A mapping proposed for a table whose form is unknown."""

@@ -1,0 +1,143 @@
+"""Import of a table in any of the formats, into the cell that it was measured in."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.readings.covariance import WHOLE, tracker_noise
+from hilcal.readings.readings import Readings
+from hilcal.robot.arm import Arm
+from hilcal.store.plan import UNLOADED
+from hilcal.tables.imported import ImportResult
+from hilcal.tables.ipa_ur10 import read_ipa_ur10
+from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import Mapping, find_mapping, mapping_names
+from hilcal.tables.stated_noise import rounding_variance
+from hilcal.tables.table import FROM_TRACKER, import_table
+from hilcal.toml import suggest
+from hilcal.types import Bools
+
+FORMATS = ("table", "ipa-ur10")
+"""Formats that are read without a mapping."""
+
+
+def import_readings(
+    path: Path,
+    form: str | Path | Mapping,
+    config: CellConfig,
+    arm: Arm,
+    second: Path | None = None,
+) -> ImportResult:
+    """Read a table into a cell.
+
+    Args:
+        path: the table.
+        form: "table" (the exchange table), "ipa-ur10", the name of a mapping that comes with the
+            program, the path of a mapping file, or a mapping.
+        config: the cell: its tracker's noise and place, its gravity, and whether tables include
+            the arm's scatter.
+        arm: its arm.
+        second: the second file of a mapping that is for two.
+
+    Raises:
+        InputError: an unknown format, or anything in the table that cannot be right.
+    """
+    mapping = form if isinstance(form, Mapping) else _mapping(form)
+    tracker = config.tracker
+    noise, station = tracker_noise(tracker), tracker.station_m
+    targets = [target.name for target in config.tool.targets]
+    if mapping is None and second is not None:
+        raise InputError(f"--second {second}: only for a --format with a section [second_file]")
+    if form == "ipa-ur10":
+        result = read_ipa_ur10(path, arm)
+    elif mapping is None:
+        result = import_table(path, arm, noise, station, targets)
+    else:
+        gravity = config.robot.gravity_m_s2
+        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
+    limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
+    where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
+    notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)
+    stated = FROM_TRACKER not in result.notes
+    covers = WHOLE if stated and config.repeatability.in_tables else result.covers
+    copied = _copies(result.readings)
+    notes += _told(result.readings, copied)
+    kept, named = _named_loads(result.readings[~copied], config)
+    stated_noise = stated or tracker.states_noise
+    return ImportResult(kept, (*notes, *named), covers, stated_noise, not stated)
+
+
+def _mapping(form: str | Path) -> Mapping | None:
+    if str(form) in FORMATS:
+        return None
+    names = (*FORMATS, *mapping_names())
+    if str(form) not in names and Path(form).suffix.lower() != ".toml":
+        raise InputError(
+            f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "
+            f"or the path of a mapping file (.toml)"
+        )
+    return find_mapping(form)
+
+
+def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:
+    """Let loads of a table that states no force act as `[[loads]]` has them by name; say which."""
+    s, gravity = readings.states, np.asarray(config.robot.gravity_m_s2)
+    loaded = [k for k in np.unique(readings.load) if readings.load_names[k] != UNLOADED]
+    if s.wrench.any() or not loaded:
+        return readings, ()
+    known = {_plain(load.name): load.wrench(gravity) for load in config.loads}
+    wrench, told = s.wrench.copy(), []
+    for k in loaded:
+        name = readings.load_names[k]
+        own = known.get(_plain(name))
+        where = "is not stated by the table, nor by [[loads]] of the cell: it is taken as none"
+        if own is not None:
+            wrench[readings.load == k] = own
+            where = "is that of [[loads]] of the cell, since the table states none"
+        told.append(f"load {name}: its force {where}")
+    return replace(readings, states=replace(s, wrench=wrench)), tuple(told)
+
+
+def _plain(name: str) -> str:
+    return "".join(name.split()).casefold()
+
+
+def _copies(readings: Readings) -> Bools:
+    """(N,) rows that repeat an earlier one to the last digit: copies, not readings made again.
+
+    A measurement that is repeated scatters. Where positions are rounded to more than their noise,
+    or are those of another cycle, equal ones may be readings, and stay; so do rows whose pose has
+    others that are none.
+    """
+    s, value = readings.states, readings.value
+    rounding = np.sqrt(12.0 * rounding_variance(value[:, :3], 1.0))
+    noise = np.sqrt(np.median(readings.covariance[:, range(3), range(3)], axis=0))
+    none = np.zeros(len(readings), dtype=bool)
+    if s.time is None and np.any(rounding > noise):
+        return none
+    given = [s.time, s.load_time, s.air_temperature]
+    columns = [s.q, s.wrench, value, *(x[:, None] for x in given if x is not None)]
+    names = np.stack([readings.load, readings.cycle, readings.target], axis=1)
+    keys = np.concatenate([*columns, names], axis=1)
+    _, first, of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    copied = first[of.reshape(-1)] != np.arange(len(readings))
+    same = readings.pose == readings.pose[first[of.reshape(-1)]]
+    whole = ~np.isin(readings.pose, readings.pose[~copied])
+    return np.asarray(copied & (same | whole))
+
+
+def _told(readings: Readings, copied: Bools) -> tuple[str, ...]:
+    """Say how many rows are copies, and name the first."""
+    if not copied.any():
+        return ()
+    k = int(np.argmax(copied))
+    name = f"{readings.pose_names[readings.pose[k]]}/{readings.load_names[readings.load[k]]}"
+    return (
+        f"{int(copied.sum())} of {len(copied)} rows are copies of others to the last digit (the "
+        f"first is of {name}): each is counted once, since a reading that is made again scatters; "
+        "take them out of the table",
+    )

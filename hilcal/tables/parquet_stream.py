@@ -1,0 +1,207 @@
+"""Readings of a moving arm that do not fit into memory: a Parquet file, chunk by chunk.
+
+The columns are those of the exchange table, without `pose`, `load` and `cycle`: each row is a
+reading that stands alone. A row group of the file is what one worker reads; it is read in chunks of
+`CHUNK` rows, so that memory does not grow with the file or its row groups.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
+from hilcal.readings.readings import Readings
+from hilcal.robot.arm import Arm
+from hilcal.robot.batch import CHUNK
+from hilcal.tables import checks, columns
+from hilcal.tables.csvfile import CsvTable
+from hilcal.tables.stated_noise import floored, rounding_variance, with_rounding
+from hilcal.tables.table import instrument_covariance, stated_covariance, states_of
+from hilcal.tables.tabular import is_plain, pyarrow_module
+from hilcal.types import Floats
+
+NAMES = ("pose", "load", "cycle")
+"""Columns of the exchange table that a stream may have, and that mean nothing in it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReadingStream:
+    """A Parquet file of readings; nothing of it is held.
+
+    Attributes:
+        path: the file.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where the file has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        columns: that are read.
+        rows: number of rows of each row group.
+        covers: what its covariances cover, `INSTRUMENT` or `WHOLE`.
+        rounding: (3,) variance of the positions' rounding, m².
+    """
+
+    path: Path
+    arm: Arm
+    noise: TrackerNoise | None
+    station: tuple[float, ...] | None
+    columns: tuple[str, ...]
+    rows: tuple[int, ...]
+    covers: str = INSTRUMENT
+    rounding: Floats | None = None
+
+    def __len__(self) -> int:
+        """Return the number of readings."""
+        return sum(self.rows)
+
+    def first_row(self, group: int) -> int:
+        """Return the number of readings before a row group."""
+        return sum(self.rows[:group])
+
+    def chunks(self, group: int) -> Iterator[Readings]:
+        """Yield the readings of a row group, at most `CHUNK` at a time.
+
+        Raises:
+            InputError: a damaged file, or a row that cannot be right, by its number.
+        """
+        row = 1 + self.first_row(group)
+        for table in _tables(self.path, group, self.columns):
+            yield self._readings(table, row)
+            row += table.num_rows
+
+    def _readings(self, found: Any, row: int) -> Readings:
+        rows = np.arange(row, row + found.num_rows)
+        number = {
+            name: _numbers(self.path, name, found.column(k), row)
+            for k, name in enumerate(self.columns)
+        }
+        table = CsvTable(str(self.path), self.columns, rows, {}, number)
+        states = states_of(table, self.arm)
+        value = table.matrix(columns.POSITION)
+        checks.check_positions(table, value, states.q, self.arm)
+        if columns.ROTATION[0] in number:
+            rotation = table.matrix(columns.ROTATION)
+            checks.check_rotations(table, rotation)
+            value = np.hstack([value, rotation])
+        count = len(rows)
+        alone, none = np.arange(count), np.zeros(count, dtype=np.int64)
+        checks.check_wrenches(table, states.wrench, none, ["as recorded"], self.arm)
+        stated = stated_covariance(table, value.shape[1])
+        if stated is None:
+            covariance = instrument_covariance(table, value, self.noise, self.station)
+        else:
+            checks.check_covariances(table, stated)
+            covariance = floored(table, stated, None)[0]
+        if self.rounding is not None:
+            covariance = with_rounding(covariance, self.rounding)[0]
+        return Readings(states, alone, none, none, value, covariance, ("as recorded",), ())
+
+
+def open_stream(
+    path: Path, arm: Arm, noise: TrackerNoise | None, station: tuple[float, ...] | None
+) -> ReadingStream:
+    """Open a Parquet file of readings; only its description and its first rows are read.
+
+    Args:
+        path: the file.
+        arm: the arm that was measured.
+        noise: gives the covariances where the file has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+
+    Raises:
+        InputError: no pyarrow, a damaged or interrupted file, a column that is missing or unknown.
+    """
+    file = _opened(path)
+    header = list(file.schema_arrow.names)
+    # Without the names of poses and loads the header is that of an exchange table.
+    wanted = [*columns.TEXT, *(name for name in header if name not in NAMES)]
+    columns.check_header(str(path), wanted, arm.n, arm.name)
+    if columns.TARGET in header:
+        raise InputError(
+            f"{path}: column '{columns.TARGET}': a stream is of one target; import a table of "
+            "several with `hilcal import`"
+        )
+    columns.covariance_size(str(path), header)
+    known = set(columns.known_columns(arm.n)) - {*NAMES, columns.COVERS}
+    meta = file.metadata
+    rows = tuple(meta.row_group(k).num_rows for k in range(meta.num_row_groups))
+    if not sum(rows):
+        raise InputError(f"{path}: columns but no readings")
+    names = tuple(name for name in header if name in known)
+    for name in names:
+        if not is_plain(kind := file.schema_arrow.field(name).type) or "string" in str(kind):
+            raise InputError(f"{path}: column '{name}' is no column of numbers")
+    stream = ReadingStream(path, arm, noise, station, names, rows)
+    first = next(k for k, count in enumerate(rows) if count)
+    covers = _covers(path, first) if columns.COVERS in header else INSTRUMENT
+    rounding = None
+    if not covers.endswith(ROUNDING):
+        rounding = rounding_variance(next(stream.chunks(first)).value[:, :3], 1.0)
+    covers = covers.removesuffix(ROUNDING)
+    return ReadingStream(path, arm, noise, station, names, rows, covers, rounding)
+
+
+def _opened(path: Path) -> Any:
+    parquet = pyarrow_module(path, "pyarrow.parquet")
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        # pages are read as they are needed: a row group may be larger than the memory
+        return parquet.ParquetFile(path, buffer_size=1 << 20, pre_buffer=False)
+    except Exception as e:  # what a reader makes of a damaged file is not documented
+        raise InputError(
+            f"{path}: not a whole Parquet file ({_words(e)}); its last part is written when "
+            "recording ends: was it interrupted?"
+        ) from e
+
+
+def _tables(path: Path, group: int, names: tuple[str, ...], count: int = CHUNK) -> Iterator[Any]:
+    file = _opened(path)
+    left = file.metadata.row_group(group).num_rows
+    batches = file.iter_batches(count, row_groups=[group], columns=list(names))
+    while left > 0:
+        try:
+            with limits.memory(str(path)):
+                batch = next(batches, None)
+        except InputError:
+            raise
+        except Exception as e:  # as above
+            raise InputError(f"{path}: damaged in row group {group + 1} ({_words(e)})") from e
+        if batch is None:
+            raise InputError(f"{path}: damaged in row group {group + 1} ({left} rows are missing)")
+        left -= batch.num_rows
+        yield batch.select(list(names))
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split())[:80]
+
+
+def _covers(path: Path, group: int) -> str:
+    """What the covariances cover, as the first row says it."""
+    word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
+    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
+        raise InputError(
+            f"{path}: row 1, column '{columns.COVERS}': {word!r} is unknown; valid: {INSTRUMENT}, "
+            f"{WHOLE}, each with {ROUNDING}"
+        )
+    return word
+
+
+def _numbers(path: Path, name: str, column: Any, row: int) -> Floats:
+    """Return a column (N,); refuses what is no finite number, by its row."""
+    try:
+        values = np.asarray(column.to_numpy(zero_copy_only=False), dtype=float)
+    except (TypeError, ValueError) as e:
+        raise InputError(f"{path}: column '{name}' is no column of numbers") from e
+    bad = ~np.isfinite(values)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(
+            f"{path}: row {row + k}, column '{name}': not a finite number; leave out the rows that "
+            "were not read"
+        )
+    return values

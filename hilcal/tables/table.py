@@ -1,0 +1,396 @@
+"""The exchange table: readings as CSV or Parquet, one row per reading."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.names import check_name
+from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
+from hilcal.readings.readings import Readings, States
+from hilcal.robot.arm import Arm
+from hilcal.tables import checks, columns
+from hilcal.tables.csvfile import CsvTable, read_columns
+from hilcal.tables.following import following_columns, with_following
+from hilcal.tables.imported import ImportResult
+from hilcal.tables.stated_noise import LEAST, floored, rounding_variance, with_rounding
+from hilcal.tables.tabular import Column, is_parquet, read_parquet, write_columns
+from hilcal.toml import suggest
+from hilcal.types import Floats, Ints
+
+FROM_TABLE = "covariance: from the table"
+FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
+LONGEST = 1e12
+"""No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
+PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
+
+
+def read_table(
+    path: str | Path,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+    targets: Sequence[str] = (),
+) -> Readings:
+    """Read an exchange table; every unit is SI, every complaint names row and column.
+
+    Args:
+        path: a CSV or Parquet file with the columns of `columns.known_columns`.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where the table has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        targets: names of the cell's targets, see `Cell.target_names`.
+
+    Returns:
+        The readings in the table's order; poses and loads are numbered as they appear.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
+    return import_table(path, arm, noise, station, targets).readings
+
+
+def import_table(
+    path: str | Path,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+    targets: Sequence[str] = (),
+) -> ImportResult:
+    """Read an exchange table as `read_table` does, with notes on where its covariances come from.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
+    path = Path(path)
+    read = read_parquet if is_parquet(path) else read_columns
+    table = read(path, lambda header: _choose(str(path), header, arm))
+    return readings_of(table, arm, noise, station, targets=targets)
+
+
+def readings_of(
+    table: CsvTable,
+    arm: Arm,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None = None,
+    covariance: Floats | None = None,
+    targets: Sequence[str] = (),
+    rounding: Floats | None = None,
+) -> ImportResult:
+    """Check a table with the exchange table's columns, in SI units, and make readings of it.
+
+    Args:
+        table: the parsed columns.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where there are none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        covariance: (N, m, m) in place of the table's columns, checked like them.
+        targets: names of the cell's targets, see `Cell.target_names`.
+        rounding: (3,) variance of the positions' rounding, m²; found from the positions where
+            None. It is added where it counts beside the covariance.
+
+    Raises:
+        InputError: anything that cannot be right.
+    """
+    checks.check_names(table)
+    pose, pose_names = _index(table.text["pose"])
+    load, load_names = _index(table.text["load"])
+    target = _targets(table, targets)
+    states = replace(states_of(table, arm), target=target)
+    checks.check_same_pose(table, pose, pose_names, states.q)
+    checks.check_wrenches(table, states.wrench, load, load_names, arm)
+    value = table.matrix(columns.POSITION)
+    checks.check_positions(table, value, states.q, arm)
+    if columns.ROTATION[0] in table.number:
+        rotation = table.matrix(columns.ROTATION)
+        checks.check_rotations(table, rotation)
+        value = np.hstack([value, rotation])
+    stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
+    notes: tuple[str, ...]
+    if stated is None:
+        cov, notes = instrument_covariance(table, value, noise, station), (FROM_TRACKER,)
+    else:
+        checks.check_covariances(table, stated)
+        tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
+        known = bool(tiny) and noise is not None
+        spec = instrument_covariance(table, value, noise, station) if known else None
+        cov, notes = floored(table, stated, spec)
+        notes = (FROM_TABLE, *notes)
+    covers, included = (INSTRUMENT, False) if stated is None else _covers(table)
+    if rounding is None:
+        rounding = np.zeros(3) if included else rounding_variance(value[:, :3], 1.0)
+    cov, rounded = with_rounding(cov, rounding)
+    readings = Readings(
+        states=states,
+        pose=pose,
+        load=load,
+        cycle=_cycles(table),
+        value=value,
+        covariance=cov,
+        load_names=tuple(load_names),
+        pose_names=tuple(pose_names),
+        target_names=() if target is None else tuple(targets),
+    )
+    return ImportResult(readings, (*notes, *rounded), covers)
+
+
+def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
+    """Check the header; text and number columns to read."""
+    if header and header[0].startswith("Timestamp;"):
+        raise InputError(f"{path}: not an exchange table; looks like --format ipa-ur10")
+    if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
+        raise InputError(
+            f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
+            f"table: {PREVIEW}"
+        )
+    known = columns.known_columns(arm.n)
+    if not any(name in known for name in header):
+        raise InputError(
+            f"{path}: not an exchange table: row 1 has none of its columns "
+            f"({', '.join(columns.required_columns(arm.n))}); for any other table: {PREVIEW}"
+        )
+    columns.check_header(path, header, arm.n, arm.name, following_columns(arm))
+    columns.covariance_size(path, header)
+    optional = (columns.TARGET, columns.COVERS)
+    text = (*columns.TEXT, *(name for name in header if name in optional))
+    return text, [name for name in header if name in known and name not in text]
+
+
+def _index(names: list[str]) -> tuple[Ints, list[str]]:
+    """Numbers of names in order of first appearance, and those names."""
+    order = {name: k for k, name in enumerate(dict.fromkeys(names))}
+    return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
+
+
+def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
+    """(N,) numbers of the targets by the cell's names; None where there is one target.
+
+    Raises:
+        InputError: table and cell name different targets.
+    """
+    given = table.text.get(columns.TARGET)
+    if given is None:
+        if len(names) > 1:
+            raise InputError(
+                f"{table.path}: no column '{columns.TARGET}', but the cell's targets are "
+                f"{', '.join(names)} ([[tool.targets]]); name in each row the one that was read"
+            )
+        return None
+    if "" in given:
+        raise InputError(
+            f"{table.at(given.index(''), columns.TARGET)}: the cell is empty; name the target"
+        )
+    used = list(dict.fromkeys(given))
+    if not names and len(used) > 1:
+        raise InputError(
+            f"{table.path}: column '{columns.TARGET}' names {', '.join(map(repr, used))}, but the "
+            f"cell has one target; give each a section [[tool.targets]] with its name (and "
+            f"target_m, where its offset is known)"
+        )
+    for name in used if names else ():
+        if name not in names:
+            raise InputError(
+                f"{table.at(given.index(name), columns.TARGET)}: target {name!r} is not in the "
+                f"cell's [[tool.targets]]{suggest(name, names)}; valid: {', '.join(names)}"
+            )
+    if len(names) < 2:
+        return None
+    return np.array([names.index(name) for name in given], dtype=np.int64)
+
+
+def _covers(table: CsvTable) -> tuple[str, bool]:
+    """What the table's covariances cover, by its column `covers`, and whether rounding, too.
+
+    Without the column it is the instrument.
+
+    Raises:
+        InputError: another word, or not the same one in all rows.
+    """
+    given = table.text.get(columns.COVERS, [INSTRUMENT])
+    for k, word in enumerate(given):
+        if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
+            raise InputError(
+                f"{table.at(k, columns.COVERS)}: {word!r} is unknown; valid: {INSTRUMENT} (the "
+                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it), each "
+                f"with {ROUNDING} where the rounding of the positions is in it"
+            )
+        if word != given[0]:
+            raise InputError(
+                f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
+                "rows must say the same"
+            )
+    return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
+
+
+def states_of(table: CsvTable, arm: Arm) -> States:
+    """Return the states of a table's rows; raises as `read_table` does."""
+    table = with_following(table, arm)
+    number, n = table.number, arm.n
+    q = table.matrix(columns.joint_columns(n))
+    checks.check_joints(table, columns.joint_columns(n), q, arm)
+    zero = np.zeros(len(q))
+    wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
+    temperature = _group(table, columns.temperature_columns(n))
+    approach = _group(table, columns.approach_columns(n))
+    actual = _group(table, columns.actual_columns(n))
+    if approach is not None:
+        names = columns.approach_columns(n)
+        table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
+    if actual is not None:
+        checks.check_actual_joints(table, columns.actual_columns(n), actual, q)
+    if temperature is not None:
+        _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
+    if "air_degC" in number:
+        _in_range(table, ("air_degC",), -50, 80, "°C")
+    if "time_s" in number:
+        _in_range(table, ("time_s",), -LONGEST, LONGEST, "s")
+    if "load_time_s" in number:
+        _in_range(table, ("load_time_s",), 0, LONGEST, "s")
+    return States(
+        q=q,
+        wrench=wrench,
+        time=number.get("time_s"),
+        load_time=number.get("load_time_s"),
+        air_temperature=number.get("air_degC"),
+        joint_temperature=temperature,
+        approach=approach,
+        q_actual=actual,
+    )
+
+
+def _group(table: CsvTable, names: Sequence[str]) -> Floats | None:
+    return table.matrix(names) if names[0] in table.number else None
+
+
+def _in_range(table: CsvTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
+    value = table.matrix(names)
+    table.refuse(
+        (value < low) | (value > high),
+        names,
+        lambda v: f"{v:g} {unit} cannot be right; expected {low:g} to {high:g} {unit}",
+    )
+
+
+def _cycles(table: CsvTable) -> Ints:
+    if "cycle" not in table.number:
+        return np.zeros(len(table.rows), dtype=np.int64)
+    cycle = table.matrix(("cycle",))
+    wrong = (cycle != np.rint(cycle)) | (np.abs(cycle) > 2**53)
+    table.refuse(wrong, ("cycle",), lambda v: f"{v:g} must be a whole number")
+    return cycle[:, 0].astype(np.int64)
+
+
+def stated_covariance(table: CsvTable, m: int) -> Floats | None:
+    """Covariances (N, m, m) that the table states, None where it states none."""
+    names = columns.covariance_columns(m)
+    if names[0] not in table.number:
+        return None
+    i, j = np.triu_indices(m)
+    cov = np.zeros((len(table.rows), m, m))
+    cov[:, i, j] = cov[:, j, i] = table.matrix(names)
+    return cov
+
+
+def instrument_covariance(
+    table: CsvTable,
+    value: Floats,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None,
+) -> Floats:
+    """Covariances (N, m, m) of the instrument in [tracker]."""
+    m = value.shape[1]
+    if noise is None:
+        names = columns.covariance_columns(m)
+        raise InputError(
+            f"{table.path}: no covariance columns ({names[0]} ... {names[-1]}) and no noise in "
+            f"the section [tracker] of the configuration; give one of them"
+        )
+    origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
+    for k in np.flatnonzero(np.linalg.norm(value[:, :3] - origin, axis=1) < 1e-3)[:1]:
+        raise InputError(
+            f"{table.at(int(k))}: position lies at the tracker's station; set station_m in the "
+            f"section [tracker] of the configuration"
+        )
+    return tracker_covariance(value[:, :3], noise, origin, m)
+
+
+def write_table(
+    readings: Readings,
+    path: str | Path,
+    covers: str = INSTRUMENT,
+    about: Mapping[str, object] | None = None,
+) -> None:
+    """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
+
+    Args:
+        readings: the readings.
+        path: the file; CSV unless it ends in .parquet.
+        covers: what their covariances cover, see `covariance` and `with_what_rounding_does`.
+        about: further metadata of a Parquet file.
+
+    Raises:
+        InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
+    """
+    path = Path(path)
+    found: dict[str, Column] = {
+        "pose": _names(readings.pose_names, readings.pose, "pose"),
+        "load": _names(readings.load_names, readings.load, "load"),
+    }
+    if readings.states.target is not None:
+        found[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
+    if covers != INSTRUMENT:
+        found[columns.COVERS] = [covers] * len(readings)
+    header, numbers = _number_columns(readings)
+    found |= zip(header, numbers, strict=True)
+    write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
+
+
+def with_what_rounding_does(covers: str, readings: Readings) -> str:
+    """Return what complete covariances cover, as the column of that name says it.
+
+    Where reading a table would add the variance of the positions' rounding, it says that this is in
+    them already.
+    """
+    rounding = rounding_variance(readings.value[:, :3], 1.0)
+    return covers + ROUNDING * bool(with_rounding(readings.covariance, rounding)[1])
+
+
+def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
+    used = [names[k] for k in dict.fromkeys(index.tolist())]
+    for name in used:
+        if not check_name(name, what) or name != name.strip():
+            raise InputError(f"{what} {name!r}: a name must be not empty and not padded")
+        if what == "load" and name != "none" and name.lower() == "none":
+            raise InputError(f"load '{name}' must be spelled 'none'")
+    if len(set(used)) < len(used):
+        name = next(name for name in used if used.count(name) > 1)
+        raise InputError(f"{what} '{name}': two of the readings' {what}s have this name")
+    return [names[k] for k in index.tolist()]
+
+
+def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]:
+    """Names and (N,) arrays of the number columns that the readings have."""
+    s, m, n = readings.states, readings.m, readings.states.q.shape[1]
+    i, j = np.triu_indices(m)
+    blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
+        (("cycle",), readings.cycle),
+        (columns.joint_columns(n), s.q),
+        ((columns.POSITION + columns.ROTATION)[:m], readings.value),
+        (columns.covariance_columns(m), readings.covariance[:, i, j]),
+        (columns.WRENCH, s.wrench if np.any(s.wrench) or np.signbit(s.wrench).any() else None),
+        (("time_s",), s.time),
+        (("load_time_s",), s.load_time),
+        (("air_degC",), s.air_temperature),
+        (columns.temperature_columns(n), s.joint_temperature),
+        (columns.approach_columns(n), s.approach),
+        (columns.actual_columns(n), s.q_actual),
+    ]
+    header: list[str] = []
+    numbers: list[Floats | Ints] = []
+    for names, block in blocks:
+        if block is not None:
+            header += names
+            numbers += list(block.reshape(len(readings), len(names)).T)
+    return header, numbers

@@ -1,0 +1,1 @@
+"""Between campaigns: what has changed on an arm, fleets of arms."""

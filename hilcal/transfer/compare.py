@@ -1,0 +1,156 @@
+"""Two campaigns of one arm: the error of the earlier calibration today, and what has changed."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.revisions import mode_of
+from hilcal.config import CellConfig
+from hilcal.diagnosis.change import find_changes
+from hilcal.diagnosis.change_candidates import changing
+from hilcal.diagnosis.comparison import Comparison, error_today
+from hilcal.diagnosis.completed import completed
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.description_words import refuse_misdescribed
+from hilcal.identification.earlier import earlier_fit
+from hilcal.identification.fit import Fit
+from hilcal.identification.parameter_differences import Differences, parameter_differences
+from hilcal.identification.posterior import Posterior
+from hilcal.identification.registration import register
+from hilcal.identification.remeasured import setting
+from hilcal.names import quoted
+from hilcal.readings.readings import Readings
+from hilcal.readings.same_readings import never_fitted
+from hilcal.store.revision import RevisionRecord
+from hilcal.store.stored_priors import CARRIED
+
+
+def compare(
+    run: Campaign,
+    later: Campaign,
+    revision: int | None = None,
+    *,
+    same_setup: bool | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Comparison:
+    """Say what has changed on an arm between two campaigns, and whether it is more than chance.
+
+    >>> with hc.Campaign.open(RUN) as run, hc.Campaign.open(LATER) as later:
+    ...     found = hc.compare(run, later)
+    >>> [(c.candidate.part, c.candidate.effect) for c in found.changes.found]
+    [('joint 2', 'joint_compliance')]
+    >>> found.lacked, found.anew
+    (('joint_tilt_compliance',), True)
+
+    Args:
+        run: the earlier campaign.
+        later: the later one; 15 readings will do.
+        revision: of the earlier campaign; the one in use where None, and the baseline without any.
+        same_setup: whether tracker and base stand as they did; where None, only if both cells
+            configure the same place of the tracker. Else its place is estimated from the later
+            readings.
+        say: takes progress, one line each.
+
+    Raises:
+        InputError: another arm, another scaling than gc, a column or unloaded readings that the
+            earlier model needs, or readings that do not fit the description of the arm.
+        CannotAnswerError: the earlier revision was fitted to all later readings; or they do not
+            determine the tracker's place.
+    """
+    if run.cell.arm.name != later.cell.arm.name:
+        raise InputError(
+            f"{later.path}: another arm ({later.cell.arm.name}) than that of {run.path} "
+            f"({run.cell.arm.name}): its errors differ everywhere; compare campaigns of one arm"
+        )
+    number, fit = run.fit_in_use(say, revision)
+    chosen, shared = _unseen(run, later, fit, number)
+    drawing = _drawn(later, chosen)
+    anew = not (_same_place(run, later) if same_setup is None else same_setup)
+    say("predicting what the earlier calibration leaves")
+    # A model that a diagnosis found to lack nothing that it can name is taken as it is.
+    whole, lacked = completed(
+        fit, () if _judged(run.in_use(revision)) else changing(run.catalogue), say
+    )
+    at = setting(earlier_fit(whole), chosen, anew=anew, cell=later.cell)
+    changes = find_changes(at, say)
+    record = later.in_use()
+    return Comparison(
+        number=number,
+        fit=fit,
+        lacked=lacked,
+        mode=fit.mode,
+        later_mode=None if record is None else mode_of(record),
+        readings=len(later.readings),
+        shared=shared,
+        anew=anew,
+        told=same_setup is not None,
+        tool=_other_keys(run.config, later.config),
+        today=error_today(at, changes, drawing),
+        changes=changes,
+        differences=None if record is None else _differences(fit, later, record, say),
+    )
+
+
+def _differences(
+    fit: Fit, later: Campaign, record: RevisionRecord, say: Callable[[str], None]
+) -> Differences | None:
+    """Compare the parameters of both fits; None where they are tied, or there is nothing to."""
+    if record.parameters_json.get(CARRIED):
+        return None
+    say("comparing the parameters of both fits")
+    try:
+        return parameter_differences(Posterior.of(fit), Posterior.of(later.restore(record)))
+    except (CannotAnswerError, InputError):
+        return None
+
+
+def _judged(record: RevisionRecord | None) -> bool:
+    """Whether a stored diagnosis names no effect that the model lacks."""
+    found: Mapping[str, Any] = {} if record is None else record.result_json.get("diagnose", {})
+    return bool(found.get("verdict", "missing_effect") != "missing_effect")
+
+
+def _unseen(run: Campaign, later: Campaign, fit: Fit, number: int | None) -> tuple[Readings, int]:
+    """Return the later readings that were not fitted, and the number of the others."""
+    there, deflections = later.readings, fit.mode == "deflection"
+    if deflections and there.unloaded.all():
+        raise InputError(
+            f"{later.path}: no loaded reading, and {run.path} was fitted to deflections: they "
+            "cannot be compared; measure with a load, or fit absolute readings: hilcal identify "
+            f"{quoted(run.path)} --readings absolute"
+        )
+    known, fresh = never_fitted(there, fit.readings, deflections)
+    if not fresh.any():
+        model = "the baseline" if number is None else f"revision {number}"
+        raise CannotAnswerError(
+            f"{later.path}: {model} of {run.path} was fitted to all its {len(there)} readings; "
+            "what has changed is seen only in later ones"
+        )
+    return there[fresh], int(known.sum())
+
+
+def _drawn(later: Campaign, readings: Readings) -> float | None:
+    """Rms error of the arm as drawn, m; refuses readings that do not fit its description."""
+    try:
+        registered = register(later.cell, readings)
+    except CannotAnswerError:
+        return None
+    try:
+        refuse_misdescribed(registered, readings)
+    except InputError as error:
+        raise InputError(f"{later.path}: {error}") from None
+    return registered.rms
+
+
+def _same_place(run: Campaign, later: Campaign) -> bool:
+    """Whether both cells configure the same place of the tracker."""
+    one, other = run.cell, later.cell
+    known = one.registration_known and other.registration_known
+    return known and bool(np.allclose(one.registration, other.registration, atol=1e-9))
+
+
+def _other_keys(one: CellConfig, other: CellConfig) -> tuple[str, ...]:
+    before, after = one.tool, other.tool
+    return tuple(k for k in type(before).model_fields if getattr(before, k) != getattr(after, k))

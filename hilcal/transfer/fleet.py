@@ -1,0 +1,128 @@
+"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm."""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.engine.engine import Advance, Engine
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.carried import SAME_M
+from hilcal.readings.same_readings import shared
+from hilcal.transfer.members import (
+    Entry,
+    Failure,
+    Member,
+    entries,
+    member_of,
+    member_with,
+    prints_of,
+)
+from hilcal.transfer.pooled import Pooled, effects_seen, pooled
+
+Counting = Callable[[str, int], AbstractContextManager[Advance]]
+
+
+def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
+    """Show no progress."""
+    return nullcontext(lambda step: None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fleet:
+    """What is known of a fleet.
+
+    Attributes:
+        types: by type of arm; those that were pooled.
+        members: the campaigns that were used.
+        failures: those that were not, and types that could not be pooled.
+    """
+
+    types: tuple[Pooled, ...]
+    members: tuple[Member, ...]
+    failures: tuple[Failure, ...]
+
+
+def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Fleet:
+    """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
+
+    Nothing is stored in them. A campaign that fails is listed with its reason; so is one whose arm
+    is described otherwise than the first of its type.
+
+    Args:
+        directory: with campaign files.
+        engine: what they are fitted on.
+        counting: shows how far it is, as `present.progress.counting` does.
+
+    Raises:
+        InputError: no directory, no campaigns, or two of the same readings, which would count
+            twice: copies, or one and its extension.
+        CannotAnswerError: no type of which anything can be said.
+    """
+    listed = entries(directory)
+    if same := shared(engine.map(prints_of, listed)):
+        one, other = sorted(listed[k].name for k in same)
+        raise InputError(
+            f"{directory}: {one} and {other} have readings in common: one measurement counts "
+            "once; leave one of them out"
+        )
+    with counting("campaigns", len(listed)) as advance:
+        results = engine.map(member_of, listed, advance=advance)
+    failures = [r for r in results if isinstance(r, Failure)]
+    kinds: dict[str, list[tuple[Entry, Member]]] = {}
+    for entry, result in zip(listed, results, strict=True):
+        if isinstance(result, Failure):
+            continue
+        of = kinds.setdefault(result.type, [])
+        if of and not _alike(of[0][1], result):
+            why = f"its {result.type} has other nominal links than that of {of[0][1].name}"
+            failures.append(Failure(result.name, why))
+            continue
+        of.append((entry, result))
+    types, members = [], []
+    for kind, of in kinds.items():
+        try:
+            found, mine, lost = _type(of, engine, counting)
+        except CannotAnswerError as error:
+            failures.append(Failure(f"type {kind}", str(error)))
+            members += [member for _, member in of]
+            continue
+        types.append(found)
+        members += mine
+        failures += lost
+    if not types:
+        first = failures[0]
+        more = f" ({len(failures) - 1} more)" if len(failures) > 1 else ""
+        raise CannotAnswerError(
+            f"{directory}: nothing can be pooled: {first.name}: {first.reason}{more}"
+        )
+    return Fleet(tuple(types), tuple(members), tuple(failures))
+
+
+def _alike(a: Member, b: Member) -> bool:
+    one, other = a.posterior.links, b.posterior.links
+    return one.shape == other.shape and bool(np.abs(one - other).max() <= SAME_M)
+
+
+def _type(
+    of: list[tuple[Entry, Member]], engine: Engine, counting: Counting
+) -> tuple[Pooled, list[Member], list[Failure]]:
+    """Pool a type; campaigns that lack a trait of it are fitted again with it."""
+    members = [member for _, member in of]
+    seen = effects_seen(members)
+    traits = tuple(s.effect for s in seen if s.kind == "trait")
+    lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
+    lost: list[Failure] = []
+    if traits and lacking:
+        run = partial(member_with, effects=traits)
+        with counting(f"campaigns again, with {', '.join(traits)}", len(lacking)) as advance:
+            again = engine.map(run, [of[k][0] for k in lacking], advance=advance)
+        for k, result in zip(lacking, again, strict=True):
+            if isinstance(result, Failure):
+                lost.append(replace(result, reason=f"with {', '.join(traits)}: {result.reason}"))
+            else:
+                members[k] = replace(result, added=members[k].added)
+    return pooled(members, seen), members, lost

@@ -1,0 +1,358 @@
+"""What the campaigns of arms of one type have in common, and what is unlike: see `hierarchy`.
+
+Effects that at least `COMMON` of the arms have are estimated together; parameters with a strength
+of their own (shrunk families) are not pooled. A parameter enters where at least two arms determine
+it. Time is in years since the arm's first campaign.
+"""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.stats import norm
+
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.posterior import LearntEffect, Posterior, Source
+from hilcal.readings.ranges import Range
+from hilcal.regression.hierarchy import (
+    FALSE_ALARM,
+    UNDETERMINED,
+    Found,
+    Hierarchy,
+    Unlike,
+    hierarchy,
+    unlike,
+)
+from hilcal.regression.schur import schur_complement
+from hilcal.store.revision import seconds_of, utc_now
+from hilcal.transfer.members import Member
+from hilcal.types import Floats
+
+COMMON = 0.5
+"""Share of the arms that have an effect from which on it is taken as a trait of the type; a
+choice."""
+RARE = 0.1
+"""Share up to which it is taken as a defect of single arms; a choice."""
+FEWEST_ARMS = 3
+"""Arms without which nothing can be said of a type; a choice: two have no spread."""
+YEAR_S = 365.25 * 86400.0
+
+
+@dataclass(frozen=True, slots=True)
+class Odd:
+    """A parameter of one arm that is unlike those of the others of its type.
+
+    Attributes:
+        arm: which arm.
+        campaign: in which campaign, where it is a change of the arm; empty where it is the arm.
+        parameter: "effect.parameter".
+        off: by how much, SI.
+        unit: its unit.
+        sigma: the same in standard deviations of what the other arms let expect.
+        p_value: of that among all that were looked at.
+    """
+
+    arm: str
+    campaign: str
+    parameter: str
+    off: float
+    unit: str
+    sigma: float
+    p_value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """One parameter of a type, SI.
+
+    Attributes:
+        parameter: "effect.parameter".
+        unit: its unit.
+        mean: μ of the type.
+        mean_std: its standard uncertainty.
+        between: standard deviation from arm to arm.
+        between_std: its standard error.
+        within: standard deviation from campaign to campaign of an arm; None where none was
+            measured twice.
+        per_year: β, common drift; None where no arm was measured at two times.
+        per_year_std: its standard uncertainty.
+    """
+
+    parameter: str
+    unit: str
+    mean: float
+    mean_std: float
+    between: float
+    between_std: float
+    within: float | None
+    per_year: float | None
+    per_year_std: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """An effect that diagnoses added.
+
+    Attributes:
+        effect: its name.
+        arms: the arms that have it.
+        of: number of arms.
+        kind: "trait" of the type, "defect" of single arms, or "some".
+    """
+
+    effect: str
+    arms: tuple[str, ...]
+    of: int
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pooled:
+    """What is known of arms of one type.
+
+    Attributes:
+        type: its name.
+        arms: names of the arms.
+        campaigns: names of the campaigns.
+        parameters: the pooled parameters.
+        odd: what is unlike, the arms' first, most certain first.
+        seen: effects that diagnoses added, most frequent first.
+        wear: parameters whose common drift is certain.
+        prior: what to expect of another arm.
+        off: (A, K) each arm's parameters minus the mean of the type, SI.
+        off_std: (A, K) their standard uncertainties; infinite where an arm did not determine one.
+    """
+
+    type: str
+    arms: tuple[str, ...]
+    campaigns: tuple[str, ...]
+    parameters: tuple[Spread, ...]
+    odd: tuple[Odd, ...]
+    seen: tuple[Seen, ...]
+    wear: tuple[str, ...]
+    prior: Posterior
+    off: Floats
+    off_std: Floats
+
+
+def effects_seen(members: Sequence[Member]) -> tuple[Seen, ...]:
+    """Return the effects that diagnoses added, and on how many arms."""
+    arms: dict[str, list[str]] = {}
+    for m in members:
+        for name in m.added:
+            arms.setdefault(name, []).append(m.arm)
+    count = len({m.arm for m in members})
+    found = []
+    for name, of in arms.items():
+        some = tuple(dict.fromkeys(of))
+        share = len(some) / count
+        kind = "trait" if share >= COMMON else "defect" if share <= RARE else "some"
+        found.append(Seen(name, some, count, kind))
+    return tuple(sorted(found, key=lambda s: -len(s.arms)))
+
+
+def pooled(members: Sequence[Member], seen: Sequence[Seen]) -> Pooled:
+    """Pool the campaigns of arms of one type.
+
+    Args:
+        members: of one type; effects that are traits are in all their models.
+        seen: effects that diagnoses added.
+
+    Raises:
+        CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
+    """
+    first = members[0].posterior
+    arms = tuple(dict.fromkeys(m.arm for m in members))
+    if len(arms) < FEWEST_ARMS:
+        raise CannotAnswerError(
+            f"{len(arms)} arms of the type {members[0].type}: two have no spread; give campaigns "
+            f"of at least {FEWEST_ARMS} arms, better 10"
+        )
+    effects, names = _common(members)
+    if not names:
+        raise CannotAnswerError(
+            f"no parameter of an arm of the type {first.arm} is determined by campaigns of two arms"
+        )
+    scale = _per_name(members, names, "scale")
+    found = _found(members, arms, names, scale)
+    h, unlike_arms = hierarchy(found)
+    odd = [_odd(o, arms[o.unit], "", names, scale, members) for o in unlike_arms]
+    odd += _changed(members, found, arms, h, names, scale)
+    years = np.sqrt(np.diag(h.covariance)[len(names) :])
+    certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
+    timed = bool(np.any(h.slope != 0))
+    units = _units(members)
+    spreads = [
+        Spread(
+            parameter=name,
+            unit=units[name],
+            mean=float(h.mu[k] * scale[k]),
+            mean_std=float(np.sqrt(h.covariance[k, k]) * scale[k]),
+            between=float(np.sqrt(h.between[k]) * scale[k]),
+            between_std=float(h.between_std_error[k] * scale[k]),
+            within=float(np.sqrt(h.within[k]) * scale[k]) if found.repeated else None,
+            per_year=float(h.slope[k] * scale[k]) if timed else None,
+            per_year_std=float(years[k] * scale[k]) if timed else None,
+        )
+        for k, name in enumerate(names)
+    ]
+    return Pooled(
+        type=members[0].type,
+        arms=arms,
+        campaigns=tuple(m.name for m in members),
+        parameters=tuple(spreads),
+        odd=tuple(odd),
+        seen=tuple(seen),
+        wear=tuple(n for n, p in zip(names, certain, strict=True) if timed and p < FALSE_ALARM),
+        prior=_prior(members, effects, names, scale, units, h, len(arms)),
+        off=(h.arm_mean - h.mu) * scale,
+        off_std=np.where(h.arm_variance < UNDETERMINED**2, np.sqrt(h.arm_variance) * scale, np.inf),
+    )
+
+
+def _common(members: Sequence[Member]) -> tuple[tuple[LearntEffect, ...], tuple[str, ...]]:
+    """Effects that most campaigns have, with the same options, and their parameters to pool."""
+    count = Counter(e.name for m in members for e in m.posterior.effects)
+    effects = []
+    for name, n in count.items():
+        of = [e for m in members for e in m.posterior.effects if e.name == name]
+        if n >= COMMON * len(members) and all(e.options == of[0].options for e in of):
+            effects.append(of[0])
+    known = {e.name for e in effects}
+    arms: dict[str, set[str]] = {}
+    for m in members:
+        p = m.posterior
+        for name, std, own in zip(p.names, p.std, p.own_precision, strict=True):
+            if name.split(".", 1)[0] in known and own == 0 and np.isfinite(std):
+                arms.setdefault(name, set()).add(m.arm)
+    order = dict.fromkeys(name for m in members for name in m.posterior.names)
+    names = tuple(name for name in order if len(arms.get(name, ())) > 1)
+    used = {name.split(".", 1)[0] for name in names}
+    return tuple(e for e in effects if e.name in used), names
+
+
+def _per_name(members: Sequence[Member], names: Sequence[str], field: str) -> Floats:
+    values: dict[str, float] = {}
+    for m in members:
+        values |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
+    return np.array([values[name] for name in names], dtype=float)
+
+
+def _units(members: Sequence[Member]) -> dict[str, str]:
+    found: dict[str, str] = {}
+    for m in members:
+        found |= dict(zip(m.posterior.names, m.posterior.units, strict=True))
+    return found
+
+
+def _found(
+    members: Sequence[Member], arms: Sequence[str], names: Sequence[str], scale: Floats
+) -> Found:
+    """The members' parameters in ordinary magnitudes; others than `names` marginalised out."""
+    k = len(names)
+    mean, information = np.zeros((len(members), k)), np.zeros((len(members), k, k))
+    place = {name: i for i, name in enumerate(names)}
+    for c, m in enumerate(members):
+        p = m.posterior
+        mine = np.array([i for i, name in enumerate(p.names) if name in place], dtype=np.int64)
+        at = np.array([place[p.names[i]] for i in mine], dtype=np.int64)
+        scaled = p.information * (p.scale[:, None] * p.scale)
+        information[c][np.ix_(at, at)] = schur_complement(scaled, mine)
+        mean[c, at] = p.mean[mine] / scale[at]
+    seconds = np.array([seconds_of(m.date) for m in members])
+    arm = np.array([arms.index(m.arm) for m in members])
+    begun = np.full(len(arms), np.inf)
+    np.minimum.at(begun, arm, seconds)
+    return Found(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
+
+
+def _changed(
+    members: Sequence[Member],
+    found: Found,
+    arms: Sequence[str],
+    h: Hierarchy,
+    names: Sequence[str],
+    scale: Floats,
+) -> list[Odd]:
+    """Campaigns in which an arm has changed since its campaign before, unlike other arms."""
+    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(len(names)))
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    after, change, spread = [], [], []
+    for a in range(len(arms)):
+        mine = np.flatnonzero(found.arm == a)
+        mine = mine[np.argsort(found.time[mine], kind="stable")]
+        for before, now in pairwise(mine):
+            years = found.time[now] - found.time[before]
+            after.append(int(now))
+            change.append(found.mean[now] - found.mean[before] - years * h.slope)
+            spread.append(variance[now] + variance[before])
+    if not after:
+        return []
+    worst = unlike(np.array(change), np.array(spread))
+    return [
+        _odd(
+            o,
+            members[after[o.unit]].arm,
+            members[after[o.unit]].name,
+            names,
+            scale,
+            members,
+        )
+        for o in worst
+    ]
+
+
+def _odd(
+    o: Unlike,
+    arm: str,
+    campaign: str,
+    names: Sequence[str],
+    scale: Floats,
+    members: Sequence[Member],
+) -> Odd:
+    name = names[o.parameter]
+    off = float(o.off * scale[o.parameter])
+    return Odd(arm, campaign, name, off, _units(members)[name], o.sigma, o.p_value)
+
+
+def _prior(
+    members: Sequence[Member],
+    effects: tuple[LearntEffect, ...],
+    names: tuple[str, ...],
+    scale: Floats,
+    units: dict[str, str],
+    h: Hierarchy,
+    arms: int,
+) -> Posterior:
+    """What to expect of another arm: N(μ, Cov μ + τ² + ω²)."""
+    information = np.linalg.inv(h.predictive)
+    information = (information + information.T) / 2
+    low: dict[tuple[str, str], tuple[float, float]] = {}
+    for m in members:
+        for r in m.posterior.ranges:
+            a, b = low.get((r.variable, r.unit), (np.inf, -np.inf))
+            low[r.variable, r.unit] = min(a, r.low), max(b, r.high)
+    first = members[0].posterior
+    modes = Counter(m.posterior.mode for m in members)
+    return Posterior(
+        arm=first.arm,
+        links=first.links,
+        mode=modes.most_common(1)[0][0],
+        effects=effects,
+        names=names,
+        units=tuple(units[name] for name in names),
+        scale=scale,
+        mean=h.mu * scale,
+        information=information / (scale[:, None] * scale),
+        own_precision=np.zeros(len(names)),
+        scatter=None,
+        ranges=tuple(Range(v, u, a, b) for (v, u), (a, b) in low.items()),
+        prints=np.concatenate([m.posterior.prints for m in members]),
+        source=Source(
+            campaign=f"{len(members)} campaigns of {arms} arms of the type {first.arm}",
+            created=utc_now(),
+            n_readings=sum(m.posterior.source.n_readings for m in members),
+        ),
+    )

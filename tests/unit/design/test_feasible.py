@@ -1,0 +1,316 @@
+"""Candidate poses: none ever breaks a limit, and what leaves nothing is named."""
+
+import re
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hilcal.cell import cell_from_config, tracker_place
+from hilcal.config import CellConfig
+from hilcal.design.draw import draw
+from hilcal.design.feasible import PLANNED, REASONS, Space
+from hilcal.errors import CannotAnswerError
+from hilcal.store.plan import UNLOADED
+from tests.support.space_cases import (
+    TABLE,
+    along,
+    boxes,
+    cell,
+    conditioning,
+    drawn_of,
+    frames,
+    gap,
+    gap_to,
+    hung,
+    place,
+    placed,
+    self_gap,
+    space_of,
+    torques,
+)
+
+cells = st.fixed_dictionaries(
+    {
+        "robot": st.sampled_from(["ur3e", "ur5e", "ur10e", "ur16e", "ur20"]).map(
+            lambda m: {"model": m}
+        ),
+        "obstacles": boxes.map(lambda box: [TABLE, box]),
+        "limits": st.builds(
+            lambda margin, low, share: {
+                "joint_margin_rad": margin,
+                "workspace_min_m": [-1.5, -1.5, low],
+                "workspace_max_m": [1.5, 1.5, 2.0],
+                "torque_share": share,
+            },
+            st.floats(0.0, 0.5),
+            st.floats(-0.2, 0.2),
+            st.floats(0.2, 0.7),
+        ),
+        "sight": st.builds(
+            lambda at, normal, most: {
+                "tracker_m": at,
+                "target_normal": normal,
+                "incidence_max_rad": most,
+            },
+            place,
+            st.sampled_from([None, [0.0, 0.0, 1.0], [1.0, 0.5, 0.2]]),
+            st.floats(0.4, 1.5),
+        ),
+        "loads": st.builds(
+            lambda mass, hang, pull, cable: [
+                {"name": "weight", "mass_kg": mass, "hang_m": hang},
+                {"name": "pull", "force_N": list(pull), "cable_m": cable},
+            ],
+            st.floats(0.5, 2.5),
+            st.floats(0.05, 0.5),
+            st.tuples(*[st.floats(10.0, 40.0)] * 3),
+            st.floats(0.0, 0.6),
+        ),
+    }
+)
+
+
+@settings(max_examples=12, deadline=None)
+@given(cells, st.integers(0, 99))
+def test_no_candidate_ever_breaks_a_limit(sections: dict[str, Any], seed: int) -> None:
+    """Each limit is looked at by other means than the planner's."""
+    config = cell(**sections)
+    space = space_of(config)
+    try:
+        drawn = draw(space, 15, np.random.default_rng(seed))
+    except CannotAnswerError:
+        return
+    assert drawn.loads == (UNLOADED, "weight", "pull")
+    assert drawn.allowed[:, 0].all()
+    for q, allowed in zip(drawn.q, drawn.allowed, strict=True):
+        _geometry(config, space, q)
+        for name, may in zip(drawn.loads, allowed, strict=True):
+            if may:
+                _under_load(config, space, q, name)
+
+
+def _geometry(config: CellConfig, space: Space, q: np.ndarray) -> None:
+    arm, limits, the_cell = space.cell.arm, config.limits, space.cell
+    low, high = arm.q_min + limits.joint_margin_rad, arm.q_max - limits.joint_margin_rad
+    assert np.all(q >= low)
+    assert np.all(q <= high)
+    at, parts = frames(arm, q), space.shapes.scene.parts
+    flange = at[-1]
+    for offset in (np.zeros(3), the_cell.target[:3, 3], the_cell.load_point):
+        point = flange[:3, :3] @ offset + flange[:3, 3]
+        assert np.all(point > limits.workspace_min_m)
+        assert np.all(point < limits.workspace_max_m)
+    assert self_gap(parts, at) > 0.01 - 1e-9
+    for part in parts:
+        points = placed(part, at)
+        if part.body > 2:
+            assert np.all(points.min(axis=0) - part.radius > limits.workspace_min_m)
+            assert np.all(points.max(axis=0) + part.radius < limits.workspace_max_m)
+        for thing in config.obstacles if part.body > 1 else ():
+            assert gap_to(thing, points) - part.radius > 0.02 - 1e-9
+    assert conditioning(arm, q) >= config.planning.singularity * (1 - 1e-6)
+    if config.sight.target_normal is not None:
+        tracker = np.array(config.sight.tracker_m)
+        way = tracker - (flange[:3, :3] @ the_cell.target[:3, 3] + flange[:3, 3])
+        looks = flange[:3, :3] @ np.array(config.sight.target_normal)
+        cosine = looks @ way / np.linalg.norm(looks) / np.linalg.norm(way)
+        assert np.arccos(cosine) <= config.sight.incidence_max_rad + 1e-9
+
+
+def _under_load(config: CellConfig, space: Space, q: np.ndarray, name: str) -> None:
+    arm, the_cell = space.cell.arm, space.cell
+    at, parts = frames(arm, q), space.shapes.scene.parts
+    load = next((x for x in config.loads if x.name == name), None)
+    force = np.zeros(3) if load is None else load.wrench(the_cell.gravity)[:3]
+    most = config.limits.torque_share * np.asarray(arm.torque_max)
+    assert np.all(np.abs(torques(the_cell, q, force)) <= most)
+    assert the_cell.tool_mass + (0.0 if load is None else load.mass_kg) <= arm.payload
+    flange = at[-1]
+    target = flange[:3, :3] @ the_cell.target[:3, 3] + flange[:3, 3]
+    tracker = np.array(config.sight.tracker_m)
+    way = tracker - target
+    beam = along(tracker, target + 0.09 * way / np.linalg.norm(way))
+    clear = config.sight.clearance_m
+    for part in parts:
+        if not part.name.startswith("tool at"):
+            assert gap(placed(part, at), beam) > part.radius + clear - 1e-9
+    for thing in config.obstacles:
+        assert gap_to(thing, beam) > clear - 1e-9 or gap_to(thing, tracker[None]) <= clear
+    for points, radius in [] if load is None else hung(the_cell, space.shapes, q, name):
+        assert gap(points, beam) > radius + clear - 1e-9
+        assert np.all(points.min(axis=0) - radius > config.limits.workspace_min_m)
+        assert np.all(points.max(axis=0) + radius < config.limits.workspace_max_m)
+        for thing in config.obstacles:
+            assert gap_to(thing, points) > radius + 0.02 - 1e-9
+        for part in parts:
+            if part.body < arm.n:
+                assert gap(placed(part, at), points) > part.radius + radius + 0.02 - 1e-9
+
+
+def test_enough_candidates_under_every_load_the_same_again_from_the_seed() -> None:
+    config = cell(obstacles=[TABLE])
+    drawn = drawn_of(config, 300)
+    assert drawn.q.shape == (300, 6)
+    assert drawn.allowed.shape == (300, 3)
+    assert np.all(drawn.allowed.mean(axis=0) > [0.99, 0.2, 0.5])
+    np.testing.assert_array_equal(drawn.q, drawn_of(config, 300).q)
+    assert not np.array_equal(drawn.q, drawn_of(config, 300, seed=1).q)
+    left = list(drawn.left.values())
+    assert left == sorted(left, reverse=True)
+    assert left[-1] >= 300
+    spread = drawn.q.std(axis=0) / (drawn.q.max(axis=0) - drawn.q.min(axis=0))
+    assert np.all(spread > 0.1)
+
+
+def test_states_that_are_given_come_first() -> None:
+    config = cell(obstacles=[TABLE])
+    some = drawn_of(config, 5).q
+    bad = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])
+    again = drawn_of(config, 20, seed=4, also=np.vstack([some, bad]))
+    np.testing.assert_array_equal(again.q[:5], some)
+    assert not np.any(np.all(again.q == bad, axis=1))
+    turned = some + 2 * np.pi * np.eye(6)[5]  # within the arm's range, beyond the half turn
+    assert not np.any(again.q[:, 5] > np.pi)
+    assert len(drawn_of(config, 5, also=turned).q) == 5
+    assert not np.any(drawn_of(config, 5, also=turned).q[:, 5] > np.pi)
+
+
+def test_reasons_are_told_one_by_one_in_order() -> None:
+    config = cell(obstacles=[TABLE], sight={"tracker_m": [-3.0, 0.0, 1.0]})
+    space = space_of(config)
+    q = np.random.default_rng(0).uniform(-3.0, 3.0, (300, 6))
+    told = space.reasons(q, "5kg")
+    assert list(told) == list(REASONS)
+    np.testing.assert_array_equal(np.all(list(told.values()), axis=0), space.allowed(q, "5kg"))
+    assert told["payload"].all()
+    for reason in ("self-collision", "obstacle", "singularity", "sight", "hanging"):
+        assert 0 < told[reason].sum() < 300
+
+
+NOTHING = {
+    "no visible pose": (
+        {
+            "sight": {
+                "tracker_m": [3, 0, 0],
+                "target_normal": [0, 0, 1],
+                "incidence_max_rad": 1e-4,
+            },
+            "limits": {"workspace_min_m": [-1.0, -1.0, 0.1]},
+        },
+        r"no pose: of [\d,]+ drawn states [\d,]+ keep workspace and floor, 0 turn the target "
+        r"to the tracker \(\[sight\] incidence_max_rad",
+    ),
+    "a wall before the tracker": (
+        {
+            "sight": {"tracker_m": [3.0, 0.0, 0.5]},
+            "obstacles": [{"name": "wall", "center_m": [2, 0, 0], "size_m": [0.1, 20, 20]}],
+        },
+        r"0 leave the beam free \(\[sight\] clearance_m, \[\[obstacles\]\]",
+    ),
+    "a box that is too small": (
+        {"limits": {"workspace_min_m": [0.3, 0.3, 0.3], "workspace_max_m": [0.32, 0.32, 0.32]}},
+        r"no pose: of 32,768 drawn states 0 keep workspace and floor \(\[limits\] workspace_min_m",
+    ),
+    "walled in": (
+        {"obstacles": [{"name": "block", "center_m": [0, 0, 1], "size_m": [4, 4, 4]}]},
+        r"0 are clear of obstacles \(.+ and block touch in \d+ % of the others; look at \[\[obst",
+    ),
+    "no regular pose": ({"planning": {"singularity": 0.9}}, r"0 are not singular \(\[planning\] "),
+    "weak": ({"limits": {"torque_share": 0.001}}, r"0 keep the joint torques \(\[limits\] torque_"),
+    "a tool too heavy": (
+        {"tool": {"mass_kg": 13.0}},
+        r"0 keep the payload \(\[tool\] mass_kg",
+    ),
+    "no range": ({"limits": {"joint_margin_rad": 3.2}}, "joint_margin_rad leaves joint 1 no range"),
+    "payload too large": (
+        {"loads": [{"name": "20kg", "mass_kg": 20.0}]},
+        r'load "20kg": tool and load are 20.8 kg; the payload of ur10e is 12.5 kg',
+    ),
+    "all loads too large": (
+        {"loads": [{"name": f"{m} kg", "mass_kg": m} for m in (20.0, 30.0)]},
+        r'load "20.0 kg": tool and load are 20.8 kg.*; load "30.0 kg": tool and load are 30.8',
+    ),
+    "a cable too long": (
+        {"loads": [{"name": "down", "force_N": [0.0, 0.0, -50.0], "cable_m": 5.0}]},
+        r'load "down": no pose: of [\d,]+ feasible poses 0 let what hangs or pulls hang free '
+        r"\(\[\[loads\]\] hang_m",
+    ),
+    "a sensor too weak": (
+        {
+            "loads": [{"name": "10kg", "mass_kg": 10.0}],
+            "force_sensor": {"driver": "x", "port": "y", "max_force_N": 50.0},
+        },
+        r'load "10kg": no pose: .* 0 keep the force sensor\'s range \(\[force_sensor\]',
+    ),
+}
+
+
+@pytest.mark.parametrize(("sections", "message"), NOTHING.values(), ids=NOTHING.keys())
+def test_what_leaves_nothing_is_named(sections: dict[str, Any], message: str) -> None:
+    with pytest.raises(CannotAnswerError, match=message) as raised:
+        drawn_of(cell(**sections))
+    assert raised.value.exit_code == 4
+    assert "\n" not in str(raised.value)
+
+
+def test_bodies_that_touch_are_named_with_what_to_look_at() -> None:
+    c = cell()
+    space = Space(cell_from_config(c), c, replace(PLANNED, itself=3.0))
+    with pytest.raises(CannotAnswerError) as raised:
+        draw(space, 10, np.random.default_rng(0))
+    assert re.search(
+        r"0 do not touch themselves \(\w.* and \w.* touch in \d+ % of the others; look at \[tool\] "
+        r"target_m, load_point_m",
+        str(raised.value),
+    )
+
+
+def test_too_few_is_told_by_what_takes_most() -> None:
+    sight = {"tracker_m": [3, 0, 0.5], "target_normal": [0, 0, 1], "incidence_max_rad": 0.05}
+    with pytest.raises(CannotAnswerError, match=r"only \d+ poses, 5,000 are needed: .* turn the t"):
+        drawn_of(cell(sight=sight), 5000, least=5000, most=1 << 16)
+
+
+def test_one_load_that_cannot_be_hung_is_a_remark() -> None:
+    loads = [{"name": "20kg", "mass_kg": 20.0}, {"name": "2kg", "mass_kg": 2.0}]
+    drawn = drawn_of(cell(loads=loads), 30)
+    assert not drawn.allowed[:, 1].any()
+    assert drawn.allowed[:, 2].any()
+    assert any('load "20kg": tool and load are 20.8 kg' in line for line in drawn.remarks)
+
+
+def test_where_the_tracker_stands() -> None:
+    """Of a registration: T_sensor_base maps base into tracker coordinates."""
+    known = {"base_xyz_m": [2.0, 1.0, -0.5], "base_rotvec_rad": [0.0, 0.0, np.pi / 2]}
+    config = cell(tracker=known)
+    # the tracker's origin p: R p + t = 0 with R a quarter turn
+    at = tracker_place(cell_from_config(config), config)
+    np.testing.assert_allclose(at, [-1.0, 2.0, 0.5], atol=1e-12)
+    for sections, told in (
+        ({"tracker": {"frame": "base", "station_m": [1, 2, 3]}}, [1, 2, 3]),
+        ({"tracker": {"frame": "base"}, "sight": {"tracker_m": [3, 2, 1]}}, [3, 2, 1]),
+        ({"sight": {"tracker_m": [3, 2, 1]}}, [3, 2, 1]),
+        ({}, None),
+        ({"tracker": {"frame": "base"}}, None),
+    ):
+        config = cell(**sections)
+        at = tracker_place(cell_from_config(config), config)
+        assert (at is None) == (told is None)
+        assert told is None or np.array_equal(at, told)
+    assert any("tracker's place is not known" in line for line in drawn_of(cell(), 5).remarks)
+
+
+def test_the_floor_of_a_plan_hides_no_tracker_below_it() -> None:
+    limits = {"workspace_min_m": [-2.0, -2.0, 0.1]}
+    config = cell(limits=limits, sight={"tracker_m": [2.5, 0.0, -0.5]})
+    assert len(drawn_of(config, 30).q) == 30
+
+
+def test_a_tripod_under_the_tracker_is_not_in_its_way() -> None:
+    tripod = {"name": "tripod", "bottom_m": [2.5, 0.0, -1.0], "radius_m": 0.4, "height_m": 1.8}
+    config = cell(obstacles=[TABLE, tripod], sight={"tracker_m": [2.5, 0.0, 0.8]})
+    assert len(drawn_of(config, 30).q) == 30

@@ -1,0 +1,95 @@
+"""Goals of a campaign: what can be asked for, and when it is met."""
+
+import numpy as np
+import pytest
+
+from hilcal.design.goal import figures, parse_goal
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from tests.support.campaigns import campaign
+
+UNITS = {"joint_compliance.j1": "rad/(N·m)", "joint_compliance.j3": "rad/(N·m)"}
+VALUES = {"joint_compliance.j1": 2e-5, "joint_compliance.j3": -1e-5, "base_frame.x": 0.0}
+STDS = {"joint_compliance.j1": 3e-7, "joint_compliance.j3": 2.5e-7, "base_frame.x": 1e-5}
+
+
+@pytest.mark.parametrize(
+    ("text", "met", "ratio", "worst"),
+    [
+        ("joint std < 2 %", False, 1.25, "joint_compliance.j3"),
+        ("joint std<3%", True, 2.5 / 3, "joint_compliance.j3"),
+        ("j1 std < 2 %", True, 0.75, "joint_compliance.j1"),
+        ("joint_compliance.j3 std < 1e-7 rad/(N·m)", False, 2.5, "joint_compliance.j3"),
+        ("j3 std <= 5e-7 rad/Nm", True, 0.5, "joint_compliance.j3"),
+        ("joint_compliance std ≤ 6e-7 rad/(N*m)", True, 0.5, "joint_compliance.j1"),
+        ("base_frame.x std < 20 um", True, 0.5, "base_frame.x"),
+        ("base_frame std < 0.005 mm", False, 2.0, "base_frame.x"),
+        ("base_frame std < 1 %", False, np.inf, "base_frame.x"),
+        ("position std < 20 um", True, 0.6, "position"),
+        ("position std < 0.01 mm", False, 1.2, "position"),
+    ],
+)
+def test_a_goal_is_met_by_the_worst_of_it(text, met, ratio, worst):
+    v = parse_goal(text).met(STDS, VALUES, 12e-6)
+    assert (v.met, v.worst) == (met, worst)
+    assert v.ratio == pytest.approx(ratio)
+
+
+def test_a_verdict_says_how_far_it_is():
+    v = parse_goal("joint std < 2 %").met(STDS, VALUES)
+    assert (v.unit, v.std) == ("%", pytest.approx(2.5))
+    v = parse_goal("j1 std < 1e-6 rad/(N·m)").met(STDS, VALUES)
+    assert (v.unit, v.std) == ("rad/(N·m)", pytest.approx(3e-7))
+
+
+@pytest.mark.parametrize("bad", [np.inf, np.nan])
+def test_what_is_not_identifiable_never_meets_a_goal(bad):
+    for text in ("joint std < 90 %", "joint std < 1 rad/(N·m)"):
+        v = parse_goal(text).met({**STDS, "joint_compliance.j1": bad}, VALUES)
+        assert not v.met
+        assert v.worst == "joint_compliance.j1"
+    assert not parse_goal("position std < 1 m").met(STDS, VALUES, bad).met
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("joint < 2 %", "not understood"),
+        ("", "not understood"),
+        ("joint std > 2 %", "not understood"),
+        ("joint std < 2", "the unit is missing"),
+        ("joint std < 0 %", "cannot be a standard uncertainty"),
+        ("joint std < -2 %", "cannot be a standard uncertainty"),
+        ("joint std < 1e999 %", "cannot be a standard uncertainty"),
+        ("joint std < 1.2.3 %", "is no number"),
+        ("position std < 2 %", "a position is in m, mm, um, not %"),
+        ("position std < 2 rad", "a position is in m, mm, um, not rad"),
+    ],
+)
+def test_a_goal_that_cannot_be_read_names_the_valid_forms(text, why):
+    with pytest.raises(InputError, match=why) as caught:
+        parse_goal(text)
+    assert '"joint std < 2 %"' in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_goal_must_fit_the_model():
+    parse_goal("j1 std < 1e-7 rad/(N*m)").check(UNITS)
+    parse_goal("joint std < 1 %").check(UNITS)
+    parse_goal("position std < 1 mm").check(UNITS)
+    with pytest.raises(InputError, match=r"joint_compliance.j1 is in rad/\(N·m\)"):
+        parse_goal("j1 std < 1 mm").check(UNITS)
+    with pytest.raises(InputError, match="j9 is not in the model; valid: position, joint_comp"):
+        parse_goal("j9 std < 1 %").check(UNITS)
+    with pytest.raises(InputError, match="work_q_rad"):
+        parse_goal("position std < 1 mm").met(STDS, VALUES)
+
+
+def test_a_fit_is_judged_by_what_it_states():
+    c = campaign(mode="deflection", poses=8, registration_known=True)
+    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    stds, values = figures(found)
+    share = max(stds[n] / abs(values[n]) for n in stds if n.startswith("joint_compliance"))
+    assert parse_goal(f"joint std < {101 * share:.6f} %").met(stds, values).met
+    assert not parse_goal(f"joint std < {99 * share:.6f} %").met(stds, values).met

@@ -1,0 +1,229 @@
+"""Measurements that separate suspects: the power that is promised, and that it is kept."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy.linalg as sl
+from scipy import stats
+
+from hilcal.cell import cell_from_config
+from hilcal.design.discriminated_pairs import (
+    LEVEL,
+    discriminated_pairs,
+    not_separable_message,
+    power,
+    supported_parameters,
+)
+from hilcal.design.effect_estimate import estimate
+from hilcal.design.information import Problem, problem
+from hilcal.design.next import DRAWS, measure_next
+from hilcal.design.nominal_model import after
+from hilcal.design.planner import Request
+from hilcal.design.t_optimality import Pair
+from hilcal.diagnosis.effect_ranking import candidates
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.refinement import add
+from hilcal.types import Floats
+from tests.support.campaigns import campaign, noiseless, plan, true_parameters, with_noise
+from tests.support.next_cases import SMALL, doubtful, settled
+from tests.support.plan_cases import config_of, poses_of
+
+TILT, LINK = "joint_tilt_compliance", "link_compliance"
+
+
+def share_is(count: int, total: int, promised: float) -> bool:
+    """Whether a share of trials is what was promised, to 4 standard errors."""
+    error = np.sqrt(max(promised * (1 - promised), 0.01) / total)
+    return bool(abs(count / total - promised) < 4 * error)
+
+
+# the power
+
+
+@pytest.mark.parametrize("size", [0.0, 2.0, 4.0])
+def test_the_power_is_the_share_of_rejections_in_linear_problems(size: float) -> None:
+    """An effect of three columns, a model of four and a rival of two, which it resembles."""
+    rng = np.random.default_rng(5)
+    a = rng.standard_normal((60, 9))
+    a[:, 7:] = a[:, 4:6] + 0.3 * a[:, 7:]
+    effect, nuisance = np.arange(4, 7), np.array([0, 1, 2, 3, 7, 8])
+    beta = np.array([0.2, -0.3, 0.1]) * max(size, 1e-9)
+    promised = power(Pair(effect, beta, nuisance), a.T @ a)
+    others, every = a[:, nuisance], a
+    rejected = 0
+    for _ in range(1500):
+        y = a[:, effect] @ beta + rng.standard_normal(60)
+        left = [np.linalg.lstsq(x, y, rcond=None)[1][0] for x in (others, every)]
+        rejected += bool(left[0] - left[1] > stats.chi2.isf(LEVEL, 3))
+    assert share_is(rejected, 1500, promised)
+    assert promised == pytest.approx(LEVEL) if size == 0 else promised > 0.05
+
+
+def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
+    """Tilting joints are there and bending links are fitted; 100 campaigns of the same poses."""
+    c = campaign(TILT, "deflection", 3, poses=8, strength=1.3, plan_seed=21)
+    p = plan(8, 21)
+    clean = noiseless(c.world, p)
+    config = config_of("deflection", against=(TILT, LINK))
+    first = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    of = problem(after(first, config), config, poses_of(8, 21))
+    where = of.of_effect(TILT)
+    nuisance = np.concatenate([np.arange(of.model_size), of.of_effect(LINK)])
+    beta = true_parameters(c.world, TILT) / of.scale[where]
+    prior = of.measured.copy()
+    size = of.model_size
+    prior[:size, :size] = of.prior[:size, :size]
+    promised = power(Pair(where, beta, nuisance), prior)
+    assert 0.2 < promised < 0.9
+    rng = np.random.default_rng(1)
+    rejected = 0
+    start = add(first, LINK)
+    for _ in range(100):
+        rival = fit(start.model, with_noise(clean, rng), "deflection", start=start.theta)
+        f = linearise(rival)
+        x = effect_columns(rival, next(e for e in candidates(rival) if e.name == TILT)).white
+        s, g = x.T @ f.project_out(x), x.T @ rival.white
+        rejected += bool(g @ np.linalg.solve(s, g) > stats.chi2.isf(LEVEL, len(g)))
+    assert share_is(rejected, 100, promised)
+
+
+def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
+    """Of what is known and planned for, with the parameters that the readings support."""
+    first = doubtful("base_compliance", 2)
+    rng, trials = np.random.default_rng(3), 2000
+    found = measure_next(
+        first.rehearsal.cell, SMALL, first.fit, first.suspects, Request(6), rng,
+        reference=first.plan.joints("reference"),
+    )  # fmt: skip
+    of, known = found.planned.problem, discriminated_pairs(found.planned.problem).prior
+    values, vectors = np.linalg.eigh(known)
+    before = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    planned = np.repeat(of.units.rows, found.planned.counts.astype(int), axis=0)
+    every = np.vstack([before, planned.reshape(-1, of.units.size)])
+    supported = supported_parameters(of, DRAWS)
+    for p in found.powers:
+        where, rival = of.of_effect(p.effect), of.of_effect(p.rival)
+        fitted = np.concatenate([np.arange(of.model_size), rival])
+        beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
+        for rows, promised in ((before, p.now), (every, p.then)):
+            y = rows[:, where] @ beta.T + rng.standard_normal((len(rows), trials))
+            spanned = [sl.orth(rows[:, c]) for c in (fitted, np.append(fitted, where))]
+            less, more = (np.sum((basis.T @ y) ** 2, axis=0) for basis in spanned)
+            added = spanned[1].shape[1] - spanned[0].shape[1]
+            rejected = int(np.sum(more - less > stats.chi2.isf(LEVEL, added)))
+            assert share_is(rejected, trials, promised), p
+
+
+# how strong suspects are
+
+
+def told(effect: str, strength: float, seed: int = 2) -> tuple[Fit, Floats, Problem]:
+    c = campaign(effect, "deflection", seed, poses=10, strength=strength)
+    found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    config = config_of("deflection", against=(effect, LINK))
+    of = problem(after(found, config), config, poses_of(10, 1000 + seed))
+    return found, true_parameters(c.world, effect), of
+
+
+def test_an_estimate_holds_the_true_parameters() -> None:
+    found, true, of = told(TILT, 4.0)
+    made = estimate(linearise(found), next(e for e in of.families if e.name == TILT))
+    assert made is not None
+    assert made.supported
+    off = made.mean - true
+    distance2 = off @ np.linalg.solve(made.root @ made.root.T, off)
+    assert distance2 < stats.chi2.isf(1e-4, len(true))
+    drawn = made.draws(4000, np.random.default_rng(0))
+    assert np.array_equal(drawn[0], made.mean)
+    spread, stated = np.std(drawn, axis=0), np.linalg.norm(made.root, axis=1)
+    np.testing.assert_allclose(spread, stated, rtol=0.06)
+
+
+def test_readings_that_do_not_speak_for_an_effect_tell_no_strength() -> None:
+    found, _, of = told("hysteresis", 0.0)
+    made = estimate(linearise(found), of.families[0])
+    assert made is not None
+    assert not made.supported
+    blind = replace(found.solution.prediction.situation.states, approach=None)
+    situation = replace(found.solution.prediction.situation, states=blind)
+    prediction = replace(found.solution.prediction, situation=situation)
+    without = replace(found, solution=replace(found.solution, prediction=prediction))
+    hysteresis = next(e for e in of.families if e.name == "hysteresis")
+    assert estimate(linearise(without), hysteresis) is None
+
+
+# the plan
+
+
+def test_pairs_that_no_measurement_separates_are_said_so() -> None:
+    """In deflections a scale of the tracker is a common factor on all compliances."""
+    first = doubtful(TILT, 1)
+    rng = np.random.default_rng(0)
+    with pytest.raises(CannotAnswerError, match="no measurement separates them"):
+        measure_next(
+            cell_from_config(SMALL), SMALL, first.fit, ("tracker_scale", LINK), Request(4), rng
+        )
+    assert not_separable_message([("a", "b"), ("a", "c"), ("b", "a"), ("c", "d")]) == (
+        "no measurement in this cell separates a from b or c, nor c from d"
+    )
+
+
+def test_a_pair_that_looks_the_same_everywhere_is_left_out() -> None:
+    """Two families with the same columns: neither can be told, whatever is measured."""
+    first = doubtful(TILT, 1)
+    config = config_of("deflection", against=(TILT, LINK))
+    of = problem(after(first.fit, config), config, poses_of(6))
+    rows, measured, prior = of.units.rows.copy(), of.measured.copy(), of.prior.copy()
+    a, b = of.of_effect(TILT), of.of_effect(LINK)[: len(of.of_effect(TILT))]
+    n = min(len(a), len(b))
+    rows[:, :, of.of_effect(LINK)] = 0.0
+    rows[:, :, a] = 0.0
+    rows[:, :, a[:n]] = rows[:, :, b[:n]] = of.units.rows[:, :, a[:n]]
+    for matrix in (measured, prior):
+        size = of.model_size
+        matrix[size:] = 0.0
+        matrix[:, size:] = 0.0
+    alike = replace(of, units=replace(of.units, rows=rows), measured=measured, prior=prior)
+    with pytest.raises(CannotAnswerError, match=f"in this cell separates {TILT} from {LINK}"):
+        discriminated_pairs(alike, fitted={})
+
+
+@pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
+def test_one_suspect_is_refused(suspects: tuple[str, ...]) -> None:
+    first = doubtful(TILT, 1)
+    with pytest.raises(InputError, match="two or more"):
+        measure_next(
+            first.rehearsal.cell, SMALL, first.fit, suspects, Request(4), np.random.default_rng(0)
+        )
+
+
+def test_what_was_ambiguous_is_decided() -> None:
+    first = doubtful("base_compliance", 2)
+    assert "base_compliance" in first.suspects
+    assert len(first.suspects) > 1
+    d, found = settled(first)
+    assert all(t.then > t.now for t in found.powers)
+    assert (d.suspects[0].effect, d.suspects[0].same_as) == ("base_compliance", ())
+    plan = found.planned.ordered.plan
+    assert found.planned.design.efficiency > 0.9
+    assert set(found.shares) <= set(plan.loads)
+    assert sum(found.shares.values()) == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effect", [TILT, LINK, "base_compliance"])
+def test_most_doubts_are_settled(effect: str) -> None:
+    """Of the first ten campaigns those with a doubt; the hidden effect leads alone after it."""
+    seeds = [s for s in range(1, 11) if len(doubtful(effect, s).suspects) > 1]
+    assert len(seeds) >= 3
+    alone = []
+    for seed in seeds:
+        d, _ = settled(doubtful(effect, seed))
+        alone.append(d.suspects[0].effect == effect and not d.suspects[0].same_as)
+    print(f"\n{effect}: in doubt {len(seeds)} of 10, settled {sum(alone)}")
+    assert np.mean(alone) >= 0.75

@@ -1,0 +1,301 @@
+"""Criteria of plans: derivatives, concavity, bounds, and what they mean."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hilcal.design.barrier import Program
+from hilcal.design.compound_criteria import CompoundDeterminant, CompoundVariance
+from hilcal.design.criteria import A, D, MeanVariance
+from hilcal.design.criterion import Criterion, require_determined, soft_least
+from hilcal.design.eigenvalue_criteria import E, K
+from hilcal.design.t_optimality import Pair, Separate
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.types import Floats
+
+P = 6
+
+
+def few_poses() -> Floats:
+    """Of rank 2, as that of few test poses is."""
+    root = np.random.default_rng(5).normal(size=(2, P))
+    return root.T @ root
+
+
+def pairs() -> tuple[Pair, ...]:
+    return (
+        Pair(np.array([0, 1]), np.array([1.0, -0.5]), np.array([2, 3, 4])),
+        Pair(np.array([4]), np.array([2.0]), np.array([2, 3, 0, 1])),
+        Pair(np.array([5]), np.array([1.0]), np.array([2, 3])),
+    )
+
+
+def compound_variance() -> CompoundVariance:
+    """Of prediction poses at which the first four of the parameters count."""
+    root = np.random.default_rng(6).normal(size=(2, 4))
+    c = np.zeros((P, P))
+    c[:4, :4] = root.T @ root
+    return CompoundVariance(c, 4, 0.7, 1.9)
+
+
+CRITERIA: dict[str, Callable[[], Criterion]] = {
+    "D": D,
+    "D of some": lambda: D(np.array([4, 1])),
+    "A": A,
+    "A of some": lambda: A(np.array([0, 5, 2])),
+    "I": lambda: MeanVariance(few_poses()),
+    "E": E,
+    "K": K,
+    "E of some": lambda: E(np.array([0, 2, 5])),
+    "separate": lambda: Separate(pairs()),
+    "compound variance": compound_variance,
+    "compound determinant": lambda: CompoundDeterminant(4),
+}
+CONCAVE = [name for name in CRITERIA if name != "K"]
+seeds = st.integers(0, 10**6)
+every = pytest.mark.parametrize("name", CRITERIA)
+
+
+def information(rng: np.random.Generator, rows: int = 12) -> Floats:
+    """A regular information matrix of parameters of different size."""
+    a = rng.normal(size=(rows, P)) * np.exp(rng.uniform(-1, 1, P))
+    return np.asarray(a.T @ a)
+
+
+def direction(rng: np.random.Generator) -> Floats:
+    d = rng.normal(size=(P, P))
+    return d + d.T
+
+
+def central(f: Callable[[float], float], h: float) -> float:
+    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
+
+
+@pytest.mark.parametrize("name", [n for n in CRITERIA if not CRITERIA[n]().kinked])
+def test_the_bound_of_a_smooth_criterion_is_its_tangent(name: str) -> None:
+    criterion = CRITERIA[name]()
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        m, d = information(rng), direction(rng)
+        slope = central(lambda h, m=m, d=d: float(criterion.value(m + h * d)), 1e-3 / 20)  # type: ignore[misc]
+        here = criterion.surrogate(m, 0.1)(m)
+        assert here is not None
+        g = here.above
+        assert np.sum(g * d) == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(g).sum())
+
+
+def test_compound_criteria_are_means_of_both_efficiencies() -> None:
+    m = information(np.random.default_rng(4))
+    volume = np.sqrt(np.linalg.det(m) ** (1 / P) * np.linalg.det(m[:4, :4]) ** (1 / 4))
+    assert float(CompoundDeterminant(4).value(m)) == pytest.approx(volume)
+    both = compound_variance()
+    c = both.c
+    q = 0.7 * np.trace(c @ np.linalg.inv(m))
+    q += 1.9 * np.trace(c[:4, :4] @ np.linalg.inv(m[:4, :4]))
+    assert float(both.value(m)) == pytest.approx(1 / q)
+
+
+@every
+@pytest.mark.parametrize("order", [0.5, 0.02])
+def test_surrogate_has_the_derivatives_it_says(name: str, order: float) -> None:
+    """Its gradient and its curvature in the weights of units, which are of one or more rows."""
+    criterion = CRITERIA[name]()
+    rng = np.random.default_rng(1)
+    m = information(rng)
+    f = criterion.surrogate(m, order)
+    here = f(m)
+    assert here is not None
+    for size in (1, 3):  # by rows, and by matrices
+        rows = rng.normal(size=(4, size, P)) * 0.3
+        program = Program(criterion, rows, np.ones(4), 1.0, np.inf, np.zeros((P, P)))
+        second = program.curvature(here)
+        units = np.matmul(rows.transpose(0, 2, 1), rows)
+        assert np.linalg.eigvalsh(second)[0] > -1e-9 * np.abs(second).max() or name == "K"
+
+        def value(h: float, k: int, units: Floats = units) -> float:
+            there = f(m + h * units[k])
+            assert there is not None
+            return there.value
+
+        def slope(h: float, k: int, n: int, units: Floats = units) -> float:
+            there = f(m + h * units[k])
+            assert there is not None
+            return float(np.sum(there.gradient * units[n]))
+
+        for k in range(4):
+            first = central(lambda h, k=k: value(h, k), 1e-4)  # type: ignore[misc]
+            assert slope(0.0, k, k) == pytest.approx(first, rel=1e-6, abs=1e-9)
+            for n in range(4):
+                bend = central(lambda h, k=k, n=n: slope(h, k, n), 1e-4)  # type: ignore[misc]
+                assert -second[k, n] == pytest.approx(
+                    bend, rel=1e-5, abs=1e-6 * np.abs(second).max()
+                )
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@given(seeds, st.floats(0.01, 100.0))
+def test_homogeneous(name: str, seed: int, factor: float) -> None:
+    criterion = CRITERIA[name]()
+    m = information(np.random.default_rng(seed))
+    power = 0 if name == "K" else 1
+    expected = factor**power * float(criterion.value(m))
+    assert float(criterion.value(factor * m)) == pytest.approx(expected, rel=1e-7)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@given(seeds, st.floats(0.0, 1.0))
+def test_concave(name: str, seed: int, share: float) -> None:
+    """Between two matrices at least the mean of the two; of K at least the less."""
+    criterion = CRITERIA[name]()
+    rng = np.random.default_rng(seed)
+    m, n = information(rng), information(rng, 7)
+    a, b = float(criterion.value(m)), float(criterion.value(n))
+    mixed = float(criterion.value(share * m + (1 - share) * n))
+    least = min(a, b) if name == "K" else share * a + (1 - share) * b
+    assert mixed >= least * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("name", CRITERIA)
+@given(seeds, st.floats(1e-4, 1.0))
+def test_bound_holds_for_any_information(name: str, seed: int, order: float) -> None:
+    """Also for singular matrices, whatever the surrogate's order."""
+    criterion = CRITERIA[name]()
+    rng = np.random.default_rng(seed)
+    m = information(rng)
+    s = criterion.surrogate(m, order)(m)
+    assert s is not None
+    for rows in (3, 7, 30):
+        n = information(rng, rows)
+        bound = np.sum(s.above * n)
+        if s.below is not None:
+            bound /= np.sum(s.below * n)
+        assert float(criterion.value(n)) <= bound * (1 + 1e-9)
+    if name in ("D", "A", "I"):  # exact at M itself
+        assert np.sum(s.above * m) == pytest.approx(float(criterion.value(m)), rel=1e-9)
+
+
+@pytest.mark.parametrize("name", ["E", "K", "separate"])
+def test_bound_of_a_kink_closes_with_the_order(name: str) -> None:
+    criterion = CRITERIA[name]()
+    m = information(np.random.default_rng(3))
+    value = float(criterion.value(m))
+    excess = []
+    for order in (1e-1, 1e-3, 1e-5):
+        s = criterion.surrogate(m, order)(m)
+        assert s is not None
+        bound = np.sum(s.above * m) / (1.0 if s.below is None else np.sum(s.below * m))
+        excess.append(bound / value - 1)
+    assert 0 <= excess[2] < 2 * P * 1e-5
+    assert excess[0] > 10 * excess[1] > 100 * excess[2] >= 0
+
+
+@every
+def test_values_of_many_are_the_values_of_each(name: str) -> None:
+    criterion = CRITERIA[name]()
+    rng = np.random.default_rng(2)
+    stack = np.array([information(rng) for _ in range(5)] + [information(rng, 3)])
+    single = [float(criterion.value(m)) for m in stack]
+    assert criterion.value(stack) == pytest.approx(single, rel=1e-9)
+    assert criterion.value(stack.reshape(2, 3, P, P)).shape == (2, 3)
+    if name != "separate":  # some pairs are separated by three rows
+        assert abs(single[-1]) <= 1e-12 * min(single[:-1])
+
+
+def test_d_of_some_is_what_the_others_leave() -> None:
+    m = information(np.random.default_rng(4))
+    chosen = np.array([4, 1])
+    covariance = np.linalg.inv(m)[np.ix_(chosen, chosen)]
+    expected = np.linalg.det(covariance) ** -0.5
+    assert float(D(chosen).value(m)) == pytest.approx(expected)
+
+
+def test_a_is_the_inverse_of_the_mean_variance() -> None:
+    m = information(np.random.default_rng(4))
+    variance = np.diag(np.linalg.inv(m))
+    assert float(A().value(m)) == pytest.approx(1 / variance.mean())
+    some = np.array([0, 5, 2])
+    assert float(A(some).value(m)) == pytest.approx(1 / variance[some].mean())
+
+
+def test_test_poses_give_the_variance_of_their_position() -> None:
+    rng = np.random.default_rng(4)
+    m = information(rng)
+    v = rng.normal(size=(7, 3, P))  # Jacobians of the position at 7 poses
+    c = np.mean(np.swapaxes(v, 1, 2) @ v, axis=0)
+    variances = [np.trace(one @ np.linalg.inv(m) @ one.T) for one in v]
+    assert float(MeanVariance(c).value(m)) == pytest.approx(1 / np.mean(variances))
+
+
+@pytest.mark.parametrize("twice", [False, True])
+def test_separation_is_what_a_fit_leaves(twice: bool) -> None:
+    """The sum of squares that a fit of the nuisance leaves; also where it is not unique."""
+    rng = np.random.default_rng(8)
+    a = rng.normal(size=(20, P))
+    if twice:
+        a[:, 3] = 2 * a[:, 2]
+    criterion = Separate(pairs())
+    left = []
+    for pair in criterion.pairs:
+        signal = a[:, pair.effect] @ pair.beta
+        fit = np.linalg.lstsq(a[:, pair.nuisance], signal, rcond=None)[0]
+        left.append(np.sum((signal - a[:, pair.nuisance] @ fit) ** 2))
+    assert criterion.parts(a.T @ a) == pytest.approx(left, rel=1e-8)
+    assert float(criterion.value(a.T @ a)) == pytest.approx(min(left), rel=1e-8)
+    for pair, expected in zip(criterion.pairs, left, strict=True):
+        u = pair.residual(a.T @ a)
+        assert np.sum((a @ u) ** 2) == pytest.approx(expected, rel=1e-8)
+
+
+@given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=8), st.floats(1e-6, 1.0))
+def test_soft_least(numbers: list[float], width: float) -> None:
+    s = np.array(numbers)
+    value, p = soft_least(s, width)
+    assert p.sum() == pytest.approx(1.0)
+    assert (p > 0).all()
+    assert s.min() - 1e-9 <= p @ s <= s.min() + (len(s) - 1) * width * (1 + 1e-6) + 1e-9
+    # p solves p_i (s_i − t) = μ for one t
+    assert np.ptp(s - width / p) == pytest.approx(0.0, abs=1e-6 * (1 + s.max()))
+    assert value <= s.min() + len(s) * width * (1 + np.log(len(s)) + np.log1p(s.max() / width))
+
+
+def test_says_which_parameters_nothing_determines() -> None:
+    rng = np.random.default_rng(0)
+    a = rng.normal(size=(30, 3)) * [1.0, 1e3, 1e-3]
+    names = ("j1", "j2", "offset")
+    require_determined(a.T @ a, names)  # differences in size are no matter
+    blind = a * [1, 0, 1]
+    with pytest.raises(CannotAnswerError, match="changes with j2;"):
+        require_determined(blind.T @ blind, names)
+    same = a.copy()
+    same[:, 2] = 1e-4 * same[:, 0]
+    with pytest.raises(CannotAnswerError, match=r"separates (j1, offset|offset, j1);"):
+        require_determined(same.T @ same, names)
+    with pytest.raises(CannotAnswerError, match="parameter 2"):
+        require_determined(blind.T @ blind)
+    alike = Separate((Pair(np.array([0]), np.ones(1), np.array([1, 2]), "backlash from drift"),))
+    with pytest.raises(CannotAnswerError, match="separates backlash from drift"):
+        alike.require(same.T @ same, names)
+    alike.require(a.T @ a, names)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: D(np.array([0, P])).value(np.eye(P)), "from 0 to 5"),
+        (lambda: A(np.array([], dtype=int)).value(np.eye(P)), "at least one"),
+        (lambda: D(np.array([1, 1])).value(np.eye(P)), "different"),
+        (lambda: MeanVariance(np.ones((2, 3))), r"\(3, 3\) matrix"),
+        (lambda: MeanVariance(np.diag([1.0, -1.0])), "semidefinite"),
+        (lambda: MeanVariance(np.array([[1.0, 1.0], [0.0, 1.0]])), "not symmetric"),
+        (lambda: MeanVariance(np.zeros((2, 2))), "zero"),
+        (lambda: Separate(()), "no pair"),
+        (lambda: Pair(np.array([0]), np.zeros(1), np.array([1])), "not all zero"),
+        (lambda: Pair(np.array([0]), np.ones(1), np.array([0, 1])), "both sides"),
+    ],
+)
+def test_refusals(make: Callable[[], object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        make()

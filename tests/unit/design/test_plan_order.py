@@ -1,0 +1,312 @@
+"""The order of a plan: all readings, each load once, clear motions, little time, random time."""
+
+from collections import Counter
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
+from hilcal.design.timing import pace, timeline
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import route
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.types import Bools, Floats
+from tests.support.campaigns import configuration
+
+CONFIG = configuration()
+CELL = cell_from_config(CONFIG)
+LOADS = tuple(load.name for load in CONFIG.loads)
+MIDDLE = np.array([0.3, -1.2, 1.4, -0.5, 0.7, 0.2])
+
+
+class World:
+    """Poses around the middle, of which some motions are blocked, one way or both."""
+
+    def __init__(self, count: int, blocked: float, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.q = MIDDLE + rng.uniform(-1.0, 1.0, (count, 6))
+        self.names = [f"p{k}" for k in range(count)]
+        self.index = {row.tobytes(): k for k, row in enumerate(np.vstack([self.q, MIDDLE]))}
+        free = rng.random((len(LOADS) + 1, count + 1, count + 1)) >= blocked
+        free[:, -1] = free[:, :, -1] = True  # the reference is reached from everywhere
+        self.free = dict(zip((UNLOADED, *LOADS), free, strict=True))
+
+    def passable(self, start: Floats, ends: Floats, load: str) -> Bools:
+        at = [self.index[np.ascontiguousarray(q).tobytes()] for q in (start, *ends)]
+        return np.asarray(self.free[load][at[0], at[1:]])
+
+    def ordered(self, chosen: list[Chosen], seed: int, how: Ordering | None = None) -> Ordered:
+        rng = np.random.default_rng(seed)
+        return order_plan(CELL, CONFIG, self.names, self.q, MIDDLE, chosen, self.passable, rng, how)
+
+
+def everything(world: World) -> list[Chosen]:
+    return [Chosen(name, (UNLOADED, *LOADS)) for name in world.names]
+
+
+@settings(max_examples=20, deadline=None)
+@given(
+    st.integers(1, 12),
+    st.floats(0.0, 0.7),
+    st.sampled_from([0.0, 0.02, 0.15]),
+    st.sampled_from(["around", "first"]),
+    st.floats(40.0, 900.0),
+    st.integers(0, 10**6),
+)
+def test_every_plan_keeps_its_promises(
+    count: int, blocked: float, slack: float, unloaded: str, every: float, seed: int
+) -> None:
+    world = World(count, blocked, seed)
+    rng = np.random.default_rng(seed + 1)
+    chosen = []
+    for name in (str(x) for x in rng.choice(world.names, count + 2)):  # some poses several times
+        some = tuple(str(x) for x in rng.permutation(LOADS)[: rng.integers(0, len(LOADS) + 1)])
+        chosen.append(Chosen(name, (UNLOADED, *some), int(rng.integers(1, 3))))
+    how = Ordering(
+        slack=slack,
+        unloaded="first" if unloaded == "first" else "around",
+        reference_every_s=every,
+        repeats=1,
+        draws=3,
+    )
+    made = world.ordered(chosen, seed, how)
+    plan = made.plan
+    taken = [s for s in plan.steps if s.pose != REFERENCE]
+
+    assert len(set(plan.steps)) == len(plan.steps)
+    wanted = Counter((c.pose, load) for c in chosen for load in c.loads for _ in range(c.count))
+    extra = Counter((s.pose, s.load) for s in taken) - wanted
+    assert not wanted - Counter((s.pose, s.load) for s in taken)
+    assert sum(extra.values()) <= 1  # the repeat
+    assert all(load == UNLOADED for _, load in extra)
+    assert all(Step(s.pose, UNLOADED, s.cycle) in plan.steps for s in plan.steps)
+    cycles = [
+        tuple(sorted(s.load for s in taken if (s.pose, s.cycle) == k)) for k in _cycles(taken)
+    ]
+    together = Counter(tuple(sorted(c.loads)) for c in chosen for _ in range(c.count))
+    assert not together - Counter(cycles)  # what shares an unloaded reading is as it was chosen
+
+    hung = [a.load for a, b in pairwise((*plan.steps, Step("", ""))) if a.load != b.load]
+    loaded = [load for load in hung if load != UNLOADED]
+    assert len(set(loaded)) == len(loaded)
+    assert set(loaded) == {load for c in chosen for load in c.loads} - {UNLOADED}
+    assert plan.steps[0] == Step(REFERENCE, UNLOADED, 0)
+    assert (plan.steps[-1].pose, plan.steps[-1].load) == (REFERENCE, UNLOADED)
+
+    for a, b in pairwise(route(plan, CELL.arm)):
+        if "beside" not in a.name + b.name and not np.array_equal(a.q, b.q):
+            assert world.passable(a.q, b.q[None], b.hanging)[0], (a, b)
+
+    limit = (1.0 + slack) * made.shortest.total
+    assert made.duration.total <= limit + 1e-6
+    dry = dry_run(CELL, CONFIG, plan)
+    assert dry.duration == pytest.approx(made.duration.total, rel=1e-9)
+    assert dry.remarks == ()
+
+    _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
+    at = [k for k, s in enumerate(plan.steps) if s.pose == REFERENCE]
+    for k, j in pairwise(at):
+        assert j - k <= 2 or times[j] - times[k] <= every + pace(CONFIG).reading_s + 1e-6 + (
+            pace(CONFIG).change_s if plan.steps[k].load != plan.steps[j].load else 0.0
+        )
+
+
+def _cycles(steps: list[Step]) -> list[tuple[str, int]]:
+    return list(dict.fromkeys((s.pose, s.cycle) for s in steps))
+
+
+def test_the_same_seed_gives_the_same_order_and_another_one_another() -> None:
+    world = World(9, 0.2, 3)
+    made = [world.ordered(everything(world), seed).plan.to_json() for seed in (1, 1, 2)]
+    assert made[0] == made[1] != made[2]
+
+
+def test_repeats_make_second_unloaded_cycles() -> None:
+    world = World(6, 0.0, 1)
+    plan = world.ordered(everything(world), 0, Ordering(repeats=4)).plan
+    again = [s for s in plan.steps if s.cycle == 1 and s.pose != REFERENCE]
+    assert len(again) == 4
+    assert {s.load for s in again} == {UNLOADED}
+
+
+def test_absolute_readings_of_a_pose_share_no_more_than_they_must() -> None:
+    world = World(3, 0.0, 1)
+    chosen = [Chosen("p0", (UNLOADED,), 2), Chosen("p0", (LOADS[0],), 2), Chosen("p1", (LOADS[1],))]
+    plan = world.ordered(chosen, 0, Ordering(repeats=0)).plan
+    taken = {(s.pose, s.load, s.cycle) for s in plan.steps if s.pose != REFERENCE}
+    assert taken == {
+        *(("p0", load, cycle) for load in (UNLOADED, LOADS[0]) for cycle in (0, 1)),
+        ("p1", LOADS[1], 0),
+    }
+
+
+def test_the_pace_is_that_of_the_configuration() -> None:
+    world = World(4, 0.0, 1)
+    config = CellConfig.model_validate(
+        {**CONFIG.model_dump(), "planning": {"reading_s": 20.0, "load_change_s": 300.0}}
+    )
+    made = order_plan(
+        CELL, config, world.names, world.q, MIDDLE, everything(world), world.passable,
+        np.random.default_rng(0),
+    )  # fmt: skip
+    assert made.duration.readings == pytest.approx(20.0 * len(made.plan.steps))
+    assert made.duration.load_changes == pytest.approx(300.0 * (len(LOADS) + 1))
+    split = made.plan.about["duration_s"]
+    assert split["total"] == pytest.approx(
+        split["motion"] + split["readings"] + split["load_changes"], abs=0.2
+    )
+
+
+def test_a_pose_behind_another_one_is_reached_by_it() -> None:
+    world = World(5, 0.0, 2)
+    for free in world.free.values():
+        free[-1, 0] = free[0, -1] = False  # never straight between the reference and p0
+        free[0, 2:] = free[2:, 0] = False  # only by p1
+        free[1, 0] = free[0, 1] = True
+    chosen = [Chosen(name, (UNLOADED,)) for name in world.names]
+    with pytest.raises(CannotAnswerError, match=r"pose p\d is not reached from the reference"):
+        world.ordered(chosen, 0)  # in by p1, and out by p1 again, where it is not measured again
+    for free in world.free.values():
+        free[0, 2] = True
+    plan = world.ordered(chosen, 0, Ordering(repeats=0)).plan
+    names = [s.pose for s in plan.steps]
+    assert names[names.index("p0") - 1] == "p1"
+    assert names[names.index("p0") + 1] == "p2"
+
+
+# drift
+
+
+@cache
+def _large() -> tuple[World, list[Ordered]]:
+    world = World(24, 0.1, 8)
+    return world, [world.ordered(everything(world), seed) for seed in range(5)]
+
+
+def test_time_is_far_less_confounded_than_in_the_shortest_order() -> None:
+    _, made = _large()
+    for ordered in made:
+        assert ordered.confounding.correlation < 0.5 * ordered.confounding_shortest.correlation
+        assert abs(ordered.confounding.bias_m) < 0.2 * ordered.confounding_shortest.bias_m
+
+
+def test_orders_under_different_loads_are_independent() -> None:
+    """A covariate that no regressor knows is confounded under each load in another way.
+
+    In the shortest order every load has nearly the same tour: what is late under one load is
+    late under all. Independent orders average out, here over four loads.
+    """
+    together = []
+    for seed in range(4):
+        world = World(20, 0.0, 20 + seed)
+        hidden = np.cos(world.q @ np.random.default_rng(seed).standard_normal((6, 40)))
+
+        def shared(plan: Plan, world: World = world, hidden: Floats = hidden) -> float:
+            _, times = timeline(plan, CELL.arm, 0.0, pace(CONFIG))
+            when = {(s.pose, s.load): t for s, t in zip(plan.steps, times, strict=True)}
+            out = []
+            for load in LOADS:
+                t = stats.zscore([when[name, load] for name in world.names])
+                out.append(t @ stats.zscore(hidden) / len(t))
+            return float(np.mean(np.mean(out, axis=0) ** 2))
+
+        plain = world.ordered(everything(world), 0, Ordering(slack=0.0)).plan
+        mixed = [world.ordered(everything(world), k, Ordering(draws=4)).plan for k in range(3)]
+        together.append((shared(plain), float(np.mean([shared(plan) for plan in mixed]))))
+    before, after = np.mean(together, axis=0)
+    assert after < 0.5 * before
+
+
+def test_correlation_is_the_information_that_a_parameter_loses_to_a_drift() -> None:
+    _, made = _large()
+    ordered = made[0]
+    plan, told = ordered.plan, ordered.confounding
+    _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
+    when = dict(zip(plan.steps, times, strict=True))
+    rows = [s for s in plan.steps if s.pose != REFERENCE and s.load != UNLOADED]
+    lag = np.array([when[s] - when[Step(s.pose, UNLOADED, s.cycle)] for s in rows])
+    wrench = {load.name: load.wrench(CELL.gravity) for load in CONFIG.loads}
+    component, *product = told.regressor.split()
+    k = ["fx", "fy", "fz", "mx", "my", "mz"].index(component)
+    column = np.array([wrench[s.load][k] for s in rows])
+    if product:
+        angle = np.array([plan.joints(s.pose)[int(product[1][1:]) - 1] for s in rows])
+        column = column * (np.cos(angle) if product[0] == "cos" else np.sin(angle))
+    both = np.stack([column, lag], axis=1)
+    alone, beside = 1 / (column @ column), np.linalg.inv(both.T @ both)[0, 0]
+    assert alone / beside == pytest.approx(1 - told.correlation**2, rel=1e-9)
+    assert told.error_m == pytest.approx(told.drift * np.sqrt(np.mean(lag**2)))
+    assert told.bias_m == pytest.approx(told.drift * np.mean(lag))
+    assert told.deflections == len(rows)
+
+
+def test_the_drift_that_returns_tell_is_that_of_a_fit_to_them() -> None:
+    _, made = _large()
+    plan = made[0].plan
+    _, times = timeline(plan, CELL.arm, CONFIG.limits.joint_margin_rad, pace(CONFIG))
+    at = [k for k, s in enumerate(plan.steps) if s.pose == REFERENCE]
+    means = np.array([[plan.steps[k].load == load for load in plan.loads] for k in at], float)
+    design = np.column_stack([times[at], means])
+    std = 15e-6 * np.sqrt(np.linalg.inv(design.T @ design)[0, 0])
+    assert made[0].confounding.drift_std == pytest.approx(std, rel=1e-6)
+
+
+def test_the_heaviest_of_three_loads_comes_in_the_middle() -> None:
+    """Its lags are then the shortest, as unloaded readings are taken before and after."""
+    masses = {"light": 0.5, "heavy": 6.0, "medium": 1.0}
+    loads = [{"name": name, "mass_kg": mass} for name, mass in masses.items()]
+    data = {**CONFIG.model_dump(exclude={"loads"}), "loads": loads}
+    config = CellConfig.model_validate(data)
+    world = World(12, 0.0, 4)
+    chosen = [Chosen(name, (UNLOADED, *masses)) for name in world.names]
+
+    def free(start: Floats, ends: Floats, load: str) -> Bools:
+        return np.ones(len(ends), dtype=np.bool_)
+
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        made = order_plan(
+            CELL, config, world.names, world.q, MIDDLE, chosen, free, rng, Ordering(slack=0.1)
+        )
+        assert made.plan.loads[2] == "heavy"
+
+
+# what cannot be
+
+
+def test_a_pose_that_is_not_reached_is_named() -> None:
+    world = World(9, 0.0, 2)
+    world.free[LOADS[1]][:, 4] = False
+    with pytest.raises(CannotAnswerError, match=f"pose p4 .* under {LOADS[1]}"):
+        world.ordered(everything(world), 0)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ([], "no reading is chosen"),
+        ([Chosen("p9", (UNLOADED,))], "no pose 'p9'"),
+        ([Chosen("p0", ("lead",))], "valid: .*none"),
+        ([Chosen("p0", (UNLOADED, UNLOADED))], "pose 'p0': loads"),
+        ([Chosen("p0", (UNLOADED,), 0)], "count 0"),
+    ],
+)
+def test_wrong_choices_are_refused(chosen: list[Chosen], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        World(3, 0.0, 0).ordered(chosen, 0)
+
+
+def test_wrong_settings_are_refused() -> None:
+    world = World(3, 0.0, 0)
+    for how in (replace(Ordering(), slack=-0.1), replace(Ordering(), reference_every_s=0.0)):
+        with pytest.raises(InputError, match="valid: 0 or more"):
+            world.ordered(everything(world), 0, how)

@@ -1,0 +1,300 @@
+"""From a cell to a plan: what it promises, what it keeps, and what it refuses."""
+
+import csv
+import json
+import sys
+from collections import Counter
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.config.write import to_toml
+from hilcal.design.choice import CRITERIA, costly_loads, objective_of
+from hilcal.design.feasible import Space
+from hilcal.design.information import Problem
+from hilcal.design.planner import Planned, Request, make
+from hilcal.design.predicted import predicted
+from hilcal.design.summary import remarks, summarise
+from hilcal.measuring.dry_run import dry_run
+from hilcal.readings.covariance import WHOLE
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.tables.table import write_table
+from hilcal.types import Floats, Ints
+from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+
+Capsys = pytest.CaptureFixture[str]
+SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
+
+
+def small(**planning: object) -> CellConfig:
+    """The demo's cell with few candidates and one effect to look out for."""
+    config = load_config(CELL)
+    changed = config.planning.model_copy(update={**SMALL, **planning})
+    return config.model_copy(update={"planning": changed})
+
+
+def planned(config: CellConfig, poses: int = 5, seed: int = 1, **wanted: object) -> Planned:
+    cell = cell_from_config(config)
+    request = Request(poses, **wanted)  # type: ignore[arg-type]
+    return make(cell, config, request, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def usual() -> Planned:
+    return planned(small(), readings=25)
+
+
+def test_the_plan_is_what_the_design_chose(usual: Planned) -> None:
+    plan = usual.ordered.plan
+    wanted: Counter[str] = Counter()
+    for k in np.flatnonzero(usual.counts):
+        wanted.update({load: int(usual.counts[k]) for load in usual.problem.what[k][1]})
+    loaded = [s for s in plan.steps if s.pose != REFERENCE and s.load != UNLOADED]
+    assert Counter(s.load for s in loaded) == wanted
+    unloaded = {(s.pose, s.cycle) for s in plan.steps if s.load == UNLOADED}
+    assert {(s.pose, s.cycle) for s in loaded} <= unloaded
+    assert usual.design.cost <= usual.budget
+    assert 0.9 < usual.design.efficiency <= 1.0
+
+
+def test_the_plan_may_be_run_and_is_the_same_every_time(usual: Planned) -> None:
+    config = small()
+    plan = usual.ordered.plan
+    checked = dry_run(cell_from_config(config), config, plan)
+    assert checked.problems == ()
+    assert checked.duration == pytest.approx(usual.ordered.duration.total)
+    again = planned(config, readings=25).ordered.plan
+    assert again.to_json() == plan.to_json()
+    assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
+
+
+def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of what each round chooses is not reached: a plan was refused for that."""
+    module = sys.modules["hilcal.design.planner"]
+    reached, rounds = module._unreachable, []
+
+    def lost(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+        chosen = {of.what[k][0] for k in units}
+        odd = {pose for pose in chosen if pose % 2} if rounds else set()
+        rounds.append(chosen)
+        return np.array(sorted(odd | {*reached(space, of, home, units).tolist()}), dtype=np.int64)
+
+    monkeypatch.setattr(module, "_unreachable", lost)
+    monkeypatch.setattr(module, "ROUNDS", 2)
+    made = planned(small(), 12)
+    _, first, last = rounds
+    assert any(pose % 2 for pose in first)
+    assert last <= {pose for pose in first if not pose % 2}
+    assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
+
+
+def test_more_readings_promise_more() -> None:
+    some, more = planned(small(), 10), planned(small(), 20)
+    before = predicted(some.problem, some.counts, work=some.work)
+    after = predicted(more.problem, more.counts, work=more.work)
+    live = np.isfinite(before.std) & (before.std > 0)
+    ratio = (after.std[live] / before.std[live])[: some.problem.model_size]
+    # As at the continuous optimum, with the root of the readings; whole numbers move single ones.
+    expected = np.sqrt(some.budget / more.budget)
+    assert expected < 0.8
+    assert np.median(ratio) == pytest.approx(expected, rel=0.1)
+
+
+@cache
+def by_criterion(name: str) -> Planned:
+    """Thirty readings; effects are told apart where there are two of them."""
+    two = small(candidates=30, against=("joint_tilt_compliance", "load_point"))
+    return planned(two if name == "separate" else small(), readings=30, criterion=name)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
+    made = by_criterion(criterion)
+    assert made.criterion == criterion
+    assert 0.5 < made.design.efficiency <= 1.0
+    assert made.ordered.plan.steps
+
+
+def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
+    of, work = usual.problem, usual.work
+    designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
+    for name in designs:
+        asked = objective_of(of, name, work)
+        values = {}
+        for other, made in designs.items():
+            own = objective_of(made.problem, name, made.work)
+            taken = np.flatnonzero(made.counts)
+            m = own.prior + own.units.information(made.counts[taken], taken)
+            values[other] = float(asked.criterion.value(m))
+        assert values[name] >= 0.97 * max(values.values()), (name, values)
+
+
+def test_absolute_readings_are_planned_one_by_one() -> None:
+    made = planned(small(readings="absolute"), readings=25)
+    assert all(len(loads) == 1 for _, loads in made.problem.what)
+    assert made.counts.sum() == made.budget
+    config = small(readings="absolute")
+    assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()
+
+
+def test_a_load_that_is_there_twice_is_said_to_cost_more_than_it_tells() -> None:
+    config = small(load_change_s=600.0)
+    twin = config.loads[1].model_copy(update={"name": "10kg again"})
+    config = config.model_copy(update={"loads": (*config.loads[1:3], twin)})
+    made = planned(config)
+    assert len({name for name, _ in made.costly} & {"10kg", "10kg again"}) >= 1
+    assert all(gain > 0 for _, gain in made.costly)
+    assert any("costs more than it tells" in words for words in remarks(made))
+    steps = [s for s in made.ordered.plan.steps if s.pose != REFERENCE]
+    assert Counter(s.load for s in steps if s.load != UNLOADED) == {
+        load.name: 5 for load in config.loads
+    }
+
+
+def test_no_load_costs_too_much_where_hanging_one_costs_nothing(usual: Planned) -> None:
+    rng = np.random.default_rng(0)
+    assert costly_loads(usual.asked, usual.problem, 25.0, 0.0, rng) == ()
+
+
+def test_the_summary_is_consistent(usual: Planned) -> None:
+    told = summarise(usual, small(), np.random.default_rng(2), lambda words: None)
+    assert told.readings == len(usual.ordered.plan.steps) == sum(told.loads.values())
+    assert {b.criterion for b in told.criteria} == {"D", "A", "E", "K", "I"}
+    best = {b.criterion: b for b in told.criteria}
+    assert best["E"].o3 >= 0.98 * max(b.o3 for b in told.criteria)
+    stds = [point.position_std_m for point in told.curve]
+    assert stds == sorted(stds, reverse=True)
+    assert {s.effect for s in told.detectable} == {"joint_tilt_compliance"}
+    assert all(s.least_m is not None and 1e-7 < s.least_m < 1e-3 for s in told.detectable)
+
+
+def cell_file(directory: Path, config: CellConfig) -> Path:
+    path = directory / "cell.toml"
+    path.write_text(to_toml(config), encoding="utf-8")
+    return path
+
+
+def test_the_command(tmp_path: Path, capsys: Capsys) -> None:
+    cell, plan, table = cell_file(tmp_path, small()), tmp_path / "plan.json", tmp_path / "plan.csv"
+    result = ok(capsys, "plan", cell, "-o", plan, "--poses", "4", "--csv", table, "--json")
+    d = result.document
+    made = load_plan(plan)
+    assert d["readings"] == len(made.steps)
+    assert d["poses"] == len(made.pose_names) - 1 == 4  # as asked, and under every load
+    loads = [load.name for load in small().loads]
+    read = {(s.pose, s.load) for s in made.steps if s.pose != REFERENCE}
+    assert read == {(f"p{k}", load) for k in range(1, 5) for load in ("none", *loads)}
+    assert d["criterion"] == "D"
+    assert 0.7 < d["efficiency"] <= 1.0  # of as many readings at any poses, under any loads
+    assert set(d["predicted_std"]) >= {f"joint_compliance.j{k}" for k in range(1, 7)}
+    assert made.about["efficiency"] == pytest.approx(d["efficiency"], abs=1e-6)
+    rows = list(csv.DictReader(table.read_text(encoding="utf-8").splitlines()))
+    assert len(rows) == d["readings"]
+    assert [int(r["x_order"]) for r in rows] == list(range(1, len(rows) + 1))
+    words = ok(capsys, "plan", cell, "-o", plan, "--poses", "4", "--quick").out
+    assert "efficiency   of the plan: at least" in words
+    assert max(map(len, words.splitlines())) <= 100
+
+
+def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys) -> None:
+    cell = cell_file(tmp_path, quickly_planned(load_config(CELL)))
+    result = run(capsys, "run", cell, "-o", tmp_path / "run.hilcal", "--yes")
+    assert "driver is missing, so there is no arm" in result.err  # after the plan
+    words = " ".join(result.out.split())
+    assert "poses 20 and the reference " in words
+    assert all(f", {name} " in words for name in ("10kg", "pull x", "pull y"))
+    assert "5kg " in words
+    assert "More would give, predicted for the deflection: 30 poses ±" in words
+
+
+def test_an_edited_plan_is_checked(tmp_path: Path, capsys: Capsys) -> None:
+    cell, plan = cell_file(tmp_path, small()), tmp_path / "plan.json"
+    ok(capsys, "plan", cell, "-o", plan, "--poses", "3", "--quick")
+    document = json.loads(plan.read_text(encoding="utf-8"))
+    document["poses"][1]["q_rad"][1] = 0.6  # through the table
+    plan.write_text(json.dumps(document), encoding="utf-8")
+    config = small()
+    problems = dry_run(cell_from_config(config), config, load_plan(plan)).problems
+    assert any(document["poses"][1]["name"] in line for line in problems)
+
+
+def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
+    r = rehearsal("nothing")
+    table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
+    write_table(r.readings, table, WHOLE)
+    cell = cell_file(tmp_path, small())
+    ok(capsys, "import", table, "--config", cell, "-o", run)
+    ok(capsys, "identify", run)
+    arguments = ("plan", cell, "-o", tmp_path / "p.json", "--poses", "3", "--quick", "--json")
+    alone = ok(capsys, *arguments).document
+    on = ok(capsys, *arguments, "--after", run).document
+    stated = ok(capsys, "identify", run, "--json").document["parameters"]
+    std = {p["name"]: p["std"] for p in stated}
+    for k in range(1, 7):
+        name = f"joint_compliance.j{k}"
+        assert on["predicted_std"][name] < alone["predicted_std"][name]
+        assert on["predicted_std"][name] < std[name]
+    assert any("planned on from" in words for words in on["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"tool": {"mass_kg": 14.0}}, "0 keep the payload ([tool] mass_kg"),
+        ({"limits": {"workspace_min_m": (1.0, 1.0, 1.0)}}, "workspace_min_m"),
+        (
+            {"sight": {"tracker_m": (3.0, 0, 1), "target_normal": (0, 0, 1.0),
+                       "incidence_max_rad": 1e-4}},
+            "incidence_max_rad",
+        ),
+    ],
+)  # fmt: skip
+def test_a_cell_that_leaves_nothing_says_which_limit_it_is(
+    changed: dict[str, dict[str, object]], words: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    config = small()
+    sections = {
+        name: getattr(config, name).model_copy(update=keys) for name, keys in changed.items()
+    }
+    cell = cell_file(tmp_path, config.model_copy(update=sections))
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json")
+    assert words in line
+    assert not (tmp_path / "p.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--criterion", "best"), "valid: D, A, E, K, I, separate"),
+        (("--poses", "0"), "valid: a whole number from 1"),
+        (("--readings", "0"), "valid: a whole number from 1"),
+        (("--seed", "-1"), "0 or more"),
+    ],
+)
+def test_numbers_and_names_that_cannot_be(
+    arguments: tuple[str, ...], words: str, tmp_path: Path, capsys: Capsys
+) -> None:
+    cell = cell_file(tmp_path, small())
+    assert words in refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *arguments)
+
+
+def test_loads_that_are_all_too_heavy_are_named(tmp_path: Path, capsys: Capsys) -> None:
+    config = small()
+    heavy = tuple(load.model_copy(update={"mass_kg": 20.0}) for load in config.loads[:2])
+    cell = cell_file(tmp_path, config.model_copy(update={"loads": heavy}))
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json")
+    assert 'load "5kg": tool and load are 20.8 kg; the payload of ur10e is 12.5 kg' in line
+
+
+def test_too_few_readings_say_so(tmp_path: Path, capsys: Capsys) -> None:
+    cell = cell_file(tmp_path, small(against=()))
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "2")
+    assert "raise the budget" in line
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "6")
+    assert "an unknown registration needs at least 4: ask for more readings" in line
+    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--poses", "2")
+    assert "an unknown registration needs at least 4: ask for more poses" in line

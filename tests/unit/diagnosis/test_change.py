@@ -1,0 +1,167 @@
+"""What has changed on an arm: claims on simulated pairs whose mechanics share no code with them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.rehearsal import measurement_noise
+from drivers.simulated.truth import Truth
+from drivers.simulated.world import stand
+from hilcal.cell import Cell
+from hilcal.config import load_config
+from hilcal.diagnosis.change import find_changes
+from hilcal.diagnosis.change_candidates import candidates
+from hilcal.diagnosis.change_found import Changes
+from hilcal.effects.spec import effect
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import with_effects
+from hilcal.identification.earlier import earlier_fit
+from hilcal.identification.remeasured import setting
+from hilcal.robot.catalogue import configs_dir
+from studies.change import StudiedArm, measured, remeasured, studied_arm
+
+CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+
+
+@pytest.fixture(scope="module")
+def arm() -> StudiedArm:
+    return studied_arm(CONFIG, "ur10e", 0, poses=30)
+
+
+def later(
+    arm: StudiedArm,
+    change: Callable[[Truth], Truth],
+    seed: int,
+    *,
+    anew: bool = True,
+    count: int = 15,
+) -> Changes:
+    """Change the arm, measure it again, and compare."""
+    rng = np.random.default_rng(seed)
+    world = replace(arm.world, physics=change(arm.world.physics))
+    if anew:
+        registration, station = stand(arm.cell, rng)
+        world = replace(world, registration=registration, station=station)
+    readings = remeasured(world, arm.loads, count, rng)
+    return find_changes(setting(arm.earlier, readings, anew=anew))
+
+
+def zero(joint: int, size: float) -> Callable[[Truth], Truth]:
+    offset = size * np.eye(6)[joint - 1]
+    return lambda p: p.with_effect("encoder_offset", p.encoder_offset + offset)
+
+
+def softer(joint: int, factor: float) -> Callable[[Truth], Truth]:
+    by = 1.0 + (factor - 1.0) * np.eye(6)[joint - 1]
+    return lambda p: p.with_effect("joint_compliance", p.joint_compliance * by)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_a_change_nothing_is_claimed(arm: StudiedArm, seed: int) -> None:
+    found = later(arm, lambda p: p, seed, anew=seed % 2 == 0)
+    assert found.found == ()
+    assert found.explained
+    assert found.before.rss == pytest.approx(
+        found.before.dof, abs=4 * np.sqrt(2 * found.before.dof)
+    )
+
+
+def test_a_joints_new_zero_and_compliance_are_found_with_their_size(arm: StudiedArm) -> None:
+    true = arm.world.physics.joint_compliance[1]
+    found = later(arm, lambda p: softer(2, 2.0)(zero(5, -1.5e-3)(p)), 11)
+    by_name = {c.candidate.name: c.sizes[0] for c in found.found}
+    assert set(by_name) == {"encoder_offset.j5", "joint_compliance.j2"}
+    assert abs(by_name["encoder_offset.j5"].value + 1.5e-3) < 4 * by_name["encoder_offset.j5"].std
+    moved = by_name["joint_compliance.j2"]
+    assert abs(moved.value - true) < 4 * moved.std
+    assert moved.before is not None
+    assert moved.before[0] == pytest.approx(true, abs=5 * moved.before[1])
+    assert found.explained
+
+
+def test_a_zero_of_joint_1_is_the_trackers_new_place_unless_that_is_the_old_one(
+    arm: StudiedArm,
+) -> None:
+    anew = later(arm, zero(1, 2e-3), 12)
+    assert anew.found == ()
+    assert "encoder_offset.j1" in {h.name for h in anew.hidden}
+    (same,) = later(arm, zero(1, 2e-3), 12, anew=False).found
+    assert same.candidate.name == "encoder_offset.j1"
+
+
+def test_a_target_that_was_mounted_anew_is_no_change_of_the_arm(arm: StudiedArm) -> None:
+    shift = np.array([4e-3, -2e-3, 1e-3])
+    found = later(arm, lambda p: p.with_effect("target_offset", p.target_offset + shift), 13)
+    (moved,) = found.found
+    assert moved.candidate.name == "target_offset"
+    assert not moved.candidate.of_arm
+    assert np.abs([s.value for s in moved.sizes] - shift).max() < 5e-5
+
+
+def test_a_tool_that_is_heavier_is_what_its_columns_say(arm: StudiedArm) -> None:
+    fit = arm.earlier.fit
+    states = fit.readings.states[:20]
+    known = candidates(fit.model.cell, states, fit.model.catalogue, 3, anew=True)
+    (weight,) = [c for c in known if c.name == "tool_weight"]
+    before = fit.model.predict(states, fit.theta)
+    columns = fit.model.jacobian_of((weight.moving.effect,), before, fit.theta, 3)
+    mass = weight.scale[0]
+    cell = fit.model.cell
+    com = cell.tool_mass * cell.tool_com / (cell.tool_mass + mass)  # the mass is at the flange
+
+    def with_cell(other: Cell) -> np.ndarray:
+        effects = tuple(type(e)(other, states, e.options) for e in fit.model.effects)
+        model = replace(fit.model, cell=other, effects=effects)
+        return model.predict(states, fit.theta).observation.position
+
+    heavier = with_cell(replace(cell, tool_mass=cell.tool_mass + mass, tool_com=com))
+    moved = heavier - with_cell(cell)
+    predicted = (columns @ weight.moving.directions)[:, :, 0]
+    assert np.abs(moved).max() > 1e-6
+    np.testing.assert_allclose(predicted, moved, atol=2e-3 * np.abs(moved).max())
+
+
+def test_what_could_not_have_been_seen_is_larger_with_fewer_readings(arm: StudiedArm) -> None:
+    few, many = (later(arm, lambda p: p, 14, count=n) for n in (8, 40))
+    size = [{x.candidate: x.size for x in c.limits} for c in (few, many)]
+    for name in ("encoder_offset.j3", "joint_compliance.j2"):
+        assert size[1][name] < size[0][name]
+
+
+def test_too_few_readings_are_refused(arm: StudiedArm) -> None:
+    readings = remeasured(arm.world, arm.loads, 15, np.random.default_rng(1))
+    with pytest.raises(CannotAnswerError, match="measure at least"):
+        setting(arm.earlier, readings[:3], anew=True)
+
+
+def test_columns_that_the_later_readings_lack_are_named(arm: StudiedArm) -> None:
+    fit = arm.earlier.fit
+    model = fit.model + effect("thermal_growth")
+    warm = replace(arm.earlier, fit=replace(fit, model=model))
+    readings = remeasured(arm.world, arm.loads, 15, np.random.default_rng(1))
+    bare = replace(readings.states, air_temperature=None, joint_temperature=None)
+    with pytest.raises(InputError, match="thermal_growth needs air_temperature"):
+        setting(warm, replace(readings, states=bare), anew=True)
+
+
+def test_a_misfit_that_is_of_poses_is_told_from_one_of_readings(arm: StudiedArm) -> None:
+    rng, off = np.random.default_rng(3), 1e-4
+    noise, joints = measurement_noise(CONFIG), CONFIG.repeatability.per_joint(arm.cell.arm.n)
+    world = nothing_hidden(arm.cell, rng, noise=noise, joint_std=joints)
+    r = measured(world, arm.loads, 30, rng)
+    model = with_effects(arm.cell, r, "absolute", ("joint_compliance",))  # much fewer than poses
+    of_pose = off * rng.standard_normal((int(r.pose.max()) + 1, 3))[r.pose]
+    of_reading = off * rng.standard_normal((len(r), 3))
+    found = [
+        earlier_fit(hc.fit(model, replace(r, value=r.value + shift), readings="absolute"))
+        for shift in (of_pose, of_reading)
+    ]
+    w = found[0].fit.whitening
+    drawn = float(np.mean(w.whiten(of_pose[w.reading]) ** 2))
+    assert found[0].by_pose == pytest.approx(drawn, rel=0.3)  # some of the 90 values are fitted
+    assert found[0].by_pose > 5 * found[0].noise
+    assert found[1].by_pose < 0.5 * found[1].noise  # parameters are shared by a pose, too

@@ -1,0 +1,331 @@
+"""Diagnosis: exact where nothing is wrong, right about what is, and honest where it cannot know."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import f as f_distribution
+from scipy.stats import kstest, poisson
+
+from drivers.simulated.injected_effects import DEFLECTION_EFFECTS
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
+from hilcal.diagnosis.noise import pure_error
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.catalogue import BUILT_IN
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.present.diagnosis_document import to_json
+from hilcal.present.text_seen import could_have_been_seen
+from hilcal.present.verdict_words import headline, message
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import Mode
+from hilcal.refinement import add
+from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
+
+MODES = ("absolute", "deflection")
+NAMES = tuple(e.name for e in BUILT_IN if e.name != "joint_compliance")
+HIDDEN = [
+    *((n, "deflection" if n in DEFLECTION_EFFECTS else "absolute") for n in NAMES),
+    *(
+        pytest.param(n, "absolute", marks=pytest.mark.slow)
+        for n in NAMES
+        if n in DEFLECTION_EFFECTS
+    ),
+]
+"""Every effect every time, in both modes in the slow suite."""
+
+
+def fit_of(c: Campaign, readings: Readings | None = None) -> Fit:
+    given = c.readings if readings is None else readings
+    return fit(baseline(c.cell, given, c.mode), given, c.mode)
+
+
+def hidden(effect: str, mode: Mode, seed: int, poses: int = 30, **options) -> Campaign:
+    known = effect == "base_frame"  # a wrong registration shows only where one is believed
+    return campaign(effect, mode, seed, poses=poses, registration_known=known, **options)
+
+
+# --- nothing is wrong -----------------------------------------------------------------------
+
+
+def null_p_values(
+    mode: Mode, seeds: int, poses: int, first: int = 0, places: bool = True
+) -> dict[str, np.ndarray]:
+    """p-values of every suspect and place over campaigns of one design that differ by noise."""
+    c = campaign("none", mode, plan_seed=0, poses=poses, registration_known=True)
+    model = baseline(c.cell, c.readings, mode)
+    clean = noiseless(c.world, plan(poses))
+    rng = np.random.default_rng(first)
+    out: dict[str, list[float]] = {}
+    for _ in range(seeds):
+        found = fit(model, with_noise(clean, rng), mode)
+        if found.outlier.any():
+            continue  # once in a thousand, and then not the same design
+        p = linearise(found)
+        for s in rank_suspects(p, candidates(p.fit)):
+            if s.score.rank:
+                out.setdefault(s.effect, []).append(s.score.p_value)
+        for v in misfit_breakdown(p) if places else ():
+            if "direction" not in v.variable:
+                out.setdefault(f"where {v.variable}", []).append(v.p_value)
+    return {name: np.array(values) for name, values in out.items()}
+
+
+def check_uniform(found: dict[str, np.ndarray], chance: float) -> None:
+    worst = {n: kstest(p, "uniform").pvalue for n, p in found.items() if len(p) > 20}
+    # So many tests: the smallest p-value of all of them is above chance/tests.
+    assert {n: w for n, w in worst.items() if w < chance / len(worst)} == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+def test_p_values_are_uniform_where_nothing_is_missing(mode):
+    found = null_p_values(mode, 100, 8, places=False)
+    assert {"base_compliance", "hysteresis", "load_point", "joint_stiffening"} <= set(found)
+    check_uniform(found, 1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+def test_p_values_are_uniform_over_many_seeds(mode):
+    found = null_p_values(mode, 600, 14, first=1)
+    for name, p in found.items():
+        print(
+            f"{mode} {name}: p < 0.05 in {np.mean(p < 0.05):.3f}, KS {kstest(p, 'uniform')[1]:.3f}"
+        )
+    check_uniform(found, 1e-3)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_nothing_hidden_is_adequate(mode):
+    for seed in range(2):
+        d = diagnose(fit_of(campaign("none", mode, seed, poses=12)))
+        assert d.verdict == "adequate", message(d)
+        assert d.significant == ()
+        of = "of the catalogue" if mode == "absolute" else "that deflections show"
+        if d.not_shown and mode == "absolute":
+            of = "that these readings could show"
+        assert f"no effect {of} is missing" in message(d)
+
+
+def test_what_deflections_cannot_show_is_part_of_the_verdict():
+    """Errors of geometry cancel in deflections: they are adequate, and the arm is off by them."""
+    for effect in ("link_geometry", "transmission_error"):
+        c = hidden(effect, "absolute", 0, strength=10.0)
+        assert diagnose(fit_of(c)).verdict != "adequate"
+        d = diagnose(fit_of(replace(c, mode="deflection")))
+        assert d.verdict == "adequate", message(d)
+        assert effect in d.not_shown
+        assert headline(d) == "adequate for deflections; geometry is not calibrated"
+        assert "geometry is not calibrated" in message(d)
+        assert "no effect of the catalogue" not in message(d)
+        told = to_json(d)
+        assert effect in told["not_shown"]
+        assert {s["effect"] for s in told["suspects"] if not s["shown"]} >= set(d.not_shown)
+        table = "\n".join(str(x) for x in could_have_been_seen(d) if isinstance(x, str))
+        assert effect in table.partition("At no plausible size would these readings show")[2]
+
+
+# --- something is ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("effect", "mode"), HIDDEN)
+def test_a_hidden_effect_leads(effect, mode):
+    p = linearise(fit_of(hidden(effect, mode, 0)))
+    lead = rank_suspects(p, candidates(p.fit))[0]
+    assert effect in (lead.effect, *lead.same_as)
+    assert lead.score.p_value < 1e-6
+    assert lead.share > 0.5
+    assert lead.holdout_share > 0.3
+
+
+@pytest.mark.parametrize("effect", ["encoder_offset", "hysteresis", "tracker_drift"])
+def test_the_verdict_names_it_and_adding_it_settles_it(effect):
+    found = fit_of(hidden(effect, "absolute", 4))
+    d = diagnose(found)
+    assert d.verdict in ("missing_effect", "ambiguous")
+    assert d.significant[0] == effect
+    assert effect in message(d)
+    after = add(found, effect)
+    assert after.holdout.rms_sigma < 0.6 * found.holdout.rms_sigma
+    low, high = after.variance_factor_interval
+    # 1 lies in the 99.9 % interval, which is 1.7 times as wide.
+    middle = after.variance_factor
+    assert middle - 1.7 * (middle - low) < 1 < middle + 1.7 * (high - middle)
+    assert diagnose(after).verdict == "adequate"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_scores_foretell_what_adding_does(mode):
+    """The F-test of a family is that of the refit with all its columns free."""
+    found = fit_of(hidden("joint_tilt_compliance", mode, 0, strength=0.8, poses=15))
+    p = linearise(found)
+    some = ("base_compliance", "hysteresis", "joint_tilt_compliance")
+    suspects = [s for s in rank_suspects(p, candidates(p.fit)) if s.effect in some]
+    assert len(suspects) == len(some)
+    for s in suspects:
+        after = add(found, s.effect)
+        rank, rest = s.score.rank, found.dof - s.score.rank
+        # Frames with a prior are learnt a little less well beside more parameters.
+        assert after.dof == pytest.approx(rest, abs=0.2)
+        ratio = (found.chi2 - after.chi2) / rank / (after.chi2 / rest)
+        assert s.score.p_value > 1e-200
+        # One linear step against the converged refit.
+        assert f_distribution.isf(s.score.p_value, rank, rest) == pytest.approx(ratio, rel=0.03)
+
+
+def test_effects_that_cannot_be_told_apart_name_each_other():
+    """Turning the base about z is turning the first joint, elastically as well."""
+    found = fit_of(campaign("base_compliance", "deflection", 3, poses=8))
+    p = linearise(found)
+    by_name = {s.effect: s for s in rank_suspects(p, candidates(p.fit))}
+    for s in by_name.values():
+        for other in s.same_as:
+            assert s.effect in by_name[other].same_as
+    tilt, base = by_name["joint_tilt_compliance"], by_name["base_compliance"]
+    apart = abs(tilt.score.log_evidence - base.score.log_evidence)
+    assert ("base_compliance" in tilt.same_as) == (apart < 3)
+
+
+def unknown_effect(poses: int = 30, strength: float = 4.0) -> Campaign:
+    """dq_3 = a sign(q_1) |q_2|: in no catalogue."""
+    c = campaign(plan_seed=0, poses=poses)
+    p = plan(poses)
+    q = p.states.q
+    off = np.zeros_like(q)
+    off[:, 2] = np.sign(q[:, 0]) * np.abs(q[:, 1])
+    at = [c.world.sight(replace(p.states, q=q + a * off)).position for a in (0.0, 1e-4)]
+    white = np.linalg.solve(np.linalg.cholesky(c.readings.covariance), (at[1] - at[0])[:, :, None])
+    a = 1e-4 * strength / np.sqrt(np.mean(white**2))
+    moved = c.world.sight(replace(p.states, q=q + a * off)).position - at[0]
+    return replace(c, readings=replace(c.readings, value=c.readings.value + moved))
+
+
+def test_an_effect_outside_the_catalogue_is_never_called_adequate():
+    d = diagnose(fit_of(unknown_effect()))
+    assert d.verdict != "adequate"
+    assert d.verdict != "noise_misjudged"
+
+
+# --- the noise is ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("factor", [2.0, 0.5])
+def test_misjudged_noise_is_told_from_a_missing_effect_by_repeats(mode, factor):
+    c = campaign("none", mode, plan_seed=0, poses=6, cycles=3)
+    clean = noiseless(c.world, plan(6, 0, 3))
+    d = diagnose(fit_of(c, with_noise(clean, np.random.default_rng(0), factor)))
+    assert d.verdict == "noise_misjudged", message(d)
+    assert d.significant == ()
+    assert d.pure_error is not None
+    low, high = d.pure_error.interval
+    # The 95 % interval, and half as much again.
+    assert low < 1.25 * factor**2
+    assert high > factor**2 / 1.25
+
+
+def test_misjudged_noise_without_repeats_cannot_be_known_to_be_it():
+    c = campaign("none", "absolute", plan_seed=0, poses=12)
+    clean = noiseless(c.world, plan(12))
+    d = diagnose(fit_of(c, with_noise(clean, np.random.default_rng(0), 2.0)))
+    assert d.verdict == "noise_misjudged"
+    assert d.pure_error is None
+    assert "without repeated readings it cannot be known" in message(d)
+
+
+def test_repeats_measure_the_noise_whatever_the_model_misses():
+    factors, expected = [], []
+    for seed in range(6):
+        c = campaign("encoder_offset", seed=seed, plan_seed=0, cycles=3, registration_known=True)
+        found = fit_of(c)
+        repeats = pure_error(found)
+        assert repeats.lack_of_fit_p < 1e-6
+        factors.append(repeats.factor)
+        expected.append(1 / repeats.dof)
+    # 4 σ of the mean of six variance factors.
+    assert np.mean(factors) == pytest.approx(1, abs=4 * np.sqrt(2 * np.sum(expected)) / 6)
+
+
+def test_without_repeats_there_is_no_pure_error():
+    assert pure_error(fit_of(campaign(plan_seed=0))) is None
+
+
+# --- where ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("effect", "mode", "kind"),
+    [
+        ("hysteresis", "absolute", "approach"),
+        ("joint_stiffening", "deflection", "torque"),
+        ("tracker_drift", "absolute", "time"),
+        ("transmission_error", "absolute", "angle"),
+    ],
+)
+def test_the_misfit_follows_the_variable_that_drives_it(effect, mode, kind):
+    places = misfit_breakdown(linearise(fit_of(hidden(effect, mode, 0))))
+    # "pose" and "direction" say where, not after what.
+    follows = [v for v in places if v.variable != "pose" and "direction" not in v.variable]
+    strongest = min(follows, key=lambda v: v.p_value)
+    assert kind in strongest.variable, [(v.variable, v.share, v.p_value) for v in places[:4]]
+    assert any(kind in v.variable for v in follows[:3])
+    assert strongest.p_value < 1e-10
+
+
+def test_where_names_each_variable_once_and_in_order():
+    places = misfit_breakdown(linearise(fit_of(hidden("hysteresis", "absolute", 0))))
+    names = [v.variable for v in places]
+    assert len(set(names)) == len(names)
+    follows = [v.share for v in places if v.variable != "pose" and "direction" not in v.variable]
+    assert follows == sorted(follows, reverse=True)
+    assert all(0 <= v.share <= 1 and 0 <= v.p_value <= 1 for v in places)
+    assert {f"joint {j} torque" for j in range(2, 7)} <= set(names)
+    assert {"time", "load", "joint 1 approach", "joint 6 angle"} <= set(names)
+
+
+# --- form -----------------------------------------------------------------------------------
+
+
+def test_the_document_holds_the_contract():
+    d = diagnose(fit_of(campaign("hysteresis", plan_seed=0)))
+    document = to_json(d)
+    assert document["model"] == ["base_frame", "joint_compliance"]
+    assert document["verdict"] == d.verdict
+    assert document["message"] == message(d)
+    assert document["variance_factor"] == d.fit.variance_factor
+    assert document["predictable_share"] == d.predictable_share
+    assert {"variable", "share", "p_value"} <= set(document["where"][0])
+    keys = {"effect", "p_value", "share", "holdout_share", "delta_bic", "same_as"}
+    assert keys <= set(document["suspects"][0])
+    assert document["suspects"][0]["effect"] == d.suspects[0].effect
+
+
+def test_a_diagnosis_needs_whitened_residuals():
+    c = campaign(plan_seed=0)
+    found = fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute", "none")
+    with pytest.raises(InputError, match="needs scaling gc, this fit has none"):
+        diagnose(found)
+
+
+def test_effects_that_need_missing_columns_are_no_suspects():
+    c = campaign(plan_seed=0)
+    bare = replace(c.readings, states=replace(c.readings.states, time=None, approach=None))
+    d: Diagnosis = diagnose(fit_of(c, bare))
+    assert {"hysteresis", "tracker_drift"}.isdisjoint(s.effect for s in d.suspects)
+    assert all("approach" not in v.variable and v.variable != "time" for v in d.misfit_breakdown)
+
+
+@pytest.mark.slow
+def test_false_alarms_are_as_rare_as_stated():
+    """An effect is named once in a thousand campaigns where none is missing."""
+    found = null_p_values("absolute", 600, 14, first=2)
+    suspects = {n: p for n, p in found.items() if not n.startswith("where")}
+    count = min(len(p) for p in suspects.values())
+    smallest = np.min([p[:count] for p in suspects.values()], axis=0)
+    alarms = int(np.sum(smallest * len(suspects) < 1e-2))
+    assert alarms <= poisson.isf(1e-3, 1e-2 * count)

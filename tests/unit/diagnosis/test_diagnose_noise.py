@@ -1,0 +1,190 @@
+"""Repeats tell noise from model: by how much, in which direction, and when they cannot."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest
+
+from hilcal.diagnosis.noise import PureError, pure_error
+from hilcal.diagnosis.noise_verdict import judge_noise
+from hilcal.diagnosis.repeats import classes, contrasts
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.model.model import Model
+from hilcal.model.observe import motion
+from hilcal.readings.readings import Readings
+from tests.support.campaigns import campaign, noiseless, plan, with_noise
+
+MODES = ("absolute", "deflection")
+
+
+class Repeated:
+    """A campaign measured twice or more, of which some readings are missing."""
+
+    def __init__(self, mode, poses, cycles=2, m=3, missing=0.15, effect="none"):
+        c = campaign(effect, mode, plan_seed=0, poses=poses, cycles=cycles, m=m,
+                     registration_known=True)  # fmt: skip
+        clean = noiseless(c.world, plan(poses, 0, cycles), m)
+        kept = np.random.default_rng(5).random(len(clean)) >= missing
+        self.clean: Readings = clean[kept | clean.unloaded]
+        self.mode = mode
+        self.model: Model = baseline(c.cell, self.clean, mode)
+
+    def fit(self, readings: Readings) -> Fit:
+        return fit(self.model, readings, self.mode)
+
+    def motion(self) -> np.ndarray:
+        p = self.model.predict(self.clean.states, np.zeros(self.model.size))
+        cell, chain = self.model.cell, p.situation.chain
+        return motion(cell, p.observation, chain, p.deviation, self.clean.m).dq
+
+
+def found(r: Repeated, readings: Readings) -> PureError:
+    result = pure_error(r.fit(readings))
+    assert result is not None
+    return result
+
+
+# --- what repeats say is exact --------------------------------------------------------------
+
+
+def null_p_values(mode, m, seeds):
+    r, rng = Repeated(mode, 6, m=m), np.random.default_rng(1)
+    pure, lack = [], []
+    for _ in range(seeds):
+        e = found(r, with_noise(r.clean, rng))
+        pure.append(chi2.sf(e.factor * e.dof, e.dof))
+        lack.append(e.lack_of_fit_p)
+    return pure, lack
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("m", [3, pytest.param(6, marks=pytest.mark.slow)])
+def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m):
+    for p in null_p_values(mode, m, 40):
+        assert kstest(p, "uniform").pvalue > 1e-3 / 8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("m", [3, 6])
+def test_the_factor_is_chi_square_over_many_seeds(mode, m):
+    for p in null_p_values(mode, m, 300):
+        assert kstest(p, "uniform").pvalue > 1e-3 / 8
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_degrees_of_freedom_are_those_of_the_repeats(mode):
+    r = Repeated(mode, 6)
+    c = contrasts(r.fit(with_noise(r.clean, np.random.default_rng(0))))
+    kind = classes(r.clean)
+    # An unloaded reading that deflections share is no measurement by itself.
+    counted = np.ones(len(kind), dtype=bool) if mode == "absolute" else ~r.clean.unloaded
+    again = np.sum(counted) - len(np.unique(kind[counted]))
+    assert c.dof + c.nuisance.shape[1] == 3 * again
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_estimated_covariances_do_not_bias_the_factor(mode):
+    """Ten samples each, and a prior worth twenty."""
+    r, rng, m = Repeated(mode, 8, m=6), np.random.default_rng(2), 6
+    root, factors = np.linalg.cholesky(r.clean.covariance), []
+    for _ in range(12):
+        z = rng.standard_normal((len(r.clean), 9, m))
+        estimate = (20 * np.eye(m) + np.swapaxes(z, 1, 2) @ z) / 29
+        covariance = root @ estimate @ np.swapaxes(root, 1, 2)
+        e = found(r, replace(with_noise(r.clean, rng), covariance=covariance))
+        factors.append(e.factor)
+    # 4 σ of the mean; uncorrected, the factor would be 1.07.
+    assert np.mean(factors) == pytest.approx(1, abs=4 * np.sqrt(2 / e.dof / len(factors)))
+
+
+def test_drift_and_friction_between_repeats_are_not_noise():
+    for effect in ("hysteresis", "tracker_drift"):
+        r = Repeated("absolute", 10, effect=effect)
+        e = found(r, with_noise(r.clean, np.random.default_rng(3)))
+        assert e.lack_of_fit_p < 1e-6
+        assert e.factor == pytest.approx(1, abs=4 * np.sqrt(2 / e.dof))
+
+
+# --- where ----------------------------------------------------------------------------------
+
+
+def spoilt(r: Repeated, what: str, rng: np.random.Generator) -> Readings:
+    read = with_noise(r.clean, rng)
+    value, v = read.value.copy(), r.clean.covariance[:, :3, :3]
+    draw = rng.standard_normal(len(value))[:, None]
+    if what == "along the beam":
+        u = r.clean.value[:, :3] / np.linalg.norm(r.clean.value[:, :3], axis=1)[:, None]
+        value[:, :3] += 3 * u * np.sqrt(np.einsum("ki,kij,kj->k", u, v, u))[:, None] * draw
+    elif what.startswith("joint"):
+        value += r.motion()[:, :, int(what[-1]) - 1] * 4e-5 * draw
+    else:
+        name = "none" if what == "unloaded" else what
+        mine = np.array(r.clean.load_names)[r.clean.load] == name
+        value[mine] += 2 * (read.value - r.clean.value)[mine]
+    return replace(read, value=value)
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("what", ["along the beam", "joint 1", "joint 3", "10kg", "unloaded"])
+def test_the_direction_that_scatters_is_named(mode, what):
+    r = Repeated(mode, 20, missing=0.0)
+    e = found(r, spoilt(r, what, np.random.default_rng(0)))
+    assert e.where is not None
+    assert e.where.name == what
+    assert e.where.p_value < 1e-3
+    assert e.where.interval[0] > 1.5
+    if what == "along the beam":
+        assert e.where.interval[0] < 10 < e.where.interval[1]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_common_factor_has_no_direction(mode):
+    r = Repeated(mode, 10)
+    for seed in range(3):
+        e = found(r, with_noise(r.clean, np.random.default_rng(seed), 2.0))
+        assert e.where is None
+        assert e.interval[0] < 4.5
+        assert e.interval[1] > 3.5
+
+
+# --- the rule -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_repeats_that_scatter_as_much_blame_the_noise(mode, factor):
+    r = Repeated(mode, 8)
+    f = r.fit(with_noise(r.clean, np.random.default_rng(0), factor))
+    verdict = judge_noise(f, pure_error(f), False)
+    assert verdict.misjudged
+    assert verdict.reason == "repeats"
+
+
+def test_repeats_that_scatter_less_blame_the_model():
+    r = Repeated("absolute", 10, effect="encoder_offset")
+    f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
+    verdict = judge_noise(f, pure_error(f), False)
+    assert verdict.off
+    assert not verdict.misjudged
+    assert verdict.reason == "lack_of_fit"
+
+
+def test_without_repeats_it_cannot_be_known():
+    r = Repeated("absolute", 12, cycles=1, missing=0.0)
+    f = r.fit(with_noise(r.clean, np.random.default_rng(0), 2.0))
+    assert pure_error(f) is None
+    verdict = judge_noise(f, None, False)
+    assert verdict.misjudged
+    assert verdict.reason == "unknown"
+    assert not judge_noise(f, None, True).misjudged
+
+
+def test_right_noise_is_not_blamed():
+    r = Repeated("absolute", 8)
+    f = r.fit(with_noise(r.clean, np.random.default_rng(0)))
+    verdict = judge_noise(f, pure_error(f), True)
+    assert not verdict.off
+    assert not verdict.misjudged

@@ -1,0 +1,147 @@
+"""An effect outside of the catalogue: how much of it is predictable, by what, and how."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.diagnosis.residual_regression import Dependence, ResidualRegression, residual_regression
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import linearise
+from hilcal.readings.readings import States
+from tests.support.campaigns import Campaign, campaign, plan
+
+Law = Callable[[States], np.ndarray]
+
+
+def elapsed(s: States) -> np.ndarray:
+    return (s.time - s.time.min()) / np.ptp(s.time)
+
+
+def pull(s: States) -> np.ndarray:
+    return np.linalg.norm(s.wrench[:, :3], axis=1)
+
+
+# Name: what errs (a joint, or a direction of the target), how, and what carries it.
+LAWS: dict[str, tuple[int | tuple[float, ...], Law, set[str]]] = {
+    "dq2 = sin 3 q4": (1, lambda s: np.sin(3 * s.q[:, 3]), {"joint 4 angle"}),
+    "dq1 = cos 2 q3": (0, lambda s: np.cos(2 * s.q[:, 2]), {"joint 3 angle"}),
+    "dq3 = tanh t": (2, lambda s: np.tanh(4 * (elapsed(s) - 0.5)), {"time"}),
+    "p = T5": ((0.5, -0.3, 0.8), lambda s: s.joint_temperature[:, 4] - 25, {"joint 5 temperature"}),
+    "z = air": ((0.0, 0.0, 1.0), lambda s: s.air_temperature - 22, {"air temperature"}),
+    "dq2 = F sin q1": (1, lambda s: pull(s) * np.sin(s.q[:, 0]), {"joint 1 angle", "load"}),
+}
+HIDDEN = [(name, "absolute") for name in LAWS] + [("dq2 = F sin q1", "deflection")]
+
+
+def warm(s: States, seed: int) -> States:
+    """Joints that warm up each in its own way, and air that drifts."""
+    rng, t = np.random.default_rng(seed), elapsed(s)
+    rise = rng.uniform(5, 20, 6) * (1 - np.exp(-t[:, None] / rng.uniform(0.1, 0.8, 6)))
+    wave = rng.uniform(-1, 1) * np.sin(2 * np.pi * t * rng.uniform(0.5, 2))
+    return replace(
+        s,
+        joint_temperature=22 + rise + 0.2 * rng.standard_normal(rise.shape),
+        air_temperature=22 + t + wave + 0.05 * rng.standard_normal(len(t)),
+    )
+
+
+def hidden(name: str, mode: str, seed: int, strength: float = 3.0, poses: int = 30) -> Campaign:
+    """Readings moved by an invented law, in base axes, at so many σ."""
+    c = campaign("none", mode, seed, poses=poses, registration_known=True)
+    p = plan(poses, 1000 + seed)
+    s = warm(p.states, seed)
+    way, law, _ = LAWS[name]
+    size = law(s)
+    at = c.world.sight(p.states).position
+    axes = c.cell.registration[:3, :3]
+
+    def moved(a: float) -> np.ndarray:
+        if isinstance(way, tuple):
+            return a * np.outer(size, axes @ np.array(way))
+        off = np.zeros_like(s.q)
+        off[:, way] = a * size
+        return c.world.sight(replace(p.states, q=s.q + off)).position - at
+
+    def strong(shift: np.ndarray) -> float:
+        v = c.readings.covariance
+        if mode == "deflection":  # each pose begins unloaded
+            first = np.searchsorted(p.pose, p.pose)
+            v, shift = (v + v[first])[p.load > 0], (shift - shift[first])[p.load > 0]
+        white = np.linalg.solve(np.linalg.cholesky(v), shift[:, :, None])
+        return float(np.sqrt(np.mean(white**2)))
+
+    a = 1e-5 * strength / strong(moved(1e-5))
+    return replace(c, readings=replace(c.readings, states=s, value=c.readings.value + moved(a)))
+
+
+def told(c: Campaign) -> ResidualRegression:
+    return residual_regression(
+        linearise(fit(baseline(c.cell, c.readings, c.mode), c.readings, c.mode))
+    )
+
+
+def right(name: str, found: ResidualRegression) -> bool:
+    return bool({v.variable for v in found.dependences[:2]} & LAWS[name][2])
+
+
+@pytest.mark.parametrize(("name", "mode"), HIDDEN)
+def test_its_variable_is_among_the_first_two(name, mode):
+    for seed in range(2):
+        found = told(hidden(name, mode, seed))
+        assert right(name, found), [v.variable for v in found.dependences]
+        assert found.share > 0.5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "mode"), HIDDEN)
+def test_its_variable_is_among_the_first_two_in_most_campaigns(name, mode):
+    seeds = 30
+    hits = sum(right(name, told(hidden(name, mode, 100 + seed))) for seed in range(seeds))
+    print(f"{name} ({mode}): {hits} of {seeds}")
+    assert hits >= 0.9 * seeds
+
+
+def test_shares_of_the_variables_add_up_to_the_whole():
+    found = told(hidden("dq2 = F sin q1", "absolute", 3))
+    assert {v.variable for v in found.dependences} == {"joint 1 angle", "load"}
+    assert sum(v.share for v in found.dependences) == pytest.approx(found.share, rel=0.05)
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_noise_is_not_predictable(mode):
+    for seed in range(4):
+        c = campaign("none", mode, seed, poses=20)
+        c = replace(c, readings=replace(c.readings, states=warm(c.readings.states, seed)))
+        found = told(c)
+        assert found.share < 0.05
+        assert found.dependences == ()
+
+
+def curve_of(name: str, variable: str) -> tuple[Campaign, Dependence]:
+    c = hidden(name, "absolute", 1, strength=6.0, poses=40)
+    return c, next(v for v in told(c).dependences if v.variable == variable)
+
+
+def test_the_curve_is_the_law():
+    _, d = curve_of("dq3 = tanh t", "time")
+    assert d.moves == "joint 3"
+    assert (d.unit, d.y_unit) == ("s", "rad")
+    assert len(d.x) == len(d.y) == len(d.error) == 8
+    assert np.all(np.diff(d.x) > 0)
+    law = np.tanh(4 * ((d.x - d.x.mean()) / (np.ptp(d.x) * 8 / 7)))
+    slope = law @ d.y / (law @ law)
+    assert np.corrcoef(law, d.y)[0, 1] > 0.98
+    # Within a bin the law bends: its mean is not the law at the mean.
+    assert np.all(np.abs(d.y - slope * law) < 5 * d.error + 0.1 * np.ptp(d.y))
+    assert np.ptp(d.y) > 5 * d.error.max()
+
+
+def test_a_curve_of_the_target_has_a_direction_in_base_axes():
+    _, d = curve_of("z = air", "air temperature")
+    assert d.moves == "target"
+    assert d.y_unit == "m"
+    assert abs(d.direction[2]) > 0.95
+    assert np.corrcoef(d.x, d.y)[0, 1] > 0.95

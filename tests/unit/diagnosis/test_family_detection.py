@@ -1,0 +1,48 @@
+"""Minimum detectable size of a family that the number of poses limits."""
+
+import numpy as np
+
+from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.minimum_detectable_effect import least_strength
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.present.diagnosis_document import least
+from hilcal.present.text_seen import could_have_been_seen
+from tests.support.campaigns import campaign
+
+ERROR = "transmission_error"
+
+
+def found(poses: int) -> Fit:
+    c = campaign("none", "absolute", 0, poses=poses, plan_seed=0)
+    return fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute")
+
+
+def test_a_family_is_seen_from_where_poses_left_out_show_it_and_not_finer_than_poses_resolve() -> (
+    None
+):
+    f = found(12)
+    p = linearise(f)
+    (e,) = (e for e in candidates(f) if e.name == ERROR)
+    (s,) = rank_suspects(p, [e])
+    of = effect_columns(f, e)
+    units = tuple(q.unit for q in e.parameters)
+    alone = least_strength(p.information(of.white), of.motion, of.scale, units, f.dof, 1.0, 1e-3)
+    assert s.least.visible
+    assert s.least.displacement_m > alone.displacement_m
+    assert s.least.finest_m == np.inf
+    assert least(s.least)["finer_than_poses"] == {"visible": False, "displacement_m": None}
+    said = [line for line in could_have_been_seen(diagnose(f)) if isinstance(line, str)]
+    assert f"A {ERROR} finer than these poses resolve would be seen at no size.\n" in said
+
+
+def test_more_poses_show_smaller_ones() -> None:
+    sizes = []
+    for poses in (12, 30):
+        f = found(poses)
+        (e,) = (e for e in candidates(f) if e.name == ERROR)
+        sizes.append(rank_suspects(linearise(f), [e])[0].least.displacement_m)
+    assert sizes[1] < 0.6 * sizes[0]

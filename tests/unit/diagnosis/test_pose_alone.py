@@ -1,0 +1,69 @@
+"""A misfit that is the same under every load of a pose: what the data do say of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.doubt import in_doubt
+from hilcal.diagnosis.effect_ranking import candidates
+from hilcal.diagnosis.more_poses import chance, enough
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.linearisation import linearise
+from hilcal.present.diagnosis_document import to_json
+from hilcal.present.verdict_words import message
+from tests.support.campaigns import campaign, measured, plan
+
+
+def fine_error(seed: int, first: int) -> Diagnosis:
+    """Thirty poses; a transmission error of 2 σ with the harmonics from `first` to 21."""
+    options = {"plan_seed": seed, "poses": 30, "strength": 2.0, "harmonics": 21}
+    c = campaign("transmission_error", "absolute", seed, **options)
+    waves = c.world.physics.transmission_error.copy()
+    size = np.sum(waves**2)
+    waves[:, : first - 1] = 0.0
+    waves *= np.sqrt(size / np.sum(waves**2))
+    world = replace(c.world, physics=replace(c.world.physics, transmission_error=waves))
+    r = measured(world, plan(30, seed), np.random.default_rng(seed))
+    return diagnose(fit(baseline(c.cell, r, "absolute"), r, "absolute"))
+
+
+@pytest.mark.parametrize("seed", [2, *(pytest.param(k, marks=pytest.mark.slow) for k in (0, 6))])
+def test_a_transmission_error_too_fine_for_thirty_poses_is_ambiguous(seed: int) -> None:
+    d = fine_error(seed, 3)
+    assert (d.verdict, d.reason) == ("ambiguous", "pose_alone")
+    assert d.pose_alone is not None
+    assert d.pose_alone.share > 0.95
+    assert d.pose_alone.effects[:2] == ("transmission_error", "link_geometry")
+    # 2 · 40 harmonics of six joints, three elements per pose.
+    assert (d.pose_alone.poses, d.pose_alone.more) == (30, 130)
+    assert "the same under every load of a pose" in message(d)
+    assert d.pose_alone.chance > 0.9
+    assert "130 more poses tell with a chance of" in message(d)
+    assert in_doubt(d)[:2] == ("transmission_error", "link_geometry")
+    assert to_json(d)["pose_alone"]["more"] == 130
+
+
+def test_what_depends_on_the_load_is_not_of_the_pose_alone() -> None:
+    c = campaign("creep", "absolute", 0, poses=30)
+    d = diagnose(fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute"))
+    assert d.pose_alone is None
+    assert d.lead is not None
+    assert d.lead.effect == "creep"
+
+
+def test_the_chance_grows_with_the_poses() -> None:
+    """Thirty poses hardly ever tell, many do."""
+    options = {"plan_seed": 0, "poses": 30, "strength": 2.0, "harmonics": 21}
+    c = campaign("transmission_error", "absolute", 0, **options)
+    p = linearise(fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute"))
+    effect = next(e for e in candidates(p.fit) if e.name == "transmission_error")
+    few, many = (chance(p, effect, n, 1e-4, 0.01) for n in (0, 160))
+    assert few < 0.2
+    assert many > 0.9
+    least = enough(p, effect, 130, 1e-4, 0.01)
+    assert least.chance >= 0.9
+    assert 33 < least.more <= 195

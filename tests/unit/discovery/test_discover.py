@@ -1,0 +1,413 @@
+"""Laws searched, and none where nothing is hidden; mechanics that the model does not know."""
+
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from hilcal.discovery import grow, shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.curve import curves
+from hilcal.discovery.discovery import Discovery, discover
+from hilcal.discovery.grammar import grammar
+from hilcal.discovery.law import Form, Part
+from hilcal.discovery.problem import Problem
+from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.refit import exact
+from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.search import Selection, _plainly, _simplicity, search, worth_their_length
+from hilcal.discovery.sites import ORDINARY, sites
+from hilcal.discovery.terms import Term
+from hilcal.discovery.variables import variables
+from hilcal.discovery.write_effect import effect_class, source_of_form
+from hilcal.effects.catalogue import installed
+from hilcal.effects.check import check_effect
+from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.effect_columns import effect_columns
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.present.text_discover import discovery_report, laws_json, refined_laws, silence, to_json
+from hilcal.refinement import refine
+from studies.unmodelled_laws import law_named, shift
+from tests.support.rehearsed import rehearsed
+
+LAW = "compliance by another joint"
+
+
+@cache
+def campaign(law: str = "", stated: float = 1.0, seed: int = 4) -> Fit:
+    """Deflections of 14 poses under two weights, with a law that no effect describes."""
+    of = rehearsed(14, seed)
+    cell, readings, value = of.cell, of.readings, of.readings.value
+    if law:
+        drawn = law_named(law)
+        value = value + shift(
+            drawn, of.world, readings.states, 6.0, "deflection", of.pose, of.cycle
+        )
+    readings = replace(readings, value=value, covariance=stated**2 * readings.covariance)
+    return fit(baseline(cell, readings, "deflection"), readings, "deflection")
+
+
+@cache
+def found() -> Discovery:
+    return discover(campaign(LAW), name="bent")
+
+
+def test_a_law_outside_of_the_catalogue_is_found_with_its_site_and_variables() -> None:
+    law = found().laws[0]
+    assert found().reason == "law"
+    assert law.formula == "dq_3 = a·cos(q_4)·τ_3"
+    assert law.name == "bent"
+    after = found().after
+    assert after is not None
+    assert after.model.names[-1] == "bent"
+    assert law.acts_on == ("joint 3",)
+    assert set(law.variables) == {"joint 4 angle", "joint 3 torque"}
+    assert law.parameters[0].unit == "rad/(N·m)"
+    assert law.p_value < 1e-6
+    assert law.holdout_share > 0.8
+
+
+def test_what_is_written_is_an_effect_that_lowers_the_error() -> None:
+    d, before = found(), campaign(LAW)
+    kind = effect_class(d.source, "bent")
+    check_effect(kind)
+    model = before.model + kind(before.model.cell, before.readings.states)
+    after = fit(model, before.readings, before.mode)
+    assert after.holdout.rms_m < 0.6 * before.holdout.rms_m
+    assert after.variance_factor == pytest.approx(d.laws[0].left, rel=1e-3)
+    assert after.parameters["bent.a"].value == pytest.approx(
+        d.laws[0].parameters[0].value, rel=1e-4
+    )
+
+
+def test_a_refinement_adds_the_law_and_its_file_gives_it_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, laws = campaign(LAW), LawSearch(tmp_path, "bent")
+    monkeypatch.setattr(
+        sys.modules[LawSearch.__module__], "discover", lambda fit, say, name: found()
+    )
+    r = refine(before.model, before.readings, before.mode, laws=laws)
+    assert r.steps[0].diagnosis.verdict == "unknown_effect"
+    assert [s.added for s in r.steps] == [None, "bent"]
+    assert r.verdict == "adequate"
+    laws.write(r.names)
+    again = installed().with_file(tmp_path / "bent.py")
+    stored = r.fit.model.catalogue.file_of("bent")
+    assert stored is not None
+    assert again.files[0].sha256 == stored.sha256
+    states = before.readings.states
+    model = before.model + again.make("bent", before.model.cell, states)
+    seen, same = (m.predict(states, r.fit.theta).observation for m in (r.fit.model, model))
+    assert same.position == pytest.approx(seen.position, abs=1e-12)
+    told = "\n".join(str(part) for part in refined_laws(laws))
+    assert "dq_3 = a·cos(q_4)·τ_3" in told
+    assert str(tmp_path / "bent.py") in told
+    (document,) = laws_json(laws)["discover"]  # type: ignore[misc]
+    assert document["written"] == str(tmp_path / "bent.py")
+
+
+def test_nothing_is_searched_where_the_model_is_adequate(tmp_path: Path) -> None:
+    before, laws = campaign(), LawSearch(tmp_path)
+    assert refine(before.model, before.readings, before.mode, laws=laws).verdict == "adequate"
+    assert laws.found == []
+    assert hc.refine(before.model, before.readings, discover=tmp_path).verdict == "adequate"
+    assert [*tmp_path.iterdir()] == []
+    with pytest.raises(InputError, match="no such folder"):
+        hc.refine(before.model, before.readings, discover=tmp_path / "nowhere")
+
+
+def test_a_law_takes_a_name_and_a_file_that_are_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "found.py").write_text("mine", encoding="utf-8")
+    asked: list[str] = []
+
+    def silent(fit: Fit, say: object, name: str) -> Discovery:
+        asked.append(name)
+        return Discovery(fit, "no_law")
+
+    monkeypatch.setattr(sys.modules[LawSearch.__module__], "discover", silent)
+    laws = LawSearch(tmp_path)
+    assert laws.propose(campaign(LAW), lambda text: None) is None
+    laws.write(("found", "found_2"))
+    assert asked == ["found_2"]
+    assert [p.name for p in tmp_path.iterdir()] == ["found.py"]
+    assert "no law of this size" in "".join(map(str, refined_laws(laws)))
+    (tmp_path / "law_of_demo.py").touch()
+    (tmp_path / "law_of_demo_2.py").touch()
+    LawSearch(tmp_path, "law_of_demo", replacing=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["found.py"]
+
+
+@cache
+def searched() -> list[Selection]:
+    return search(Problem(screen(linearise(campaign(LAW)))))
+
+
+def test_the_same_readings_give_the_same_answer() -> None:
+    first, second = searched(), search(Problem(screen(linearise(campaign(LAW)))))
+    assert [s.terms for s in first] == [s.terms for s in second]
+    assert [s.odds for s in first] == [s.odds for s in second]
+
+
+@pytest.mark.parametrize("stated", [0.5, 2.0])
+def test_noise_that_is_misjudged_is_no_law(stated: float) -> None:
+    d = discover(campaign(stated=stated))
+    assert d.laws == ()
+    assert d.reason in ("adequate", "unpredictable", "catalogue", "no_law")
+    assert silence(d).startswith("no law")
+
+
+def test_a_drift_of_readings_without_times_is_said_to_need_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    of = campaign()
+    timeless = replace(of.readings.states, time=None, load_time=None)
+    value = of.readings.value.copy()
+    value[:, 0] += 400e-6 * np.maximum(np.linspace(-1.0, 1.0, len(value)), 0.0)
+    readings = replace(of.readings, states=timeless, value=value)
+    before = fit(baseline(of.model.cell, readings, "absolute"), readings, "absolute")
+    monkeypatch.setattr(sys.modules[Discovery.__module__], "search", lambda problem: [])
+    d = discover(before)
+    assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
+    assert "whose times are missing" in silence(d)
+    assert "row order carries" in "".join(map(str, discovery_report(d)))
+    assert to_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
+
+
+def test_nothing_is_searched_where_the_noise_explains_the_residual() -> None:
+    d = discover(campaign())
+    assert (d.reason, d.candidates) == ("adequate", 0)
+
+
+@cache
+def screened() -> Screen:
+    return screen(linearise(campaign(LAW)))
+
+
+def test_screening_is_what_the_columns_themselves_give() -> None:
+    s = screened()
+    problem = Problem(s)
+    rng = np.random.default_rng(0)
+    seen = np.argwhere(s.square > 0)
+    for site, amplitude in rng.choice(seen, 40, replace=False).tolist():
+        x = problem.columns(Term(((site, amplitude),), 0.0))
+        exact = float(s.linear.information(x)[0, 0])
+        assert s.square[site, amplitude] == pytest.approx(exact, rel=2e-2)
+        slope = float(x[:, 0] @ problem.residual)
+        size = float(np.linalg.norm(x) * np.linalg.norm(problem.residual))
+        assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
+
+
+def test_candidates_beside_a_term_are_those_of_the_model_with_it() -> None:
+    s = screened()
+    problem = Problem(s)
+    seen = np.argwhere(s.square > 0)
+    (one, two) = np.random.default_rng(1).choice(seen, 2, replace=False).tolist()
+    first, second = (Term((tuple(k),), 0.0) for k in (one, two))
+    beside = problem.beside([first])
+    x, y = problem.columns(first)[:, 0], problem.columns(second)[:, 0]
+    mx = s.linear.project_out(x)
+    left = float(y @ s.linear.project_out(y)) - float(y @ mx) ** 2 / float(x @ mx)
+    assert beside.screened.square[tuple(two)] == pytest.approx(left, rel=2e-2)
+    score = beside.score([second])[0].score
+    assert 0 <= score.gain <= problem.rss
+
+
+def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
+    thinned = screen(linearise(campaign(LAW)))
+    assert len(thinned.readings) <= 27
+    assert not thinned.rows.all()
+    (first, *_) = search(Problem(thinned))
+    (known, *_) = searched()
+    assert first.terms[0].parts == known.terms[0].parts
+    assert first.total == pytest.approx(known.total, rel=1e-6)
+
+
+def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
+    s, f = screened(), campaign(LAW)
+    situation = f.solution.prediction.situation
+    rng = np.random.default_rng(2)
+    for site, amplitude in rng.choice(np.argwhere(s.square > 0), 6, replace=False).tolist():
+        form = Form((Part(s.sites[site], s.grammar.amplitudes[amplitude], 0),))
+        kind = effect_class(source_of_form(form, "tried"), "tried")
+        effect = kind(f.model.cell, situation.states)
+        own = effect_columns(f, effect)
+        assert own.white / own.scale == pytest.approx(
+            form.columns(s, situation) / unit_motion(form), rel=1e-6, abs=1e-6 * np.ptp(own.white)
+        )
+
+
+def unit_motion(form: Form) -> float:
+    return ORDINARY[form.parts[0].site.unit]
+
+
+def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
+    told = "\n".join(str(part) for part in discovery_report(found()))
+    assert "dq_3 = a·cos(q_4)·τ_3" in told
+    assert "acts on      joint 3" in told
+    assert "µrad/(N·m)" in told
+    (law,) = to_json(found())["laws"][:1]  # type: ignore[index]
+    asked = ("name", "formula", "acts_on", "parameters", "holdout_share", "p_value", "variables")
+    assert {*asked} <= {*law}
+    assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
+
+
+def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
+    by_angle, by_torque = found().curves
+    assert (by_angle.site, by_angle.quantity, by_angle.of) == ("joint 3", "q_4", "dq_3/τ_3")
+    assert (by_torque.quantity, by_torque.unit) == ("τ_3", "rad")
+    (a,) = found().laws[0].parameters
+    x, law = by_angle.line
+    assert law == pytest.approx(a.value * np.cos(x), rel=1e-9)
+    for c in (by_angle, by_torque):
+        x, y, std, count = c.binned
+        off = (c.y - np.interp(c.x, *c.line)) / c.std
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(1.0, abs=3 / np.sqrt(2 * len(off)))
+        assert count.sum() == len(c.x)
+        assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
+    told = "".join(str(part) for part in discovery_report(found()))
+    assert "seen for" in told
+    drawn = to_json(found())["curves"][0]  # type: ignore[index]
+    assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
+
+
+def test_a_wave_of_high_order_is_drawn_over_one_period() -> None:
+    f = campaign(LAW)
+    v = next(v for v in variables(f.solution.prediction.situation) if v.symbol == "q_2")
+    wave = Amplitude((Factor(v, shapes.FINE_COS, (40.0,)),))
+    form = Form((Part(screened().sites[1], wave, 0),))
+    after, *_ = exact(screened(), form, "waves")
+    (c,) = curves(after, form)
+    assert np.abs(c.x).max() <= np.pi / 40
+    assert c.quantity == "q_2 within a period of 2π/40"
+
+
+def test_of_equals_the_cause_in_the_joint_itself_is_simpler() -> None:
+    s = screened()
+    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
+    own, other = (
+        _simplicity(s, Term(((2, by[name,]),), 0.0)) for name in ("joint 3 angle", "joint 4 angle")
+    )
+    assert own < other
+
+
+def test_another_joints_temperature_stands_in_for_time_and_is_no_simpler() -> None:
+    cell = example_cell()
+    s = example_situation(cell, example_states(cell))
+    made = grammar([v for v in variables(s) if v.kind in ("temperature", "time", "torque")], s, 14)
+    by = {a.names: k for k, a in enumerate(made.amplitudes) if a.names and a.cost == 1}
+    some = replace(screened(), grammar=made, sites=sites(6))
+    places = {site.symbol: k for k, site in enumerate(some.sites)}
+
+    def cost(name: str, site: str = "dq_3") -> float:
+        return _simplicity(some, Term(((places[site], by[name,]),), 0.0))[0]
+
+    assert cost("joint 4 temperature") == cost("joint 3 temperature") + 1
+    assert cost("joint 4 temperature") == cost("joint 4 temperature", "base_x")
+    assert cost("joint 3 temperature") == cost("joint 4 torque") == cost("time")
+
+
+def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
+    one, two, three = (
+        Selection((Term(((0, 0),), 0.0),) * k, odds)
+        for k, odds in ((1, (182.3,)), (2, (171.9, 9.0)), (3, (171.9, 9.0, 5.0)))
+    )
+    assert worth_their_length([one, two, three]) == [one, three]
+    assert worth_their_length([one, two]) == [one]
+
+
+def test_products_that_were_added_later_are_tried_again_and_extended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    s = screen(linearise(campaign(LAW)))
+    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
+    one, two = by["joint 3 torque",], by["joint 4 torque",]
+    singles = s.grammar.amplitudes
+    cubed = replace(singles[two].factors[0], shape=shapes.ODD, numbers=(2.7, 0.1))
+    inner = s.grammar.index(Amplitude((cubed,)))
+    place = s.grammar.index(Amplitude((*singles[one].factors, cubed)))
+    assert inner is not None
+    assert place is not None
+    assert min(inner, place) >= len(singles)
+    assert s.grammar.index(Amplitude((cubed,))) == inner
+    beside = Problem(s).beside(())
+    monkeypatch.setattr(grow, "MOST", 3)
+    further = grow._products(beside, 2, by["joint 3 torque",])
+    assert further
+    s.grammar.index(further[0])
+    assert grow._products(beside, 2, by["joint 3 torque",]) == further
+    terms = list(beside._extended(2, place))
+    assert ((2, place), (2, inner)) in [t.parts for t in terms]
+    (values,) = s.grammar.rows([place])
+    assert np.sqrt(np.mean(values**2)) == pytest.approx(1.0, rel=1e-6)
+
+
+def test_a_tilt_that_is_a_joints_displacement_is_called_so() -> None:
+    s = screened()
+    named = {site.symbol: s.sites[s.alias[k]].symbol for k, site in enumerate(s.sites)}
+    assert (named["tilt5_y"], named["tilt5_x"], named["dq_4"]) == ("dq_4", "tilt5_x", "dq_4")
+    tilt = next(k for k, site in enumerate(s.sites) if site.symbol == "tilt5_y")
+    told = _plainly(s, Selection((Term(((tilt, s.one),), 0.0),), (1.0,)))
+    assert s.sites[told.terms[0].parts[0][0]].symbol == "dq_4"
+
+
+def test_every_coefficient_has_a_unit() -> None:
+    s = screened()
+    by = {a.names: a for a in s.grammar.amplitudes}
+    assert (
+        Form((Part(s.sites[0], by["joint 2 torque", "joint 3 torque"], 0),))
+        .unit(0)
+        .startswith("rad/(")
+    )
+    for amplitude in s.grammar.amplitudes[:: len(s.grammar.amplitudes) // 200]:
+        form = Form((Part(s.sites[0], amplitude, 0),))
+        assert form.unit(0).startswith("rad")
+        assert form.text().startswith("dq_1 = a")
+        assert form.latex()
+
+
+def with_zero(symbol: str, *more: Part) -> Form:
+    """A law a·cos(q_4)·τ_3, and b times a quantity at the same site."""
+    s = screened().linear.fit.solution.prediction.situation
+    known = {v.symbol: v for v in variables(s)}
+    wave, torque = Factor(known["q_4"], shapes.COS, (1.0,)), Factor(known["τ_3"], shapes.LINEAR)
+    other = Factor(known[symbol], shapes.LINEAR)
+    place = next(x for x in screened().sites if x.field == "dq" and x.element == 2)
+    both = Part(place, Amplitude((other,)), 0), Part(place, Amplitude((wave, torque)), 1)
+    return Form((*both, *more))
+
+
+def test_a_number_that_the_model_absorbs_is_dropped() -> None:
+    """The zero of a compliance that is no constant: the model has one already."""
+    form = with_zero("τ_3")
+    assert form.text() == "dq_3 = a·τ_3 + b·cos(q_4)·τ_3"
+    after, kept, values, kind = exact(screened(), form, "kept")
+    assert kept.text() == "dq_3 = a·cos(q_4)·τ_3"
+    assert [c.name for c in values] == ["a"]
+    assert abs(values[0].value) > 10 * values[0].std
+    assert after.variance_factor == pytest.approx(found().laws[0].left, rel=1e-3)
+    check_effect(kind)
+
+
+def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise CannotAnswerError("it finds no equilibrium")
+
+    monkeypatch.setattr(sys.modules[discover.__module__], "exact", fails)
+    d = discover(campaign(LAW), name="bent")
+    assert d.reason == "no_law"
+    said = silence(d)
+    assert "dq_3 = a·cos(q_4)·τ_3 predicts" in said
+    assert "it finds no equilibrium" in said
+    assert "no law of this size" not in said
+    assert to_json(d)["refused"]

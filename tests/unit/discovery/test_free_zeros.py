@@ -1,0 +1,123 @@
+"""Products one of whose factors has a free zero, as (T − T0)·d: screened as pairs of columns."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude
+from hilcal.discovery.problem import Problem
+from hilcal.discovery.screen import Screen
+from hilcal.discovery.search import _preference, _simplicity, search
+from hilcal.discovery.terms import Scored, Term
+from hilcal.regression.evidence import FamilyScore
+from tests.unit.discovery.test_discover import screened
+
+
+def products(s: Screen, count: int) -> list[tuple[int, int]]:
+    """Sites and products, of which the model explains neither these nor their factors alone."""
+    words = s.grammar
+    seen = s.square > 0
+    out = []
+    rng = np.random.default_rng(3)
+    for f in rng.permutation(np.flatnonzero((words.less >= 0).all(axis=0))).tolist():
+        one, two = words.less[:, f].tolist()
+        places = np.flatnonzero(seen[:, f] & seen[:, one] & seen[:, two])
+        if len(places):
+            out.append((int(rng.choice(places)), f))
+        if len(out) == count:
+            return out
+    raise AssertionError("too few products")
+
+
+def test_a_product_knows_what_is_left_without_either_factor() -> None:
+    words = screened().grammar
+    for _, f in products(screened(), 20):
+        first, second = words.at(f).factors
+        without_first, without_second = words.less[:, f].tolist()
+        assert words.at(without_first) == Amplitude((second,))
+        assert words.at(without_second) == Amplitude((first,))
+    single = words.amplitudes.index(Amplitude((words.singles[0],)))
+    assert words.less[:, single].tolist() == [-1, -1]
+
+
+def test_products_with_their_factors_alone_are_those_of_their_columns() -> None:
+    s = screened()
+    for place, f in products(s, 20):
+        for k, less in enumerate(s.grammar.less[:, f].tolist()):
+            x = s.columns([(place, f), (place, less)])
+            own = s.linear.information(x)
+            size = np.sqrt(own[0, 0] * own[1, 1])
+            assert abs(s.across_less[k, place, f] - own[0, 1]) < 1e-3 * size
+
+
+def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
+    """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
+    s = screened()
+    place, f, less, direction = _nearly_alike(s)
+    p = Problem(s)
+    noise = 0.3 * np.random.default_rng(5).standard_normal(len(p.residual))
+    p.residual = p._thin_residual = 40.0 * direction + p.model.project_out(noise)
+    p.rss = float(p.residual @ p.residual)
+    alone = p.beside(()).score([Term(((place, k),), 0.0) for k in (f, less)])
+    assert all(c.score.gain < 0.05 * p.rss for c in alone)
+    best = search(p, most=1)[0].terms[0]
+    x = np.hstack([p.columns(best)])
+    free = p.model.project_out(x)
+    told = free @ np.linalg.lstsq(free, p.residual, rcond=None)[0]
+    assert told @ told > 0.95 * p.rss
+    assert {at for at, _ in best.parts} == {place}
+
+
+def _nearly_alike(s: Screen) -> tuple[int, int, int, np.ndarray]:
+    """A product of a site, a factor of it alone, and the unit direction between their columns."""
+    for place, f in products(s, 1000):
+        for less in s.grammar.less[:, f].tolist():
+            free = s.linear.project_out(s.columns([(place, f), (place, less)]))
+            unit = free / np.linalg.norm(free, axis=0)
+            cosine = float(unit[:, 0] @ unit[:, 1])
+            if 0.8 < abs(cosine) < 0.97 and s.alias[place] == place:
+                between = unit[:, 0] - np.sign(cosine) * unit[:, 1]
+                return place, f, less, between / np.linalg.norm(between)
+    raise AssertionError("no such pair")
+
+
+def test_a_free_zero_is_as_simple_as_an_exponent_off_the_grid() -> None:
+    s = screened()
+    words = s.grammar
+    root = next(f for f in words.singles if f.shape is shapes.ODD and f.numbers[0] == 0.5)
+    other = next(
+        f for f in words.singles if f.shape is shapes.LINEAR and f.variable is not root.variable
+    )
+    off_grid = replace(root, numbers=(0.7, *root.numbers[1:]))
+    product, tuned, alone = (
+        words.index(Amplitude(factors)) for factors in ((root, other), (off_grid, other), (other,))
+    )
+    assert product is not None
+    assert tuned is not None
+    assert alone is not None
+
+    def simple(*amplitudes: int) -> float:
+        return _simplicity(s, Term(tuple((0, k) for k in amplitudes), 0.0))[0]
+
+    assert simple(product) < simple(product, alone) == simple(tuned)
+
+
+def test_of_equally_simple_terms_the_likelier_is_taken_whatever_its_functions() -> None:
+    s = screened()
+    by = {f.shape.name: f for f in s.grammar.singles if f.variable.names == ("joint 3 torque",)}
+    plus, minus = (s.grammar.index(Amplitude((by[name],))) for name in ("plus", "minus"))
+    assert plus is not None
+    assert minus is not None
+    assert by["plus"].shape.rank < by["minus"].shape.rank
+    likely, less = (
+        _scored(Term(((2, k),), 0.0), odds) for k, odds in ((minus, 12.0), (plus, 10.0))
+    )
+    same = _scored(Term(((2, plus),), 0.0), 12.0)
+    assert _preference(s, likely) < _preference(s, less)
+    assert _preference(s, same) < _preference(s, likely)
+
+
+def _scored(t: Term, odds: float) -> Scored:
+    score = FamilyScore(1.0, odds, 0.0, 0.0, 1, 0.0, 0.0, 0.0, np.zeros(1), None, 0.0)
+    return Scored(t, score)

@@ -1,0 +1,172 @@
+"""The closed-form start: where the tracker stands and where its target sits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hilcal.cell import Cell
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.registration import register
+from hilcal.readings.readings import Readings, States
+from tests.support.arm_cases import slots_of
+from tests.support.campaigns import cell_of, plan
+
+CELL = replace(cell_of(), target_known=False)
+KNOWN = [(False, False), (False, True), (True, False), (True, True)]
+
+angles = st.floats(-np.pi, np.pi)
+turns = st.tuples(angles, angles, angles).map(lambda a: Rotation.from_euler("ZYX", a).as_matrix())
+places = st.tuples(*[st.floats(-8.0, 8.0)] * 3).map(np.array)
+offsets = st.tuples(*[st.floats(-0.3, 0.3)] * 3).map(np.array)
+
+
+def pose_of(turn, place):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, place
+    return pose
+
+
+def poses(count: int = 12) -> np.ndarray:
+    p = plan(count)
+    return p.states.q[np.unique(p.pose, return_index=True)[1]]
+
+
+def flanges_at(q) -> np.ndarray:
+    return np.array([slots_of(CELL.arm, each)[-1] for each in q])
+
+
+def seen(registration, target, m, q=None, noise=0.0, seed=0) -> Readings:
+    """Readings of the rigid arm, by products of homogeneous matrices."""
+    q = poses() if q is None else q
+    at = registration @ flanges_at(q) @ target
+    rng = np.random.default_rng(seed)
+    value = at[:, :3, 3] + noise * rng.normal(size=(len(q), 3))
+    if m == 6:
+        turned = Rotation.from_rotvec(noise * rng.normal(size=(len(q), 3)))
+        value = np.hstack([value, (turned * Rotation.from_matrix(at[:, :3, :3])).as_rotvec()])
+    zero = np.zeros(len(q), dtype=np.int64)
+    return Readings(
+        states=States(q, np.zeros((len(q), 6))),
+        pose=np.arange(len(q)),
+        load=zero,
+        cycle=zero,
+        value=value,
+        covariance=np.tile(1e-10 * np.eye(m), (len(q), 1, 1)),
+        load_names=("none",),
+        pose_names=tuple(f"p{k}" for k in range(len(q))),
+    )
+
+
+def told(registration, target, registration_known, target_known) -> Cell:
+    """A cell that knows what it is said to know, and something wrong of the rest."""
+    return replace(
+        CELL,
+        registration=registration if registration_known else np.eye(4),
+        target=target if target_known else np.eye(4),
+        registration_known=registration_known,
+        target_known=target_known,
+    )
+
+
+@pytest.mark.parametrize("m", [3, 6])
+@pytest.mark.parametrize(("registration_known", "target_known"), KNOWN)
+@given(turn=turns, place=places, tool=turns, offset=offsets)
+def test_what_is_unknown_is_found_exactly(
+    m, registration_known, target_known, turn, place, tool, offset
+):
+    registration, target = pose_of(turn, place), pose_of(tool, offset)
+    cell = told(registration, target, registration_known, target_known)
+    if m == 3 and not target_known:  # the target's axes cannot be seen in positions
+        target = pose_of(np.eye(3), offset)
+    found = register(cell, seen(registration, target, m)).cell
+    # Rounding of readings up to 14 m away, through a few well-conditioned systems; the
+    # alternation for positions stops when it moves by less than 1e-12 m.
+    np.testing.assert_allclose(found.registration, registration, rtol=0, atol=2e-9)
+    np.testing.assert_allclose(found.target, target, rtol=0, atol=2e-9)
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_rotations_are_rotations_and_what_is_known_stays(m):
+    turn = Rotation.from_rotvec([0.0, 0.0, np.pi]).as_matrix()
+    registration, target = pose_of(turn, [1.0, 2.0, 3.0]), pose_of(np.eye(3), [0.1, 0.0, 0.2])
+    readings = seen(registration, target, m, noise=1e-3)
+    for registration_known, target_known in KNOWN:
+        cell = told(registration, target, registration_known, target_known)
+        found = register(cell, readings).cell
+        for pose in (found.registration, found.target):
+            np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+            assert np.linalg.det(pose[:3, :3]) > 0
+            np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
+        if registration_known:
+            np.testing.assert_array_equal(found.registration, registration)
+        if target_known:
+            np.testing.assert_array_equal(found.target[:3, 3], target[:3, 3])
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_noise_enters_in_proportion(m):
+    """Errors of the start are of the noise's size over the lever, and fall with it."""
+    turn = Rotation.from_rotvec([1.0, -2.0, 0.5]).as_matrix()
+    registration, target = pose_of(turn, [2.0, -1.0, 0.3]), pose_of(np.eye(3), [0.1, 0.05, 0.2])
+    cell = told(registration, target, False, False)
+    sizes = []
+    for noise in (1e-3, 1e-5):
+        off = []
+        for seed in range(20):
+            found = register(cell, seen(registration, target, m, noise=noise, seed=seed)).cell
+            x = np.linalg.inv(registration) @ found.registration
+            off.append([np.linalg.norm(x[:3, 3]), np.linalg.norm(x[:3, :3] - np.eye(3))])
+        sizes.append(np.sqrt(np.mean(np.square(off), axis=0)))
+    np.testing.assert_allclose(sizes[0] / sizes[1], 100, rtol=0.05)
+    assert np.all(sizes[1] < 10 * 1e-5)
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_too_few_poses_cannot_answer(m):
+    registration = pose_of(np.eye(3), [1.0, 0.0, 0.0])
+    for q in (poses()[:3], np.repeat(poses()[:3], 5, axis=0)):
+        readings = seen(registration, np.eye(4), m, q)
+        with pytest.raises(CannotAnswerError, match="3 distinct poses; measure at least 4"):
+            register(told(registration, np.eye(4), False, False), readings)
+
+
+def on_the_last_axis() -> np.ndarray:
+    """(4, 4) a target that the last joint does not move."""
+    return pose_of(np.eye(3), [0.0, 0.0, 0.2])
+
+
+def test_positions_on_a_line_cannot_answer():
+    """Four poses, two positions: the last joint turns about the target."""
+    q = np.repeat(poses()[:2], 3, axis=0)
+    q[:, 5] += np.tile([0.0, 1.0, 2.0], 2)
+    registration = pose_of(np.eye(3), [1.0, 0.0, 0.0])
+    readings = seen(registration, on_the_last_axis(), 3, q)
+    with pytest.raises(CannotAnswerError, match="spread in space"):
+        register(told(registration, on_the_last_axis(), False, True), readings)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-5])
+def test_positions_in_one_point_cannot_answer(noise):
+    """Poses about one tip, here on the first joint's axis, do not tell how the base is turned."""
+    q = np.tile(np.array([0.0, -np.pi / 2, 0.1, -np.pi / 2, 0.2, 0.3]), (8, 1))
+    q[:, 0] = np.linspace(-2, 2, 8)
+    tip = np.linalg.inv(flanges_at(q)[0]) @ np.array([0.0, 0.0, 1.0, 1.0])
+    registration, target = pose_of(np.eye(3), [1.0, 0.0, 0.0]), pose_of(np.eye(3), tip[:3])
+    readings = seen(registration, target, 3, q, noise)
+    with pytest.raises(CannotAnswerError, match="spread in space"):
+        register(told(registration, target, False, True), readings)
+
+
+def test_turns_about_one_axis_give_a_start_that_explains_the_readings():
+    """Shifts along the axis cannot be told apart; the start is one of those that fit."""
+    q = np.tile(poses()[0], (6, 1))
+    q[:, 0] += np.linspace(0, 1, 6)
+    registration, target = pose_of(np.eye(3), [1.0, 0.0, 0.0]), pose_of(np.eye(3), [0.1, 0.0, 0.2])
+    readings = seen(registration, target, 3, q)
+    found = register(told(registration, target, False, False), readings).cell
+    again = (found.registration @ flanges_at(q) @ found.target)[:, :3, 3]
+    np.testing.assert_allclose(again, readings.value, rtol=0, atol=1e-6)

@@ -1,0 +1,148 @@
+"""One feasibility: what the planner refuses, a check, a run and the guard refuse, and no more."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.design.feasible import Space
+from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.guard import Guard
+from hilcal.store.plan import UNLOADED, Plan, Step
+from tests.support.arm_cases import ODD, arm_of
+from tests.support.cli_cases import refused, run
+from tests.support.fake_bench import Bench
+from tests.support.space_cases import cell
+
+HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
+BELOW = (0.0, 0.5, 0.9, -1.5, -1.5, 0.0)
+"""The tool of a UR10e is 0.86 m below the plane that it is mounted on."""
+
+
+def refused_lines(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[str, ...]:
+    names = ("reference", *(f"p{k}" for k in range(1, len(states))))
+    plan = Plan(names, np.array(states, dtype=float), (Step(names[-1], load),))
+    return dry_run(cell_from_config(config), config, plan).problems
+
+
+def stopped(config: CellConfig, q: Any) -> str | None:
+    joints = np.array(q, dtype=float)
+    here = replace(Bench().rig.arm.sample(), q=joints, qd=np.zeros(len(joints)))
+    return Guard(cell_from_config(config), config).check(here)
+
+
+def planned(config: CellConfig, q: Any) -> bool:
+    space = Space(cell_from_config(config), config)
+    return bool(space.allowed(np.array([q], dtype=float), UNLOADED, GEOMETRY).all())
+
+
+GEOMETRY = ("joint limits", "workspace", "self-collision", "obstacle")
+
+
+def elbow(height: float) -> tuple[float, ...]:
+    """The elbow's joint of a UR10e at a height above the mounting plane, m."""
+    lift = float(np.arcsin((0.1807 - height) / 0.6127))
+    return (0.0, lift, -lift - 1.0, -1.0, -1.5, 0.0)
+
+
+def with_targets(*more: Any, **limits: Any) -> CellConfig:
+    targets = [
+        {"name": f"t{k}", "target_m": at} for k, at in enumerate(([0.0, 0.0, 0.1], *more), start=1)
+    ]
+    return cell(tool={"targets": targets}, limits=limits)
+
+
+CASES = {
+    "the tool 0.86 m below the mounting plane, no workspace given": (
+        cell(), BELOW, "mounting plane",
+    ),
+    "the elbow 17 mm above a floor at 0": (
+        cell(limits={"workspace_min_m": [-3.0, -3.0, 0.0]}), elbow(0.017), "forearm",
+    ),
+    "a second target 0.39 m outside": (
+        with_targets([0.0, 0.0, 0.7], workspace_min_m=[-3.0, -3.0, 0.17]), HOME, "t2",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("config", "q", "word"), CASES.values(), ids=CASES.keys())
+def test_what_the_planner_refuses_is_refused_and_stops_the_arm(
+    config: CellConfig, q: tuple[float, ...], word: str
+) -> None:
+    assert not planned(config, q)
+    found = refused_lines(config, q)
+    assert any(word in line for line in found), found
+    said = stopped(config, q)
+    assert said is not None
+    assert word in said
+
+
+def test_run_and_check_refuse_it_before_anything_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toml, plan = tmp_path / "cell.toml", tmp_path / "plan.json"
+    arm, tracker = 'driver = "ur"\nhost = "127.0.0.1"', 'driver = "geocom"\nport = "/dev/null"'
+    toml.write_text(f'[robot]\nmodel = "ur10e"\n{arm}\n[tracker]\n{tracker}\n', encoding="utf-8")
+    poses = [{"name": name, "q_rad": q} for name, q in (("reference", HOME), ("low", BELOW))]
+    steps = [{"pose": "low", "load": "none", "cycle": 0}]
+    told = {"format": "hilcal-plan", "version": 1, "poses": poses, "steps": steps}
+    plan.write_text(json.dumps(told), encoding="utf-8")
+    line = refused(capsys, 2, "run", toml, "--plan", plan, "-o", tmp_path / "x.hilcal")
+    assert "pose low: forearm is 0.726 m below the mounting plane z = 0" in line
+    assert "workspace_min_m" in line
+    checked = run(capsys, "check", toml, "--plan", plan, "--json").document["plan"]
+    assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
+
+
+def test_where_the_arm_may_go_below_its_mount_is_said_in_the_cell() -> None:
+    """On a pedestal: the same plan passes by one line of CELL.toml, and the arm is not stopped."""
+    config = cell(limits={"workspace_min_m": [-2.0, -2.0, -1.0]})
+    assert refused_lines(config, HOME, BELOW) == ()
+    assert stopped(config, BELOW) is None
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_the_upper_arm_keeps_the_sides_that_leave_the_shoulder_room(axis: int) -> None:
+    """A side 0.45 m from the axis: lying towards it, the upper arm alone is outside."""
+    most = [3.0, 3.0, 3.0]
+    most[axis] = 0.45
+    lift, turn = (-1.57, 0.0) if axis == 2 else (0.0, np.pi if axis == 0 else -np.pi / 2)
+    q = (turn, lift, 2.6 if axis == 2 else -2.6, 0.0, -1.5, 0.0)
+    limits = {"workspace_min_m": [-3.0, -3.0, -3.0], "workspace_max_m": most}
+    found = refused_lines(cell(limits=limits), HOME, q)
+    assert any("pose p1: upper arm is" in line and "outside" in line for line in found), found
+
+
+def test_the_shape_of_an_unknown_arm_is_said_to_be_guessed() -> None:
+    config = cell()
+    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
+    q = np.zeros((1, unknown.arm.n))
+    dry = dry_run(unknown, config, Plan(("reference",), q, (Step("reference", UNLOADED),)))
+    said = "the shape of odd is not known: its links are guessed"
+    assert said in dry.remarks
+    assert said in Space(unknown, config).remarks
+
+
+def test_guessed_links_are_held_to_each_other_by_planner_dry_run_and_guard() -> None:
+    """States of an arm of unknown shape in which it touches nothing but itself."""
+    config = cell(limits={"workspace_min_m": [-9.0, -9.0, -9.0]}, loads=[])
+    unknown = replace(cell_from_config(config), arm=arm_of(ODD))
+    space, guard = Space(unknown, config), Guard(unknown, config)
+    drawn = np.random.default_rng(0).uniform(-2.0, 2.0, (200, unknown.arm.n))
+    overlap = [q for q in drawn if space.shapes.scene.itself.distance(q) < 0.0]
+    assert len(overlap) > 20
+    for q in overlap[:20]:
+        assert not space.allowed(q[None], UNLOADED, ("self-collision",)).all()
+        plan = Plan(("reference",), q[None], (Step("reference", UNLOADED),))
+        found = [x for x in dry_run(unknown, config, plan).problems if "collide" in x]
+        assert found
+        assert all("its links are guessed" in x for x in found)
+        here = replace(Bench().rig.arm.sample(), q=q, qd=np.zeros(len(q)))
+        said = guard.check(here)
+        assert said is not None
+        assert "collide" in said

@@ -1,0 +1,586 @@
+"""A person beside the arm: it is moved, leaned on, a load falls; and devices that repeat."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.config import Load
+from hilcal.errors import DeviceError
+from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
+from hilcal.measuring.measure import Measurer
+from hilcal.measuring.progress import Phase, Remark
+from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
+from tests.support.fake_world import Killed
+from tests.support.run_cases import measure, rows
+
+FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
+FREE = np.array([0.6, -1.3, 1.6, -1.4, -1.4, 0.1])
+
+
+def jogged(b: Bench, at: str, q: Any, *, after: int = 0) -> None:
+    """Move the arm by hand during the question after `after` others for a load or none."""
+    hang = b.operator.hang
+
+    def moved(load: Load | None, why: str) -> None:
+        hang(load, why)
+        name = "none" if load is None else load.name
+        if name == at and len(b.operator.asked) > after and not moves:
+            moves.append(name)
+            b.world.q = np.array(q)
+
+    moves: list[str] = []
+    b.operator.hang = moved  # type: ignore[method-assign]
+
+
+def confirmed(b: Bench) -> list[str]:
+    """What the operator was asked besides loads."""
+    return [words for name, words in b.operator.asked if name == "confirm"]
+
+
+def carried(b: Bench) -> list[tuple[str, float]]:
+    """What hangs at the start of each motion, and the payload that the controller knows, kg."""
+    start, found = b.rig.arm.start_move, []
+
+    def noted(q: Any, speed: float, acceleration: float) -> None:
+        assert b.world.payload is not None
+        found.append((b.world.load, b.world.payload[0]))
+        start(q, speed, acceleration)
+
+    b.rig.arm.start_move = noted  # type: ignore[method-assign]
+    return found
+
+
+KNOWN = {("none", 0.8), ("3kg", 3.8), ("pull", 0.8)}
+"""What hangs, and its payload with the tool of 0.8 kg."""
+SHORT = plan_of(("p1", "none", 0), ("p1", "3kg", 0), ("reference", "none", 1))
+
+
+# moved by hand
+
+
+def test_an_arm_jogged_into_a_blocked_place_during_the_first_question_is_not_moved() -> None:
+    b = Bench()
+    jogged(b, "none", FOLDED)
+    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand"):
+        measure(b)
+    assert "arm.start_move" not in b.world.calls
+    assert "arm.take_control" not in b.world.calls
+
+
+def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_there() -> None:
+    b = Bench()
+    jogged(b, "none", FREE)
+    measure(b)
+    (asked,) = confirmed(b)
+    assert "shoulder_pan is 0.5 rad off" in asked
+    assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
+
+
+def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again() -> None:
+    b = Bench()
+    jogged(b, "none", FREE)
+    confirm = b.operator.confirm
+    places = [FREE + 0.1, FREE + 0.1]
+
+    def again(question: str) -> None:
+        confirm(question)
+        if places:
+            b.world.q = places.pop()
+
+    b.operator.confirm = again  # type: ignore[method-assign]
+    measure(b)
+    assert len(confirmed(b)) == 2
+
+
+def test_an_arm_jogged_while_control_is_taken_is_not_moved() -> None:
+    b = Bench()
+    take = b.rig.arm.take_control
+
+    def moved(mass: float, com: Any) -> None:
+        take(mass, com)
+        b.world.q = FREE.copy()
+
+    b.rig.arm.take_control = moved  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match=r"has commanded it since.*0\.5 rad"):
+        measure(b)
+    assert "arm.start_move" not in b.world.calls
+
+
+@pytest.mark.parametrize(("load", "after"), [("3kg", 0), ("none", 1)])
+def test_an_arm_moved_while_a_load_is_changed_goes_back_once_that_is_agreed(
+    load: str, after: int
+) -> None:
+    b = Bench()
+    away = np.array(POSES["reference"]) + 0.2 * np.eye(6)[0]
+    jogged(b, load, away, after=after)
+    motions = carried(b)
+    readings = measure(b, SHORT)
+    assert len(readings) == len(SHORT.steps)
+    (asked,) = confirmed(b)
+    assert "shoulder_pan is 0.2 rad off" in asked
+    assert "where it was left" in asked
+    back = [q for q, hung in b.world.at_start if hung == load]
+    assert np.allclose(back[0 if load == "3kg" else -1], POSES["reference"])
+    assert set(motions) <= KNOWN
+
+
+def test_an_arm_moved_to_a_blocked_place_while_a_load_is_hung_ends_the_run() -> None:
+    b = Bench()
+    jogged(b, "3kg", FOLDED)
+    with pytest.raises(DeviceError, match=r"outside the workspace.*drive it by hand.*--resume$"):
+        measure(b)
+    assert not [q for q, load in b.world.at_start if load == "3kg"]
+
+
+def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree() -> None:
+    b = Bench()
+    jogged(b, "none", FREE)
+
+    class Silent:
+        """A driver of others, from before the question."""
+
+        def __init__(self, asks: Any) -> None:
+            self.report, self.hang, self.close = asks.report, asks.hang, asks.close
+
+    b.rig = replace(b.rig, operator=Silent(b.operator))
+    with pytest.raises(DeviceError, match="does not stand where it was left"):
+        measure(b)
+    assert "arm.start_move" not in b.world.calls
+
+
+def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -> None:
+    b = Bench()
+    b.world.kill_after = ("store.recorded", 3)
+    with pytest.raises(Killed):
+        measure(b)
+    b.world.again()
+    measure(b)
+    assert confirmed(b) == []  # it stands where it was read last
+    b = Bench()
+    b.world.kill_after = ("store.recorded", 3)
+    with pytest.raises(Killed):
+        measure(b)
+    b.world.again()
+    b.world.q = FREE.copy()
+    measure(b)
+    assert len(confirmed(b)) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"q": 0.02, "q_target": 0.02}, "another program, or somebody at the pendant"),
+        ({"q": 0.02}, "somebody has moved it"),
+    ],
+)
+def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(
+    change: dict[str, float], said: str
+) -> None:
+    b = Bench()
+    sample = b.rig.arm.sample
+    begun: list[float] = []
+
+    def moved() -> ArmSample:
+        here = sample()
+        if b.world.calls.count("tracker.measure") < 20:
+            return here
+        begun.append(b.world.time)
+        return replace(here, **{name: getattr(here, name) + by for name, by in change.items()})
+
+    b.rig.arm.sample = moved  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match=said):
+        measure(b)
+    assert b.world.time - begun[0] < 1.0
+    assert b.world.calls[-2] == "arm.stop"
+
+
+# in motion
+
+
+def in_motion(b: Bench, change: Any, motion: int = 4) -> list[float]:
+    """Change samples of the arm from the first look on of a motion; returns when that began."""
+    b.world.hurry = 1.0
+    sample = b.rig.arm.sample
+    begun: list[float] = []
+
+    def changed() -> ArmSample:
+        here = sample()
+        if len(b.world.at_start) < motion or not (begun or b.world.is_moving):
+            return here
+        begun.append(b.world.time)
+        return change(here)  # type: ignore[no-any-return]
+
+    b.rig.arm.sample = changed  # type: ignore[method-assign]
+    return begun
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (("q",), "told to be .* rad from where it is.*its angle is old"),
+        (("q", "q_target"), r"joint angles have stood still for 0\.6 s"),
+    ],
+)
+def test_joint_feedback_that_stands_still_in_motion_is_named_within_a_second(
+    names: tuple[str, ...], said: str
+) -> None:
+    b = Bench()
+    first: list[Any] = []
+
+    def frozen(here: ArmSample) -> ArmSample:
+        first.append(here.q)
+        return replace(here, **dict.fromkeys(names, first[0]))
+
+    begun = in_motion(b, frozen)
+    with pytest.raises(DeviceError, match=said):
+        measure(b)
+    assert b.world.time - begun[0] < 1.0
+
+
+def test_a_clock_of_the_arm_that_stands_still_is_named_within_a_second() -> None:
+    b = Bench()
+    first: list[float] = []
+
+    def frozen(here: ArmSample) -> ArmSample:
+        first.append(here.timestamp)
+        return replace(here, timestamp=first[0])
+
+    begun = in_motion(b, frozen)
+    with pytest.raises(DeviceError, match=r"its clock has stood still"):
+        measure(b)
+    assert b.world.time - begun[0] < 1.0
+
+
+def test_an_arm_that_leaves_its_straight_way_is_stopped() -> None:
+    b = Bench()
+    begun = in_motion(b, lambda here: replace(here, q=here.q + 0.06 * np.eye(6)[3]))
+    with pytest.raises(DeviceError, match="wrist_1 has left the straight way"):
+        measure(b)
+    assert b.world.time - begun[0] < 0.1
+
+
+def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
+    b = Bench()
+    b.world.hurry = 0.02
+    sample = b.rig.arm.sample
+    b.rig.arm.sample = lambda: replace(sample(), speed_scaling=0.02)  # type: ignore[method-assign]
+    measure(b, plan_of(("reference", "none", 0), ("p1", "none", 0)))
+
+
+# loads
+
+
+def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again() -> None:
+    b = Bench()
+    b.world.hurry = 1.0
+    moving, fell, payloads = b.rig.arm.moving, [], []
+    set_payload, motions = b.rig.arm.set_payload, carried(b)
+
+    def falls() -> bool:
+        if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
+            b.world.load = "none"
+            fell.append(b.world.time)
+        return moving()
+
+    def noted(mass: float, com: Any) -> None:
+        payloads.append((b.world.load, mass))
+        set_payload(mass, com)
+
+    stopped: list[float] = []
+    stop = b.rig.arm.stop
+
+    def stops() -> None:
+        stopped.append(b.world.time)
+        stop()
+
+    b.rig.arm.moving, b.rig.arm.stop = falls, stops  # type: ignore[method-assign]
+    b.rig.arm.set_payload = noted  # type: ignore[method-assign]
+    readings = measure(b)
+    assert len(readings) == len(usual_plan().steps)
+    assert stopped[0] - fell[0] < 0.5
+    name, why = b.operator.asked[2]
+    assert (name, b.operator.asked[1][0]) == ("3kg", "3kg")
+    assert "0.0 N where 3kg should hang (29.4 N)" in why
+    assert ("none", 0.8) in payloads  # the controller knows that nothing hangs
+    assert set(motions) == KNOWN  # and that it was hung again
+    assert [x["hanging"] for k, x in b.store.events if k == "load"][:3] == ["3kg", None, "3kg"]
+    loaded = rows(readings, "3kg")
+    assert np.allclose(readings.states.wrench[loaded, 2], -3.0 * 9.80665, atol=0.01)
+
+
+def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it() -> None:
+    """It falls while the tracker measures: the reading is kept as doubted, and taken again."""
+    b = Bench()
+    take, fell = b.rig.tracker.measure, []
+
+    def falls() -> TrackerSample:
+        if b.world.load == "3kg" and len(b.store.rows) == 7 and not fell:
+            b.world.load = "none"
+            fell.append(b.world.time)
+        return take()
+
+    b.rig.tracker.measure = falls  # type: ignore[method-assign]
+    measure(b)
+    assert [name for name, _ in b.operator.asked][1:3] == ["3kg", "3kg"]
+    for _, reading, _ in b.store.rows:
+        held = b.world
+        load = reading.load_names[0]
+        if load == "3kg":
+            q = reading.states.q_actual[0]
+            held.q, held.load, held.is_moving = q, load, False
+            assert np.linalg.norm(reading.value[0] - held.position()) < 1e-4
+
+
+@pytest.mark.parametrize("load", ["none", "3kg"])
+def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(
+    load: str,
+) -> None:
+    b = Bench()
+    real = b.rig.force
+    assert real is not None
+    average, leaned = real.average, []
+
+    def leans(seconds: float) -> WrenchSample:
+        ready = len(b.store.rows) == (4 if load == "none" else 7)
+        b.world.extra = np.zeros(6)
+        if ready and b.world.load == load and len(leaned) < 1:
+            leaned.append(b.world.time)
+            b.world.extra = np.array([0, 60.0, 0, 0, 0, 0])
+        return average(seconds)
+
+    real.average = leans  # type: ignore[method-assign]
+    readings = measure(b)
+    assert leaned
+    assert len(readings) == len(usual_plan().steps)
+    doubted = b.store.last("doubted")
+    assert "60" in doubted["why"] or load != "none"
+    assert doubted["reading"]["load"] == load
+    assert [name for name, _ in b.operator.asked].count(load) > 1
+    assert any("somebody touch the tool" in note.text for note in b.notes.of(Remark))
+
+
+def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed() -> None:
+    """Two unloaded readings do not weigh the tool; the tare holds it where the arm turns little."""
+    load = "2kg"
+    b = Bench(loads=(Load(name=load, mass_kg=2.0, hang_m=0.1),))
+    steps = (("p1", "none", 0), ("p3", "none", 0), ("p1", load, 0), ("p3", load, 0))
+    take, fell = b.rig.tracker.measure, []
+
+    def falls() -> TrackerSample:
+        if b.world.load == load and len(b.store.rows) == 3 and not fell:
+            b.world.load = "none"
+            fell.append(load)
+        return take()
+
+    b.rig.tracker.measure = falls  # type: ignore[method-assign]
+    measure(b, plan_of(*steps, poses={k: POSES[k] for k in ("reference", "p1", "p3")}))
+    assert "tool" not in b.store.kinds()
+    assert [name for name, _ in b.operator.asked][-2:] == [load, load]
+    assert f"where {load} should hang" in b.operator.asked[-1][1]
+
+
+def leans_in_phase(b: Bench, phase: str, number: int) -> None:
+    """Lean on the tool with 60 N during one phase of a run, until somebody is asked."""
+    tell, seen = b.notes.notify, []
+
+    def told(event: object) -> None:
+        tell(event)
+        if isinstance(event, Phase):
+            seen.extend([event.text] * (phase in event.text))
+            now = phase in event.text and len(seen) == number
+            b.world.extra = np.array([0, 60.0 * now, 0, 0, 0, 0])
+
+    b.notes.notify = told  # type: ignore[method-assign]
+
+
+@pytest.mark.parametrize(
+    ("phase", "number"), [("moving to beside", 1), ("taring", 2), ("taring", 3)]
+)
+def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared_away(
+    phase: str, number: int
+) -> None:
+    b = Bench()
+    b.world.hurry = 1.0
+    leans_in_phase(b, phase, number)
+    measure(b, SHORT)
+    assert any("feels 60.0 N where nothing should hang" in why for _, why in b.operator.asked)
+    zeros = [d["felt"]["zero"] for d in b.store.details()]
+    assert np.allclose(zeros, b.world.offset, atol=1e-6)
+
+
+def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so() -> None:
+    b = Bench()
+    leans_in_phase(b, "taring", 1)
+    with pytest.raises(DeviceError, match=r"the tool was touched while the sensor was tared"):
+        measure(b, SHORT)
+    assert b.store.rows == []
+    measure(b, SHORT)  # with a tare of its own
+
+
+def test_leaning_in_most_samples_of_a_reading_and_not_at_its_end_is_measured_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    b = Bench()
+    take, taken, averaged = b.rig.tracker.measure, [], Measurer._averaged
+
+    def settled(*arguments: Any) -> Any:
+        taken.extend([0] * (len(b.store.rows) == 1))
+        return averaged(*arguments)
+
+    monkeypatch.setattr(Measurer, "_averaged", settled)
+
+    def leaned() -> TrackerSample:
+        taken.extend([0] * bool(taken))
+        now = len(taken) in (3, 4)  # the second and the third of three
+        b.world.extra, b.world.shift = 60.0 * now * np.eye(6)[1], 1.2e-3 * now * np.eye(3)[1]
+        return take()
+
+    b.rig.tracker.measure = leaned  # type: ignore[method-assign]
+    average = b.rig.force.average  # type: ignore[union-attr]
+
+    def free(seconds: float) -> WrenchSample:
+        b.world.extra, b.world.shift = np.zeros(6), np.zeros(3)
+        return average(seconds)
+
+    b.rig.force.average = free  # type: ignore[union-attr, method-assign]
+    measure(b, SHORT)
+    assert any("was the tool touched" in note.text for note in b.notes.of(Remark))
+    b.world.is_moving, b.world.extra, b.world.shift = False, np.zeros(6), np.zeros(3)
+    for _, reading, _ in b.store.rows:
+        b.world.q, b.world.load = reading.states.q_actual[0], reading.load_names[0]
+        assert np.linalg.norm(reading.value[0] - b.world.position()) < 1e-4
+
+
+def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with() -> None:
+    b = Bench()
+    b.world.tool_mass = 4.0  # [tool] says 0.8 kg, which the controller is told
+    with pytest.raises(DeviceError, match=r"asked 3 times") as raised:
+        measure(b)
+    assert any("[tool] mass_kg" in why for _, why in b.operator.asked), raised.value
+
+
+def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
+    """Below what is noticed at once: 5 N to one side in one of five."""
+    b = Bench()
+    real = b.rig.force
+    assert real is not None
+    average = real.average
+
+    def leans(seconds: float) -> WrenchSample:
+        b.world.extra = np.array([0, 5.0 * (len(b.store.rows) == 2), 0, 0, 0, 0])
+        return average(seconds)
+
+    real.average = leans  # type: ignore[method-assign]
+    measure(b)
+    assert b.store.last("tool")["mass_kg"] == pytest.approx(0.8, abs=1e-6)
+    assert any("was the tool touched" in note.text for note in b.notes.of(Remark))
+
+
+def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
+    b = Bench()
+    b.world.hurry = 1.0
+    latest = b.rig.force.latest  # type: ignore[union-attr]
+
+    def swings() -> WrenchSample:
+        one = latest()
+        if b.world.load == "3kg" and b.world.is_moving:
+            one.wrench[:3] += 6.0 * np.sin(2 * np.pi * b.world.time / 0.8)
+        return one
+
+    b.rig.force.latest = swings  # type: ignore[union-attr, method-assign]
+    measure(b)
+    assert [name for name, _ in b.operator.asked] == ["none", "3kg", "none", "pull", "none"]
+
+
+def test_a_load_that_stays_wrong_ends_the_run() -> None:
+    b = Bench()
+    b.world.hurry = 1.0
+    moving, fell = b.rig.arm.moving, []
+
+    def falls() -> bool:
+        if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
+            b.world.load, b.world.wrong = "none", ["none"] * 3
+            fell.append(b.world.time)
+        return moving()
+
+    b.rig.arm.moving = falls  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match=r"asked 3 times to hang 3kg.*--resume$"):
+        measure(b)
+    assert len(b.store.rows) == 7
+
+
+# devices that repeat themselves
+
+
+def test_a_tracker_whose_target_does_not_move_with_the_arm_is_named_before_any_reading() -> None:
+    b = Bench()
+    still = b.world.position()
+    b.world.position = lambda: still  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="repeats an old reading, or follows a reflector"):
+        measure(b)
+    assert b.store.rows == []
+
+
+def test_a_tracker_that_repeats_one_measurement_is_named() -> None:
+    b = Bench()
+    take = b.rig.tracker.measure
+    kept: list[TrackerSample] = []
+
+    def repeats() -> TrackerSample:
+        one = take()
+        if len(b.store.rows) == 3:
+            kept.append(one)
+            return replace(one, value=kept[0].value)
+        return one
+
+    b.rig.tracker.measure = repeats  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="the same to the last digit"):
+        measure(b)
+    assert len(b.store.rows) == 3
+
+
+def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named_with_its_first_reading() -> (
+    None
+):
+    b = Bench()
+    place = b.world.position
+    kept: list[Any] = []
+
+    def stuck() -> Any:
+        if len(b.store.rows) < 2:
+            kept[:] = [place()]
+        return kept[0]
+
+    b.world.position = stuck  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="repeats an old reading"):
+        measure(b)
+    assert len(b.store.rows) == 2
+    assert "why" in b.store.last("doubted")
+
+
+def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on() -> None:
+    """As older versions stored them: four right ones, then three at one and the same place."""
+    b = Bench()
+    plan = usual_plan()
+    b.world.kill_after = ("store.recorded", 7)
+    with pytest.raises(Killed):
+        measure(b, plan)
+    step, reading, _ = b.store.rows[3]
+    for k in (4, 5, 6):
+        step, other, text = b.store.rows[k]
+        b.store.rows[k] = (step, replace(other, value=reading.value), text)
+    b.world.again()
+    assert len(measure(b, plan)) == len(plan.steps)
+
+
+def test_a_force_sensor_that_repeats_itself_is_named() -> None:
+    b = Bench()
+    force = b.rig.force
+    assert force is not None
+    average = force.average
+    force.average = lambda s: replace(average(s), covariance=np.zeros((6, 6)))  # type: ignore
+    with pytest.raises(DeviceError, match="frames are the same to the last digit"):
+        measure(b)
+    assert b.store.rows == []

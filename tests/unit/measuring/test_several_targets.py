@@ -1,0 +1,195 @@
+"""Several reflectors at each stop: pointed to, read one after the other, stored together."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.config import Tool
+from hilcal.config.cell import Target
+from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import TargetLostError, TrackerSample, WrenchSample
+from hilcal.measuring.progress import ReadingStored, Remark
+from hilcal.measuring.rig import Rig
+from hilcal.measuring.run import run
+from hilcal.present.text_info import event_words
+from hilcal.readings.readings import Readings
+from hilcal.robot import chain as chains
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog, create_run
+from hilcal.types import Floats
+from tests.support.fake_bench import Bench, usual_plan
+from tests.support.fake_devices import STD, FakeTracker
+from tests.support.fake_world import REGISTRATION, SAG, Killed, World
+from tests.support.reflector_cases import NAMES, OFFSETS
+
+TOOL = Tool(
+    targets=tuple(
+        Target(name=n, target_m=tuple(at)) for n, at in zip(NAMES, OFFSETS.tolist(), strict=True)
+    ),
+    load_point_m=(0.05, 0.0, 0.15),
+    mass_kg=0.8,
+    com_m=(0.01, 0.0, 0.06),
+)
+BOOTSTRAP = 3
+"""Stops at which only the first target is read: with the positions beside the reference and at it,
+these readings tell where the tracker stands."""
+
+
+def places(world: World) -> Floats:
+    """(3, 3) where the reflectors are, sensor axes."""
+    chain = chains.evaluate(world.cell.arm, world.joints()[None])
+    at = np.array([chain.point(offset)[0] for offset in OFFSETS]) + SAG * world.pull()[:3]
+    return at @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
+
+
+@dataclass
+class PointedTracker(FakeTracker):
+    """A tracker that holds the reflector it was last pointed to."""
+
+    held: int = 0
+    hidden: set[tuple[float, int]] = field(default_factory=set)  # first joint's angle, number
+    misled: bool = False
+
+    def _seen(self, k: int) -> bool:
+        q = float(self.world.joints()[0])
+        return not any(abs(q - at) < 1e-6 and k == number for at, number in self.hidden)
+
+    def aim(self, position: Floats, radius: float) -> None:
+        self.world.call("tracker.aim")
+        away = np.linalg.norm(places(self.world) - position, axis=1)
+        k = int(np.argmin(away))
+        if not self._seen(k):
+            raise TargetLostError("tracker: no target in sight")
+        assert away[k] < radius
+        self.held = 0 if self.misled and k == 1 else k
+
+    def measure(self) -> TrackerSample:
+        self.world.call("tracker.measure")
+        self.world.time += 0.1
+        if not self._seen(self.held):
+            raise TargetLostError("tracker: the beam is broken")
+        value = places(self.world)[self.held] + STD * self.world.rng.standard_normal(3)
+        return TrackerSample(int(self.world.time * 1e9), value, STD**2 * np.eye(3))
+
+
+def bench() -> tuple[Bench, PointedTracker]:
+    b = Bench(tool=TOOL)
+    tracker = PointedTracker(b.world)
+    b.rig = Rig(b.rig.arm, tracker, b.rig.force, b.rig.operator)
+    return b, tracker
+
+
+def measure(b: Bench, path: Path) -> Readings:
+    plan = usual_plan()
+    made = CampaignFile.open(path) if path.exists() else create_run(path, b.config, Path(), plan)
+    with made as file:
+        run(b.rig, b.cell, b.config, plan, RunLog(file), b.clock, b.notes)
+        return file.readings()
+
+
+def by_key(r: Readings) -> dict[tuple[str, str, int, str], Floats]:
+    return {
+        (r.pose_names[p], r.load_names[load], int(c), r.target_names[t]): value
+        for p, load, c, t, value in zip(r.pose, r.load, r.cycle, r.target, r.value, strict=True)
+    }
+
+
+def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
+    b, _ = bench()
+    r = measure(b, tmp_path / "r.hilcal")
+    plan = usual_plan()
+    stops = len(plan.steps)
+    assert r.target.tolist() == [0] * BOOTSTRAP + [0, 1, 2] * (stops - BOOTSTRAP)
+    assert len(np.unique(r.arrivals)) == stops
+    told = [e.text for e in b.notes.of(Remark) if "only target R1" in e.text]
+    assert len(told) == 1
+    assert [e.done for e in b.notes.of(ReadingStored)] == list(range(1, stops + 1))
+    chain = chains.evaluate(b.cell.arm, r.states.q)
+    held = chain.point(OFFSETS[r.target]) + SAG * r.states.wrench[:, :3]
+    seen = held @ REGISTRATION[:3, :3].T + REGISTRATION[:3, 3]
+    assert np.abs(r.value - seen).max() < 6 * STD
+    assert r.states.time is not None
+    assert np.all(np.diff(r.states.time) > 0)
+
+
+def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> None:
+    b, tracker = bench()
+    angle = float(usual_plan().joints("p4")[0])
+    tracker.hidden = {(angle, 1)}
+    r = measure(b, tmp_path / "some.hilcal")
+    steps = usual_plan().steps[BOOTSTRAP:]
+    wanted = {(s.pose, s.load, s.cycle, n) for s in steps for n in NAMES}
+    lost = {key for key in wanted if key[0] == "p4" and key[3] == "R2"}
+    assert lost
+    later = {key for key in by_key(r) if key[:3] in {(s.pose, s.load, s.cycle) for s in steps}}
+    assert later == wanted - lost
+    words = [e.text for e in b.notes.of(Remark) if "R2 is not read" in e.text]
+    assert words == ["p4: target R2 is not read: tracker: no target in sight"] * len(lost)
+    b, tracker = bench()
+    tracker.hidden = {(angle, k) for k in range(3)}
+    with pytest.raises(DeviceError, match=r"p4: .*all others.* run again with --resume"):
+        measure(b, tmp_path / "none.hilcal")
+
+
+def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
+    b, tracker = bench()
+    tracker.misled = True
+    r = measure(b, tmp_path / "r.hilcal")
+    assert set(r.target.tolist()) == {0, 2}
+    assert any(
+        "R2 is not read: tracker: it sees R1 in its place" in e.text for e in b.notes.of(Remark)
+    )
+
+
+def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
+    b, _ = bench()
+    force = b.rig.force
+    assert force is not None
+    average, leaned = force.average, []
+
+    def leans(seconds: float) -> WrenchSample:
+        wanted = len(b.notes.of(ReadingStored)) == BOOTSTRAP and not leaned
+        leaned.extend([seconds] * wanted)
+        b.world.extra = np.array([0, 60.0 * wanted, 0, 0, 0, 0])
+        sample = average(seconds)
+        b.world.extra = np.zeros(6)
+        return sample
+
+    force.average = leans  # type: ignore[method-assign]
+    r = measure(b, tmp_path / "r.hilcal")
+    assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
+    with CampaignFile.open(tmp_path / "r.hilcal") as file:
+        doubted = [e for e in RunLog(file).events() if e["kind"] == "doubted"]
+    assert [e["reading"]["target"] for e in doubted] == list(NAMES)
+    words = event_words(doubted[0])
+    assert "reading of p3, none, R1 kept as doubted: the force sensor feels" in words
+
+
+@pytest.mark.parametrize("call", [("tracker.aim", 8), ("tracker.measure", 60)])
+def test_a_killed_run_goes_on_with_whole_arrivals(tmp_path: Path, call: tuple[str, int]) -> None:
+    b, _ = bench()
+    b.world.kill_after = call
+    with pytest.raises(Killed):
+        measure(b, tmp_path / "r.hilcal")
+    with CampaignFile.open(tmp_path / "r.hilcal") as file:
+        stored = file.readings()
+        done = RunLog(file).done()
+        assert len(done) == len(np.unique(stored.arrivals))
+        # After the start all targets of a stored arrival are there.
+        assert stored.target.tolist()[BOOTSTRAP:] == [0, 1, 2] * (len(done) - BOOTSTRAP)
+    b.world.again()
+    r = measure(b, tmp_path / "r.hilcal")
+    assert len(by_key(r)) == len(r) == BOOTSTRAP + 3 * (len(usual_plan().steps) - BOOTSTRAP)
+
+
+def test_what_cannot_be_pointed_is_refused(tmp_path: Path) -> None:
+    b = Bench(tool=TOOL)
+    with pytest.raises(InputError, match=r"driver cannot be told which .* no method `aim`"):
+        measure(b, tmp_path / "r.hilcal")
+    rough = TOOL.targets[1].model_copy(update={"target_m": None})
+    tool = TOOL.model_copy(update={"targets": (TOOL.targets[0], rough)})
+    b = Bench(tool=tool)
+    with pytest.raises(InputError, match=r'target "R2" has no target_m: .* estimate = true'):
+        measure(b, tmp_path / "s.hilcal")

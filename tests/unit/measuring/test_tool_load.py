@@ -1,0 +1,294 @@
+"""What the force sensor weighs: zero, tool and load, with what it is known of them."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2 as chi2_law
+
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.measuring.tool_load import compare, identify_tool_load, shift, tare
+
+GRAVITY = np.array([0.0, 0.0, -9.80665])
+BIAS = np.array([4.0, -2.5, 7.0, 0.3, -0.2, 0.1])
+MASS, COM = 1.7, np.array([0.01, -0.02, 0.06])
+
+
+def rotations(number, rng):
+    return Rotation.random(number, random_state=rng).as_matrix()
+
+
+def reading(rotation, gravity=GRAVITY, bias=BIAS, mass=MASS, com=COM, load=None):
+    """(K, 6) what the sensor reads, by forces and levers in base axes; load (K, 6) likewise."""
+    out = np.empty((len(rotation), 6))
+    for k, R in enumerate(rotation):
+        force = mass * gravity
+        moment = np.cross(R @ com, force)
+        if load is not None:
+            force, moment = force + load[k, :3], moment + load[k, 3:]
+        out[k] = np.concatenate([R.T @ force, R.T @ moment])
+    return out + bias
+
+
+def covariances(number, rng, scale=1.0):
+    """(K, 6, 6) correlated, not alike."""
+    std = np.repeat((0.05, 0.002), 3) * scale
+    mix = rng.standard_normal((number, 6, 6)) * 0.3 + np.eye(6)
+    return std[:, None] * (mix @ np.swapaxes(mix, 1, 2)) * std
+
+
+def noise(covariance, rng):
+    root = np.linalg.cholesky(covariance)
+    return (root @ rng.standard_normal((len(covariance), 6, 1)))[..., 0]
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(11)
+
+
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    mass=st.floats(0.0, 20.0),
+    com=st.tuples(*[st.floats(-0.3, 0.3)] * 3),
+    poses=st.integers(4, 30),
+)
+def test_without_noise_everything_is_recovered(seed, mass, com, poses):
+    rng = np.random.default_rng(seed)
+    gravity = Rotation.random(random_state=rng).apply(GRAVITY)
+    R = rotations(poses, rng)
+    bias = rng.normal(size=6) * np.repeat((10.0, 1.0), 3)
+    wrench = reading(R, gravity, bias, mass, np.array(com))
+    try:
+        found = identify_tool_load(wrench, covariances(poses, rng), R, gravity)
+    except CannotAnswerError:
+        u = np.swapaxes(R, 1, 2) @ gravity / 9.80665
+        assert np.linalg.svd(u - u.mean(axis=0))[1][1] < 0.1 * np.sqrt(poses)
+        return
+    assert found.bias == pytest.approx(bias, abs=1e-7)
+    assert found.mass == pytest.approx(mass, abs=1e-8)
+    assert found.moment == pytest.approx(mass * np.array(com), abs=1e-8)
+    assert found.chi2 == pytest.approx(0.0, abs=1e-8)
+    assert (found.dof, found.poses) == (6 * poses - 10, poses)
+    if mass > 0.5:
+        assert found.com == pytest.approx(np.array(com), abs=1e-6)
+    assert found.load_wrench(wrench, R) == pytest.approx(np.zeros((poses, 6)), abs=1e-6)
+
+
+def test_estimates_scatter_as_their_covariance_says(rng):
+    K, N = 8, 1500
+    R, cov = rotations(K, rng), covariances(K, rng)
+    truth = np.concatenate([BIAS, [MASS], MASS * COM])
+    found = [identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY) for _ in range(N)]
+    x = np.array([np.concatenate([f.bias, [f.mass], f.moment]) for f in found])
+    inverse = np.linalg.inv(found[0].covariance)
+    error = x - truth
+    # squared Mahalanobis distances are chi² of 10; their mean has the variance 20 / N
+    distance = np.einsum("ki,ij,kj->k", error, inverse, error)
+    assert distance.mean() == pytest.approx(10.0, abs=4 * np.sqrt(20 / N))
+    # each direction by itself: whitened scatter is the unit matrix
+    L = np.linalg.cholesky(found[0].covariance)
+    white = np.linalg.solve(L, error.T)
+    assert white @ white.T / N == pytest.approx(np.eye(10), abs=5 * np.sqrt(2 / N))
+    chi2 = np.array([f.chi2 for f in found])
+    assert chi2.mean() == pytest.approx(6 * K - 10, abs=4 * np.sqrt(2 * (6 * K - 10) / N))
+    assert np.mean(chi2 > chi2_law.ppf(0.95, 6 * K - 10)) == pytest.approx(0.05, abs=0.023)
+    com = np.array([f.com for f in found])
+    assert com.std(axis=0) == pytest.approx(found[0].com_std, rel=0.1)
+
+
+def test_the_least_certain_readings_weigh_least(rng):
+    R, cov = rotations(10, rng), covariances(10, rng)
+    wrench = reading(R)
+    wrench[0] += 50.0
+    cov[0] *= 1e10
+    found = identify_tool_load(wrench, cov, R, GRAVITY)
+    assert found.mass == pytest.approx(MASS, abs=1e-4)
+
+
+def test_a_wrong_model_shows_in_the_variance_factor(rng):
+    R, cov = rotations(10, rng), covariances(10, rng)
+    turned = R @ Rotation.from_rotvec([0.0, 0.1, 0.0]).as_matrix()  # the sensor sits askew
+    assert identify_tool_load(reading(turned), cov, R, GRAVITY).variance_factor > 100.0
+    good = identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY)
+    assert 0.4 < good.variance_factor < 1.9
+
+
+@pytest.mark.parametrize(
+    ("turns", "missing"),
+    [
+        ([[0, 0, 0]], "mass and centre of mass"),
+        ([[0, 0, 0], [0, 0, 1.0], [0, 0, 2.0]], "mass and centre of mass"),
+        ([[0, 0, 0], [0, 1.0, 0]], "centre of mass in one direction"),
+        ([[0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [0, 1.0, 0]], "centre of mass in one direction"),
+    ],
+)
+def test_orientations_that_do_not_determine_the_tool_are_refused(turns, missing, rng):
+    R = Rotation.from_rotvec(turns).as_matrix()
+    with pytest.raises(CannotAnswerError, match=f"do not determine the tool's {missing}") as caught:
+        identify_tool_load(reading(R), covariances(len(R), rng), R, GRAVITY)
+    assert "3 or more poses" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_the_rank_messages_say_is_so():
+    """Two tools that differ only along the missing direction read alike."""
+    R = Rotation.from_rotvec([[0, 0, 0], [0, 1.0, 0]]).as_matrix()
+    u = np.swapaxes(R, 1, 2) @ GRAVITY
+    along = (u[1] - u[0]) / np.linalg.norm(u[1] - u[0])
+    other = COM + 0.05 * along
+    bias = BIAS.copy()
+    bias[3:] -= MASS * np.cross(other - COM, u[0])
+    assert reading(R, com=other, bias=bias) == pytest.approx(reading(R), abs=1e-12)
+
+
+def test_three_orientations_are_enough(rng):
+    R = Rotation.from_rotvec([[0, 0, 0], [0.6, 0, 0], [0, 0.6, 0]]).as_matrix()
+    found = identify_tool_load(reading(R), covariances(3, rng), R, GRAVITY)
+    assert found.com == pytest.approx(COM, abs=1e-8)
+
+
+def test_a_sensor_that_is_mounted_the_other_way_round_is_told_of(rng):
+    R = rotations(6, rng)
+    with pytest.raises(CannotAnswerError, match="axes or its sign are wrong: check rotvec_rad"):
+        identify_tool_load(-reading(R), covariances(6, rng), R, GRAVITY)
+
+
+@pytest.mark.parametrize("what", ["wrench", "covariance", "rotation"])
+def test_values_that_are_no_numbers_are_refused(what, rng):
+    R = rotations(6, rng)
+    given = {"wrench": reading(R), "covariance": covariances(6, rng), "rotation": R}
+    given[what] = given[what].copy()
+    given[what][2, ..., 0] = np.nan
+    with pytest.raises(InputError, match=f"{what} has values that are no finite numbers"):
+        identify_tool_load(**given, gravity=GRAVITY)
+
+
+def test_covariances_that_weigh_nothing_are_refused(rng):
+    R = rotations(6, rng)
+    with pytest.raises(InputError, match="not positive definite; average over more frames"):
+        identify_tool_load(reading(R), np.zeros((6, 6, 6)), R, GRAVITY)
+    with pytest.raises(InputError, match="not positive definite"):
+        identify_tool_load(reading(R), np.ones((6, 6, 6)), R, GRAVITY)
+    with pytest.raises(InputError, match=r"covariance has shape \(6, 6\), not \(6, 6, 6\)"):
+        identify_tool_load(reading(R), np.eye(6), R, GRAVITY)
+
+
+def test_a_massless_tool_has_its_centre_of_mass_nowhere(rng):
+    R, cov = rotations(8, rng), covariances(8, rng)
+    found = identify_tool_load(reading(R, mass=0.0) + noise(cov, rng), cov, R, GRAVITY)
+    assert np.all(np.isfinite(found.com))
+    assert abs(found.mass) < 5 * np.sqrt(found.covariance[6, 6])
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_tare_with_the_tool_known_gives_zero_and_load(seed):
+    rng = np.random.default_rng(seed)
+    R = rotations(4, rng)
+    load = rng.normal(size=(4, 6)) * 50.0
+    unloaded, cov = reading(R[:1])[0], covariances(1, rng)[0]
+    found = tare(unloaded, cov, R[0], GRAVITY, MASS, COM)
+    assert found.bias == pytest.approx(BIAS, abs=1e-9)
+    assert found.com == pytest.approx(COM)
+    assert found.covariance[:6, :6] == pytest.approx(cov)
+    assert not np.any(found.covariance[6:])
+    felt = found.load_wrench(reading(R, load=load), R)
+    assert felt == pytest.approx(load, abs=1e-9)
+    assert found.load_wrench(reading(R, load=load)[1], R[1]) == pytest.approx(load[1], abs=1e-9)
+
+
+def test_the_load_s_wrench_scatters_as_its_covariance_says(rng):
+    K, N = 5, 1500
+    R, cov = rotations(K, rng), covariances(K, rng)
+    pose, one = rotations(1, rng), covariances(1, rng)
+    load = np.array([[10.0, 0.0, -98.0, 1.0, 2.0, 0.0]])
+    error = []
+    for _ in range(N):
+        found = identify_tool_load(reading(R) + noise(cov, rng), cov, R, GRAVITY)
+        sample = reading(pose, load=load) + noise(one, rng)
+        error.append(found.load_wrench(sample[0], pose[0]) - load[0])
+    stated = found.load_covariance(one[0], pose[0])
+    white = np.linalg.solve(np.linalg.cholesky(stated), np.array(error).T)
+    assert white @ white.T / N == pytest.approx(np.eye(6), abs=5 * np.sqrt(2 / N))
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+def test_shift_moves_the_moment_and_back(seed):
+    rng = np.random.default_rng(seed)
+    force, arm = rng.normal(size=(7, 3)), rng.normal(size=(7, 3))
+    couple = rng.normal(size=(7, 3))
+    at_point = np.hstack([force, couple])
+    at_origin = np.hstack([force, couple + np.cross(arm, force)])  # the force acts at `arm`
+    assert shift(at_origin, arm) == pytest.approx(at_point)
+    assert shift(shift(at_point, arm), -arm) == pytest.approx(at_point)
+    assert shift(at_origin[0], arm[0]) == pytest.approx(at_point[0])
+
+
+WEIGHT = np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])
+PULL = np.array([50.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+STD = np.full(6, 0.1)
+
+
+def test_the_right_load_is_accepted():
+    measured = WEIGHT + np.array([1.0, -1.0, 1.0, 5.0, -3.0, 1.0])
+    assert compare(WEIGHT, measured, STD, 3.0, 0.0) == (
+        True,
+        "asked for 10 kg (98.1 N), felt 97.1 N",
+    )
+    assert compare(np.zeros(6), np.full(6, 0.5), STD, 3.0, 0.05)[0]
+
+
+@given(size=st.floats(0.1, 300.0), share=st.floats(0.0, 0.3), off=st.floats(0.0, 2.0))
+def test_a_load_is_right_within_newtons_or_its_share(size, share, off):
+    expected = np.array([0.0, 0.0, -size, 0.0, 0.0, 0.0])
+    limit = max(3.0, share * size)
+    measured = expected + np.array([off * limit, 0.0, 0.0, 0.0, 0.0, 0.0])
+    right, text = compare(expected, measured, STD, 3.0, share)
+    if abs(off - 1.0) > 1e-9:
+        assert right == (off < 1.0)
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("expected", "measured", "text"),
+    [
+        (WEIGHT, WEIGHT / 2, "asked for 10 kg (98.1 N), felt 49.0 N: that is about 5.0 kg"),
+        (WEIGHT, 0.01 * WEIGHT, "asked for 10 kg (98.1 N), felt 1.0 N: that is nothing"),
+        (0 * WEIGHT, WEIGHT / 2, "asked for nothing, felt 49.0 N: about 5.0 kg still hangs"),
+        (0 * WEIGHT, PULL, "asked for nothing, felt 50.0 N: something still pulls"),
+        (PULL, 0.8 * PULL, "asked for 50.0 N, felt 40.0 N: that is 80 % of it, 0° off its"),
+        (
+            PULL,
+            np.array([0.0, 50.0, 0.0, 0.0, 0.0, 0.0]),
+            "asked for 50.0 N, felt 50.0 N: that is 100 % of it, 90° off its direction",
+        ),
+        (WEIGHT, np.full(6, np.nan), "asked for 10 kg (98.1 N), felt nan N: the sensor gives no"),
+    ],
+)  # fmt: skip
+def test_a_wrong_load_is_told_in_words(expected, measured, text):
+    right, said = compare(expected, measured, STD, 3.0, 0.05)
+    assert not right
+    assert said.startswith(text)
+
+
+def test_kilograms_are_told_in_the_gravity_of_the_cell():
+    moon = np.array([1.62, 0.0, 0.0])  # and the arm hangs on a wall
+    expected = np.concatenate([10.0 * moon, np.zeros(3)])
+    assert compare(expected, expected / 2, STD, 3.0, 0.05, moon)[1] == (
+        "asked for 10 kg (16.2 N), felt 8.1 N: that is about 5.0 kg"
+    )
+
+
+def test_a_load_that_cannot_be_told_from_the_noise_is_not_right():
+    right, text = compare(WEIGHT, WEIGHT, np.full(6, 2.0), 3.0, 0.05)
+    assert not right
+    assert "± 6.0 N: too uncertain to tell" in text
+
+
+def test_a_pure_moment_is_judged_by_its_moment():
+    expected = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 10.0])
+    assert compare(expected, expected, STD / 10, 3.0, 0.05)[0]
+    right, text = compare(expected, 0.5 * expected, STD / 10, 3.0, 0.05)
+    assert not right
+    assert text == "asked for 10.0 N·m, felt 5.0 N·m: that is 50 % of it, 0° off its direction"

@@ -1,0 +1,262 @@
+"""The process of a live viewer: whatever becomes of it or of its viewers, nothing waits for it."""
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+from rerun.chunk import RrdReader
+
+from hilcal.measuring.progress import ReadingStored
+from hilcal.present import live_viewer
+from hilcal.present.live_viewer import LiveViewer
+from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.style import LEVEL_NAMES
+from tests.support.live_story import BLIND, events, measuring, plan
+from tests.support.paths import ROOT
+
+SOON = 0.05
+"""A call that only puts something into a queue takes less, s, on a machine that is busy, too."""
+posix = pytest.mark.skipif(os.name != "posix", reason="signals")
+
+
+@pytest.fixture
+def home(tmp_path, monkeypatch) -> Path:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
+    return tmp_path
+
+
+@pytest.fixture
+def said() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def live(home, said) -> Iterator[LiveViewer]:
+    """A started viewer on a free port."""
+    made = LiveViewer(home / "run.live.rrd", said.append, free_port())
+    made.start()
+    yield made
+    made.close()
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def tell(live: LiveViewer, poses: int = 24, paced: bool = False) -> float:
+    """Tell a campaign as fast as it goes; returns how long the slowest call took, s.
+
+    If `paced`, no faster than the process draws.
+    """
+    slowest = 0.0
+    for _, what in events(measuring(plan(poses))):
+        while paced and live._queue.qsize() > live_viewer.MOST // 2:
+            time.sleep(0.01)
+        begun = time.perf_counter()
+        live._tell(time.time(), what)
+        slowest = max(slowest, time.perf_counter() - begun)
+    return slowest
+
+
+def client(url: str, path: Path) -> subprocess.Popen[bytes]:
+    """A viewer without a window, that saves what it gets."""
+    return subprocess.Popen(
+        [executable(), "--port", "auto", "--save", str(path), url],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+
+
+def readings(path: Path) -> int:
+    """Compared readings that a recording has so far; it may still be growing."""
+    if not path.exists() or path.stat().st_size == 0:
+        return 0
+    try:
+        found = [RrdReader(path).stream().filter(content=f"/live/1/{n}") for n in LEVEL_NAMES]
+        batches = [c.to_record_batch() for stream in found for c in stream.to_chunks()]
+        return sum(b.num_rows for b in batches if "Scalars:scalars" in b.schema.names)
+    except (ValueError, RuntimeError):  # nothing in it yet; a part of a message
+        return 0
+
+
+def until(what, words: str, seconds: float = 30.0) -> None:
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, words
+        time.sleep(0.05)
+
+
+def alive(pid: int) -> bool:
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_viewer_that_comes_late_gets_all_and_the_recording_has_it_too(home, said):
+    with socket.socket() as taken:  # the wanted port: the next one is taken instead
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        live = LiveViewer(home / "run.live.rrd", said.append, port)
+        live.start()
+    try:
+        assert live.url is not None
+        assert live.url.startswith("rerun+http://127.0.0.1:")
+        assert str(port) not in live.url
+        process = psutil.Process(live.pid)
+        listening = [c.laddr.ip for c in process.net_connections() if c.status == "LISTEN"]
+        assert listening == ["127.0.0.1"]
+        assert process.nice() > 0
+        assert tell(live, 24) < SOON
+        until(lambda: readings(live.record) >= 0.9 * (48 - BLIND), "not recorded")  # in batches
+        late = client(live.url, home / "late.rrd")
+        try:
+            until(lambda: readings(home / "late.rrd") == 48 - BLIND, "the late viewer lacks some")
+        finally:
+            late.kill()
+            late.wait()
+    finally:
+        live.close()
+    assert readings(live.record) == 48 - BLIND
+    assert RrdReader(live.record).store() is not None  # it has its footer: whole
+    assert (said, live.dropped) == ([], 0)
+    assert not alive(process.pid)
+
+
+@pytest.mark.slow
+@posix
+@pytest.mark.filterwarnings("ignore:RRD file has no footer")
+def test_a_frozen_viewer_costs_nothing(live, said, home, monkeypatch):
+    url = live.url
+    assert url is not None
+    frozen = client(url, home / "frozen.rrd")
+    try:
+        time.sleep(1.0)
+        frozen.send_signal(signal.SIGSTOP)
+        before = psutil.Process(live.pid).memory_info().rss
+        assert tell(live, 490, paced=True) < SOON
+        until(lambda: readings(live.record) >= 0.95 * 980, "not recorded", 60.0)
+        grown = psutil.Process(live.pid).memory_info().rss - before
+        assert grown < 400e6  # what the server keeps for late viewers, and what it is kept in
+    finally:
+        frozen.kill()
+        frozen.wait()
+    live.close()
+    assert readings(live.record) == 980 - BLIND  # up to a thousand each is drawn
+    assert said == []
+
+
+@pytest.mark.slow
+@posix
+def test_a_process_that_is_frozen_is_dropped_and_ended(live, said, monkeypatch):
+    monkeypatch.setattr(live_viewer, "END_S", 1.0)
+    pid = live.pid
+    os.kill(pid, signal.SIGSTOP)
+    slowest = tell(live, 1500)
+    assert slowest < SOON
+    assert live._queue.qsize() <= live_viewer.MOST
+    assert live.dropped > 0
+    begun = time.monotonic()
+    live.close()
+    assert time.monotonic() - begun < 10.0
+    assert not alive(pid)
+    assert "did not end" in said[0]
+    assert "messages are not recorded" in said[1]
+
+
+@pytest.mark.slow
+@posix
+def test_a_process_that_is_killed_is_told_once_and_left_behind(live, said):
+    tell(live, 6)
+    os.kill(live.pid, signal.SIGKILL)
+    until(lambda: said, "nobody says that it has ended")
+    assert tell(live, 1500) < SOON
+    live.close()
+    assert said == ["the live viewer has ended; everything else goes on"]
+
+
+@pytest.mark.slow
+def test_no_free_port_is_said_and_the_recording_is_written_all_the_same(home, said):
+    live = LiveViewer(home / "run.live.rrd", said.append, 70_000)
+    live.start()
+    assert live.url is None
+    tell(live, 12)
+    live.close()
+    assert [s for s in said if s.startswith("no free port from 70000")] == said
+    assert readings(live.record) == 24 - BLIND
+
+
+FULL = """
+import resource, sys, time
+from pathlib import Path
+from tests.unit.present.test_live_viewer import tell
+from hilcal.present.live_viewer import LiveViewer
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, resource.RLIM_INFINITY))
+live = LiveViewer(Path(sys.argv[1]), print, int(sys.argv[2]))
+live.start()
+slowest = tell(live, 60)
+time.sleep(3)
+print("goes on", live.url is not None, slowest < 0.05)
+live.close()
+"""
+KILLED = """
+import os, signal, sys, time
+from pathlib import Path
+from tests.unit.present.test_live_viewer import tell
+from hilcal.present.live_viewer import LiveViewer
+live = LiveViewer(Path(sys.argv[1]), print, int(sys.argv[2]))
+live.start()
+tell(live, 24)
+while live._queue.qsize():
+    time.sleep(0.01)
+print(live.pid, flush=True)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def run(code: str, path: Path) -> str:
+    """Let a program of its own tell a campaign; returns what it printed."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(path), str(free_port())],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    return done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@posix
+def test_a_full_disk_ends_the_recording_only(home):
+    told = run(FULL, home / "full.live.rrd")
+    assert told.count("cannot be written") == 1
+    assert "everything else goes on" in told
+    assert "goes on True True" in told
+
+
+@pytest.mark.slow
+@posix
+def test_the_recording_is_whole_although_the_command_was_killed(home):
+    path = home / "killed.live.rrd"
+    pid = int(run(KILLED, path).split()[-1])
+    until(lambda: not alive(pid), "the process has stayed behind")
+    assert RrdReader(path).store() is not None
+    assert readings(path) == 48 - BLIND
+
+
+def test_what_has_no_process_is_silent(tmp_path, said):
+    live = LiveViewer(tmp_path / "x.rrd", said.append)
+    live.notify(ReadingStored(plan().steps[0], 1, 2, 0.0, 0.0))
+    live.close()
+    assert (said, live.dropped, live.pid) == ([], 0, None)

@@ -1,0 +1,323 @@
+"""The report in a browser: whole on a desk and on a phone, light and dark, offline, on paper."""
+
+import base64
+import itertools
+import json
+import re
+import shutil
+import subprocess
+from collections.abc import Iterator
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from playwright.sync_api import Browser
+
+from hilcal import numbers
+from hilcal.calibration.budget import budget
+from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import first_screen, left_out_errors, limit_words
+from hilcal.present.html.page import page as page_of
+from hilcal.present.html.parts import Chart, Table
+from hilcal.present.html.sections import sections
+from hilcal.store.overview import Instrument
+from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
+from tests.support.picture import pixels
+from tests.support.report_pages import EVIL, opened, small_content
+
+DRAW_ALL = "drawAll()"
+PAPER = 681
+"""Width of A4 without its margins, 180 mm, in CSS pixels."""
+CUT = (
+    "() => charts.flatMap((c) => { const box = c.getBoundingClientRect();"
+    " return [...c.querySelectorAll('svg text')].filter((t) => t.textContent && (({left, right,"
+    " width}) => width && (left < box.left - 2 || right > box.right + 2))("
+    "t.getBoundingClientRect())).map((t) => [c.ariaLabel.split(':')[0], t.textContent]); })"
+)
+"""Words of charts that are cut at their left or right edge."""
+OVERLAPPING = """() => charts.flatMap((c) => {
+  const shown = (t) => t.textContent && t.getBoundingClientRect().width;
+  const of = (kind) => [...c.querySelectorAll(kind)].filter(shown);
+  const labels = of('.xtick text, .ytick text, .xtitle, .ytitle, .legendtext, .annotation-text');
+  const boxes = labels.map((t) => [t.textContent, t.getBoundingClientRect()]);
+  const hit = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 1
+    && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 2;
+  return boxes.flatMap(([a, x], k) => boxes.slice(k + 1).filter(([, y]) => hit(x, y))
+    .map(([b]) => [c.ariaLabel.split(':')[0], a, b]));
+})"""
+"""Pairs of labels of charts that lie over each other; boxes have 2 pixels of leading."""
+MAIN = ["certificate", "revisions", "where", "evidence", "parameters"]
+MOST_PAGES = 6
+needs_poppler = pytest.mark.skipif(
+    shutil.which("pdftoppm") is None, reason="no poppler: on Debian install poppler-utils"
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[ReportContent, Path]:
+    folder = tmp_path_factory.mktemp("report")
+    m = small_content(folder)
+    path = folder / "report.html"
+    path.write_text(page_of(m), encoding="utf-8")
+    return m, path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with open_browser() as found:
+        yield found
+
+
+def plain(m: ReportContent) -> ReportContent:
+    """The same without its appendix."""
+    return replace(m, appendix=False, scalings={})
+
+
+def large(m: ReportContent) -> ReportContent:
+    """The same with many revisions, poses of long names, and instruments, with no appendix."""
+    told = m.story
+    last = told.revisions[-1]
+    many = tuple(
+        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "", model=("a",))
+        for k in range(12)
+    )
+    named = tuple(f"calibration pose number {k:03d}" for k in range(len(told)))
+    story = replace(
+        told, revisions=many, pose_names=named, pose=np.arange(len(told)),
+        time_s=60.0 * np.arange(len(told)),
+    )  # fmt: skip
+    one = Instrument("tracker", "leica", "Leica AT960-MR", "750123", {"firmware": "3.1"}, m.made)
+    overview = replace(m.overview, instruments=(one,) * 5)
+    return replace(plain(m), story=story, overview=overview)
+
+
+def read(values: object) -> np.ndarray:
+    """Numbers of a chart, which plotly may write as base64."""
+    if isinstance(values, dict):
+        return np.frombuffer(base64.b64decode(values["bdata"]), dtype=values["dtype"])
+    return np.asarray(values, float)
+
+
+class Outline(HTMLParser):
+    """Headings, tables and charts of a page, and text outside of scripts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+
+
+def test_the_page_is_one_file_with_its_headings_tables_and_sentences(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    outline = Outline()
+    outline.feed(text)
+    tags = [tag for tag, _ in outline.tags]
+    assert tags.count("h1") == 1
+    levels = [int(t[1]) for t in tags if re.fullmatch(r"h[1-6]", t)]
+    assert all(b <= a + 1 for a, b in itertools.pairwise(levels)), levels
+    for name, found in outline.tags:
+        assert not (name in ("script", "img", "iframe") and "src" in found)
+        if name == "th":
+            assert found["scope"] in ("row", "col")
+        if found.get("class") == "chart":
+            assert len(str(found["aria-label"])) > 20
+            assert found["role"] == "img"
+        if name == "link":
+            assert found["href"] == "data:,"
+    assert tags.count("table") == tags.count("caption")
+    ids = [found["id"] for name, found in outline.tags if name == "section"]
+    assert ids[: len(MAIN)] == MAIN
+    assert set(ids[len(MAIN) :]) == {"joints", "rejected", "all", "scalings", "provenance"}
+    links = [found["href"] for name, found in outline.tags if name == "a"]
+    assert links == [f"#{i}" for i in ids]
+
+
+def test_names_are_text_and_nothing_else(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    assert EVIL not in text
+    assert "<img" not in text.split("<body>")[1].split("<script>/**")[0]
+    assert "&lt;script&gt;" in text
+
+
+def test_numbers_of_the_certificate_are_those_of_the_fit(made) -> None:
+    m, path = made
+    text = path.read_text(encoding="utf-8")
+    error = left_out_errors(m.fit)
+    assert error.max() == pytest.approx(m.fit.holdout.max_m)
+    words, passed = limit_words(m)
+    assert passed == bool(error.max() <= m.limit_m)
+    assert words.startswith("PASSED" if passed else "FAILED")
+    assert numbers.length(m.fit.holdout.rms_m) in text
+    failed, kept = limit_words(replace(m, limit_m=float(np.median(error))))
+    assert not kept
+    assert failed.startswith(f"FAILED: {(len(error) + 1) // 2} of {len(error)}")
+    b = budget(m.fit)
+    assert f"U = {numbers.length(b.expanded)}" in text
+    assert b.combined >= m.fit.holdout.rms_m
+    inside = np.sum(error <= b.expanded)
+    assert f"{inside} of {len(error)} deflections of poses left out are within it" in text
+
+
+def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
+    """The pose that fits worst is not the one that is predicted worst."""
+    m, _ = made
+    error = left_out_errors(m.fit)
+    worst = f"furthest off: {numbers.length(error.max())}"
+    assert worst in first_screen(m).answers[1][1]
+    size = np.linalg.norm(m.left_out.residual, axis=1)
+    np.testing.assert_allclose(np.sort(size), np.sort(error), rtol=1e-9)
+    by_pose = next(p for p in sections(m)[1].parts if isinstance(p, Chart))
+    drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.json)["data"]])
+    np.testing.assert_allclose(np.sort(drawn) ** 2, np.sort(m.left_out.whitened_norm2), rtol=1e-5)
+
+
+def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made) -> None:
+    m, path = made
+    short, long = page_of(plain(m)), path.read_text(encoding="utf-8")
+    outline = Outline()
+    outline.feed(short)
+    assert [found["id"] for name, found in outline.tags if name == "section"] == MAIN
+    for words in ("Correlations", "SHA-256 of its readings", "Scaling none, gu", "Over joint 1",
+                  "Other suspects", "Commands as they were typed"):  # fmt: skip
+        assert words in long
+        assert words not in short
+    rejected = [s.effect for s in m.diagnosis.suspects if not s.passes]
+    assert rejected
+    assert not any(f"Added variable: {name}" in short for name in rejected)
+    rows = [row for p in sections(m)[-1].parts if isinstance(p, Table) for row in p.rows]
+    known = [p for p in m.fit.parameters if p.identifiable]
+    assert [name for name, *_ in rows] == [p.name for p in known] != []
+    for p, (_, value, std, unit) in zip(known, rows, strict=True):
+        factor = {"µrad/(N·m)": 1e6}[unit]
+        assert (value, std) == numbers.with_std(factor * p.value, factor * p.std)
+        assert f">{value}</td>" in short
+
+
+@needs_chromium
+@pytest.mark.parametrize(
+    ("size", "scheme"),
+    [
+        pytest.param(DESKTOP, "light", id="desk-light"),
+        pytest.param(PHONE, "dark", id="phone-dark"),
+        pytest.param(DESKTOP, "dark", id="desk-dark", marks=pytest.mark.slow),
+        pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.slow),
+    ],
+)
+def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> None:
+    m, path = made
+    with opened(browser, path, viewport=size, color_scheme=scheme) as (page, bad):
+        head = page.locator("h1")
+        box, answers = head.bounding_box(), page.locator(".answers").bounding_box()
+        assert box is not None
+        assert answers is not None
+        assert answers["y"] + answers["height"] < size["height"]
+        assert "joint_tilt_compliance" in head.inner_text() or m.diagnosis.lead is None
+        page.evaluate(DRAW_ALL)
+        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
+        drawn = page.evaluate(
+            "charts.map((c) => [c.getAttribute('aria-label').split(':')[0], c._fullData.map("
+            "(t) => (t.x && !t.isempty ? Array.from(t.x).filter((v) => v !== null).length : 0))])"
+        )
+        counts = {name: sum(points) for name, points in drawn}
+        readings = len(m.story)
+        assert counts["By pose"] == counts["By load"] == counts["Over joint 3"] == readings
+        assert counts["Measured against predicted"] == 3 * readings + 2
+        marks = "c => c.getAttribute('aria-label').startsWith('By pose:')"
+        found = page.evaluate(f"charts.find({marks}).querySelectorAll('.point').length")
+        assert found == readings
+        ink = page.evaluate("charts[0]._fullLayout.font.color")
+        assert ink == {"light": "#24272e", "dark": "#e4e5e9"}[scheme]
+        assert page.evaluate(f"({CUT})()") == []
+        assert page.evaluate(f"({OVERLAPPING})()") == []
+        assert page.evaluate("window.harmed") is None
+        assert bad == []
+
+
+@needs_chromium
+@pytest.mark.parametrize("of", [plain, large])
+def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, of) -> None:
+    path = tmp_path / "short.html"
+    path.write_text(page_of(of(made[0])), encoding="utf-8")
+    with opened(browser, path, viewport=DESKTOP) as (page, bad):
+        page.evaluate(f"window.onbeforeprint = () => {{ window.over = ({OVERLAPPING})(); }}")
+        pdf = page.pdf(prefer_css_page_size=True)
+        assert page.evaluate("window.over") == []
+        assert bad == []
+    assert 2 <= len(re.findall(rb"/Type\s*/Page\b", pdf)) <= MOST_PAGES
+
+
+@needs_chromium
+def test_long_names_of_many_poses_do_not_lie_over_each_other_on_a_phone(
+    made, browser: Browser, tmp_path: Path
+) -> None:
+    path = tmp_path / "page.html"
+    path.write_text(page_of(large(made[0])), encoding="utf-8")
+    with opened(browser, path, viewport=PHONE) as (page, _):
+        page.evaluate(DRAW_ALL)
+        page.wait_for_function("charts.every((c) => c._fullLayout && c.querySelector('svg'))")
+        assert page.evaluate(f"({OVERLAPPING})()") == []
+
+
+@needs_chromium
+@pytest.mark.slow
+def test_it_prints_on_a4_in_light_colours_with_all_charts(made, browser: Browser) -> None:
+    _, path = made
+    with opened(browser, path, viewport=DESKTOP, color_scheme="dark") as (page, bad):
+        page.evaluate(
+            "window.addEventListener('beforeprint', () => { window.printed = charts.map("
+            "(c) => [!!c._fullLayout, c.getBoundingClientRect().width,"
+            " c._fullLayout.font.color]);"
+            f" window.cut = ({CUT})(); }})"
+        )
+        pdf = page.pdf(prefer_css_page_size=True)
+        printed = page.evaluate("window.printed")
+        assert page.evaluate("window.cut") == []
+        assert all(drawn for drawn, _, _ in printed)
+        assert max(width for _, width, _ in printed) <= PAPER
+        assert {ink for _, _, ink in printed} == {"#24272e"}
+        assert re.search(rb"/MediaBox \[0 0 59[45][.0-9]* 84[12][.0-9]*\]", pdf)
+        assert page.evaluate("charts[0]._fullLayout.font.color") == "#e4e5e9"  # as it was
+        page.set_viewport_size({"width": PAPER, "height": 1000})
+        page.emulate_media(media="print")
+        page.add_style_tag(content=".chart { display: none; }")  # they are as wide as the screen
+        assert page.evaluate("document.documentElement.scrollWidth") <= PAPER
+        assert bad == []
+
+
+@needs_chromium
+@needs_poppler
+@pytest.mark.slow
+def test_printed_pages_are_numbered_light_and_end_with_no_heading(
+    made, browser: Browser, tmp_path: Path
+) -> None:
+    with opened(browser, made[1], viewport=DESKTOP, color_scheme="dark") as (page, _):
+        titles = set(page.locator("h2, h3, caption").all_text_contents())
+        page.pdf(path=tmp_path / "page.pdf", prefer_css_page_size=True, print_background=True)
+    pdf = str(tmp_path / "page.pdf")
+    told = subprocess.run(["pdftotext", "-layout", pdf, "-"], capture_output=True, text=True)
+    pages = [[x.strip() for x in p.splitlines() if x.strip()] for p in told.stdout.split("\f")]
+    pages = [p for p in pages if p]
+    assert len(pages) > 5
+    for k, lines in enumerate(pages):
+        assert lines[-1] == f"page {k + 1} of {len(pages)}"
+        foot = lines[-3:-1] if k + 1 < len(pages) else lines[-2:-1]
+        assert not titles & set(foot), foot
+        assert len(lines) > 3  # no page for the end of a table alone
+    subprocess.run(["pdftoppm", "-r", "20", "-png", pdf, str(tmp_path / "p")], check=True)
+    for png in sorted(tmp_path.glob("p-*.png")):
+        ink = pixels(png)[..., :3]
+        assert np.median(ink) == 255  # white paper
+        assert (ink < 200).any()  # and something on it
+
+
+def test_what_is_in_scripts_is_json(made) -> None:
+    text = made[1].read_text(encoding="utf-8")
+    found = re.findall(r'<script type="application/json">(.*?)</script>', text, re.S)
+    assert len(found) > 10
+    for one in found:
+        assert "data" in json.loads(one)

@@ -1,0 +1,393 @@
+"""The recording, read back: what the story says is what the viewer gets."""
+
+import re
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rerun.chunk import RrdReader
+from scipy.spatial.transform import Rotation
+
+from hilcal.errors import InputError
+from hilcal.present.story import StoryRevision, StorySuspect
+from hilcal.present.viewer import Limits, digest, errors, flat, layout, save, style, words
+from hilcal.present.viewer.stream import executable
+from hilcal.robot.body import body_poses, capsules
+from tests.support.viewer_story import story, ur10e
+
+FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
+READINGS = 90
+
+
+@pytest.fixture(autouse=True)
+def _strict():
+    rr.set_strict_mode(True)
+    yield
+    rr.set_strict_mode(False)
+
+
+@pytest.fixture(scope="module")
+def told():
+    return story()
+
+
+@pytest.fixture(scope="module")
+def recording(told, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("viewer") / "story.rrd"
+    save(told, path)
+    return path
+
+
+def column(path: Path, entity: str, component: str, timeline: str) -> dict[int, object]:
+    """Return the values of a component by time, read back from a recording."""
+    values: dict[int, object] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
+        batch = chunk.to_record_batch()
+        if timeline in batch.schema.names and component in batch.schema.names:
+            times = batch.column(timeline).to_pylist()
+            found = batch.column(component).to_pylist()
+            values.update({int(t): v for t, v in zip(times, found, strict=True) if v is not None})
+    return values
+
+
+def texts(path: Path) -> list[str]:
+    """Return every string that a viewer would have to draw."""
+    out: list[str] = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith((":text", ":labels", ":names", ":name")):
+                for row in batch.column(name).to_pylist():
+                    out += [t for t in row or [] if t is not None]
+    return out
+
+
+def static(path: Path, entity: str, component: str) -> object:
+    """Return the value of a component that does not change."""
+    (value,) = (
+        value
+        for chunk in RrdReader(path).stream().filter(content=entity).to_chunks()
+        if component in (batch := chunk.to_record_batch()).schema.names
+        for value in batch.column(component).to_pylist()
+    )
+    return value
+
+
+def drawn_errors(path: Path) -> dict[str, np.ndarray]:
+    """Return the heights, in the picture, of every mark of the errors."""
+    return {
+        name: np.array(static(path, f"/errors/{name}", "Points2D:positions"))
+        for name, *_ in errors.SERIES
+    }
+
+
+def test_errors_are_drawn_to_scale_inside_the_picture_and_nothing_between_them(told, recording):
+    expected = {
+        "fit": [r.error_fit["rms_m"] for r in told.revisions],
+        "holdout": [r.error_holdout["rms_m"] for r in told.revisions],
+        "largest": [r.error_fit["max_m"] for r in told.revisions],
+    }
+    at = drawn_errors(recording)
+    up = np.concatenate([at[name][:, 1] for name in expected])
+    value = np.log10(np.concatenate(list(expected.values())))
+    slope, start = np.polyfit(value, up, 1)
+    assert slope < 0  # y points down
+    np.testing.assert_allclose(up, start + slope * value, atol=1e-3)
+    floor = np.array(static(recording, "/errors/noise", "LineStrips2D:strips"))[0]
+    np.testing.assert_allclose(floor[:, 1], start + slope * np.log10(told.noise_floor_m), atol=1e-3)
+    assert floor[0, 1] == floor[1, 1]  # level
+    for places in (*at.values(), floor):
+        assert (places >= 0).all()
+        assert (places <= (errors.WIDTH, flat.HEIGHT)).all()
+    lines = [
+        chunk
+        for name in expected
+        for chunk in RrdReader(recording).stream().filter(content=f"/errors/{name}").to_chunks()
+        if any("Strip" in c or "Line" in c for c in chunk.to_record_batch().schema.names)
+    ]
+    assert lines == []
+
+
+def test_each_revision_has_one_tick_and_the_present_one_its_change_and_errors(told, recording):
+    labels = column(recording, "/errors/words", "Points2D:labels", "revision")
+    frames = column(recording, "/errors/now", "LineStrips2D:strips", "revision")
+    fit = drawn_errors(recording)["fit"]
+    for k, r in enumerate(told.revisions):
+        ticks = [t for t in labels[r.revision] if t[0].isdigit()]
+        assert sorted(t.split(":")[0] for t in ticks) == ["0", "1", "2", "3"]
+        assert f"{r.revision}: {r.change or 'first model'}" in ticks
+        assert any(style.micrometres(r.error_fit["max_m"]) in t for t in labels[r.revision])
+        x = np.array(frames[r.revision][0])[:, 0]
+        inside = (x.min() < fit[:, 0]) & (fit[:, 0] < x.max())
+        assert np.flatnonzero(inside).tolist() == [k]
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0, 40.0])
+def test_ticks_of_errors_are_round_few_and_inside(size):
+    for ratio in (1.4, 3.0, 30.0, 1e6):
+        found = errors.decades(size, ratio * size)
+        assert 2 <= len(found) <= 8
+        assert ((found >= size * (1 - 1e-9)) & (found <= ratio * size * (1 + 1e-9))).all()
+
+
+def test_a_story_without_any_error_is_drawn(told, tmp_path):
+    zero = dict.fromkeys(told.revisions[0].error_fit, 0.0)
+    first = replace(told.revisions[0], error_fit=zero, error_holdout=zero)
+    save(replace(told, revisions=(first,), noise_floor_m=0.0), tmp_path / "zero.rrd")
+    at = drawn_errors(tmp_path / "zero.rrd")
+    assert all(np.isfinite(places).all() for places in at.values())
+
+
+def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
+    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    heads = [read[k][0].splitlines()[0] for k in range(4)]
+    assert [("the last" in head) for head in heads] == [False, False, False, True]
+    assert [f"({k + 1} of 4)" in head for k, head in enumerate(heads)] == [True] * 4
+    reader = RrdReader(recording)
+    (blueprint,) = reader.blueprints()
+    panel: dict[str, object] = {}
+    for chunk in reader.stream(store=blueprint).filter(content="/time_panel").to_chunks():
+        panel |= chunk.to_record_batch().to_pydict()
+    assert panel["TimePanelBlueprint:timeline"] == [["revision"]]
+    assert panel["TimePanelBlueprint:play_state"] == [[1]]  # paused: else it opens at the end
+
+
+def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
+    strips = column(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
+    balls = digest.digest(told, Limits()).half_sizes
+    for r in told.revisions:
+        worst = int(np.argmax(r.whitened_norm2))
+        dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
+        assert len(dots) >= 5  # dotted
+        np.testing.assert_allclose(dots[:, :, :2], 0.0, atol=1e-6)
+        assert dots[:, :, 2].min() > min(balls[worst].max(), 0.25)  # begins outside of the ball
+        lengths = np.ptp(dots[:, :, 2], axis=1)
+        gaps = dots[1:, 0, 2] - dots[:-1, 1, 2]
+        assert (gaps > lengths[:-1]).all()
+    assert tuple(style.LEADER) not in {tuple(c) for c in style.LEVEL_COLORS.tolist()}
+
+
+def test_the_tallest_bar_is_the_worst_reading_of_the_label(told, recording):
+    labels = column(recording, "/world/residual/worst", "Points3D:labels", "revision")
+    for r in told.revisions:
+        bars = [
+            column(recording, f"/bars/{name}", "BarChart:values", "revision")[r.revision][0]
+            for name in style.LEVEL_NAMES
+        ]
+        tallest = max(max(b["buffer"]) for b in bars)
+        assert f"({tallest:.1f} σ)" in labels[r.revision][0]
+
+
+def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
+    named = replace(told, pose_names=tuple(f"p{k + 40}a" for k in told.pose))
+    path = tmp_path / "named.rrd"
+    save(named, path)
+    name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
+    worst = column(path, "/world/residual/worst", "Points3D:labels", "revision")
+    assert f"pose {name}," in worst[3][0]
+    details = column(path, "/words/details", "TextDocument:text", "revision")
+    assert f"pose {name}," in details[3][0]
+    cards = column(path, "/words/verdict", "TextDocument:text", "pose")
+    assert cards[7][0].startswith("### Pose p47a:")
+    with pytest.raises(InputError, match=r"story\.pose_names: 1 names for 90 readings"):
+        save(replace(told, pose_names=("a",)), path)
+
+
+def test_timelines_are_revision_and_pose(recording):
+    names = {
+        name for chunk in RrdReader(recording).stream().to_chunks() for name in chunk.timeline_names
+    }
+    assert names == {"revision", "pose"}
+
+
+def test_every_reading_has_its_arrow(told, recording):
+    drawn = column(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    scale = digest.digest(told, Limits()).residual_scale
+    for r in told.revisions:
+        vectors = np.array(drawn[r.revision])
+        assert vectors.shape == (READINGS, 3)
+        length = np.linalg.norm(r.residual, axis=1) * scale
+        np.testing.assert_allclose(
+            np.linalg.norm(vectors, axis=1), np.minimum(length, digest.ARROW_CAP), rtol=1e-5
+        )
+
+
+def test_one_ball_per_pose_and_arm_moves_through_poses(told, recording):
+    balls = column(recording, "/world/residual/noise", "Ellipsoids3D:half_sizes", "revision")
+    assert {len(b) for b in balls.values()} == {30}
+    moves = column(recording, "/world/arm/body6", "Transform3D:translation", "pose")
+    bodies = body_poses(told.arm, told.q[::3])
+    assert sorted(moves) == list(range(30))
+    read = np.array([moves[k][0] for k in range(30)])
+    np.testing.assert_allclose(read, bodies[:, 6, :3, 3], atol=1e-6)
+
+
+def test_arm_stands_in_the_worst_pose(told, recording):
+    stands = column(recording, "/world/arm/body7", "Transform3D:translation", "revision")
+    for r in told.revisions:
+        i = int(np.argmax(r.whitened_norm2))
+        expected = body_poses(told.arm, told.q[i : i + 1])[0, -1, :3, 3]
+        np.testing.assert_allclose(stands[r.revision][0], expected, atol=1e-6)
+
+
+def test_bars_hold_every_pose_once_under_its_level(told, recording):
+    for r in told.revisions:
+        total = 0
+        for name in style.LEVEL_NAMES:
+            bars = column(recording, f"/bars/{name}", "BarChart:values", "revision")
+            values = np.array(bars[r.revision][0]["buffer"], dtype=float)
+            total += int((values > 0).sum())
+        assert total == 30
+
+
+def test_verdict_names_suspects_with_their_figures(told, recording):
+    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    first = read[0][0]
+    assert "base_compliance" in first.replace("\\", "")
+    assert "86 %" in first
+    assert "84 %" in first
+    assert "■■■■ 86 %" in first
+    assert "adequate" in read[3][0]
+    assert "86 %" not in read[3][0]
+
+
+def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
+    again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
+    save(told, again)
+    save(story(seed=2), other)
+    assert compare(recording, again) == 0
+    assert compare(recording, other) != 0
+
+
+def compare(a: Path, b: Path) -> int:
+    command = [executable(), "rrd", "compare", str(a), str(b)]
+    return subprocess.run(command, capture_output=True, check=False).returncode
+
+
+def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
+    path = tmp_path / "names.rrd"
+    save(story(poses=4, names=f" |{FORBIDDEN}\U0001f916\t*x*"), path)
+    found = texts(path)
+    assert any("joint_tilt_compliance" in t.replace("\\", "") for t in found)
+    assert [c for t in found for c in t if c in FORBIDDEN or ord(c) > 0x2FFF] == []
+    assert [t for t in found if style.safe(t) != t] == []
+
+
+def test_user_names_cannot_break_a_table(told):
+    r = replace(told.revisions[0], suspects=(StorySuspect("a|b\nc", 0.5, 0.4, 0.01),))
+    table = words.suspects(r).splitlines()
+    assert len(table) == 3
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in table} == {5}
+
+
+def test_unidentifiable_parameters_show_no_number(told):
+    row = next(
+        line for line in words.parameters(told.revisions[0], 40).splitlines() if "joint1" in line
+    )
+    assert "not identifiable" in row
+    assert not re.search(r"\d\.\d", row)
+
+
+def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
+    big, path = story(poses=3000, loads=1, mode="absolute"), tmp_path / "big.rrd"
+    save(big, path)
+    assert path.stat().st_size < 20e6
+    arrows = column(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    assert all(100 < len(a) < 300 for a in arrows.values())
+    title = layout.residual_title(digest.digest(big, Limits()))
+    assert f"about {len(arrows[0])} of 3000" in title
+    balls = column(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
+    origins = column(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
+    for k in range(4):
+        assert {tuple(c) for c in balls[k]} <= {tuple(o) for o in origins[k]}
+    assert len(column(path, "/world/arm/body3", "Transform3D:translation", "pose")) == 3000
+
+
+def test_subsample_keeps_the_worst():
+    badness = np.random.default_rng(0).random(1000)
+    chosen = digest.worst_and_even(badness, 50)
+    assert len(chosen) <= 50
+    assert set(np.argsort(-badness)[:10]) <= set(chosen.tolist())
+    assert np.diff(chosen).max() < 100
+
+
+def test_ellipsoids_give_the_covariance_back():
+    rng = np.random.default_rng(3)
+    a = rng.standard_normal((50, 3, 3))
+    covariance = a @ a.transpose(0, 2, 1)
+    half, quaternion = digest.ellipsoids(covariance)
+    x, y, z, w = quaternion.T
+    rotation = np.stack(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
+    np.testing.assert_allclose(again, covariance, atol=1e-12)
+
+
+def test_levels_hold_the_share_of_noise_they_name():
+    norm2 = np.random.default_rng(4).chisquare(3, 200_000)
+    share = np.bincount(style.levels(norm2), minlength=3) / len(norm2)
+    assert share[1] == pytest.approx(0.0099, abs=0.001)
+    assert share[2] == pytest.approx(0.0001, abs=0.0001)
+
+
+def test_the_arm_is_drawn_as_its_capsules(told, recording):
+    for i in range(told.arm.n + 1):
+        own = [c for c in capsules(told.arm) if c.body == i]
+        entity = f"/world/arm/body{i}"
+        (start,), (radius,), (length,), (turn,) = (
+            [x for chunk in RrdReader(recording).stream().filter(content=entity).to_chunks()
+             if name in (batch := chunk.to_record_batch()).schema.names
+             for x in batch.column(name).to_pylist()]
+            for name in ("Capsules3D:translations", "Capsules3D:radii", "Capsules3D:lengths",
+                         "Capsules3D:quaternions")
+        )  # fmt: skip
+        assert len(own) >= 1
+        np.testing.assert_allclose(start, [c.start for c in own], atol=1e-6)
+        np.testing.assert_allclose(radius, [c.radius for c in own], atol=1e-6)
+        axis = Rotation.from_quat(turn).apply([0.0, 0.0, 1.0])
+        end = np.array(start) + np.array(length)[:, None] * axis
+        np.testing.assert_allclose(end, [c.end for c in own], atol=1e-6)
+
+
+def test_arm_of_another_shape_is_drawn(tmp_path):
+    six = ur10e()
+    four = replace(
+        six,
+        links=six.links[:5],
+        masses=six.masses[:4],
+        coms=six.coms[:4],
+        joint_names=six.joint_names[:4],
+    )
+    told = story(poses=3)
+    path = tmp_path / "four.rrd"
+    save(replace(told, arm=four, q=told.q[:, :4]), path)
+    assert len(column(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "names"),
+    [
+        ({"q": np.zeros((READINGS, 5))}, "story.q"),
+        ({"anchor": np.full((READINGS, 3), np.nan)}, "story.anchor"),
+        ({"revisions": ()}, "story.revisions"),
+        ({"load_names": ("a",)}, "story.load_names"),
+        ({"noise_floor_m": float("nan")}, "noise_floor_m"),
+    ],
+)
+def test_a_story_that_does_not_fit_together_is_refused(told, tmp_path, change, names):
+    with pytest.raises(InputError, match=names):
+        save(replace(told, **change), tmp_path / "x.rrd")
+
+
+def test_a_bad_revision_is_refused_by_its_number(told, tmp_path):
+    bad: StoryRevision = replace(told.revisions[1], residual=np.zeros((3, 3)))
+    with pytest.raises(InputError, match="revision 1: residual"):
+        save(replace(told, revisions=(told.revisions[0], bad)), tmp_path / "x.rrd")

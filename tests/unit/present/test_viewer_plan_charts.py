@@ -1,0 +1,180 @@
+"""The recording of a plan, read back: charts and words are what is planned."""
+
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rerun.chunk import RrdReader
+
+from hilcal.design.detectable import DetectableEffect
+from hilcal.design.summary import PredictedParameter
+from hilcal.errors import InputError
+from hilcal.present.viewer import plan_layout, plan_style, style
+from hilcal.present.viewer.plan_digest import plan_digest
+from hilcal.present.viewer.plan_stream import record_plan
+from hilcal.present.viewer.stream import executable
+from hilcal.store.plan import UNLOADED, Plan, Step
+from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.viewer_plan import (
+    BARE,
+    PLAN,
+    SUMMARY,
+    TRACKER,
+    Q,
+    configured,
+    entities,
+    recording,
+    rgb,
+    rows,
+    shadowed,
+    strict,
+)
+
+__all__ = ["recording", "shadowed", "strict"]  # fixtures
+
+
+def test_the_schedule_has_every_reading_at_its_minute_in_its_loads_series(shadowed, recording):
+    minutes = plan_digest(*shadowed, PLAN, SUMMARY).time / 60.0
+    colors = plan_style.load_colors(PLAN.loads)
+    drawn = {}
+    for k, load in enumerate(PLAN.loads):
+        at = rows(recording, f"/schedule/load{k}", "Scalars:scalars")
+        steps = [i for i, s in enumerate(PLAN.steps, start=1) if s.load == load]
+        assert sorted(at) == steps
+        drawn |= at
+        name = "unloaded" if load == UNLOADED else load
+        label = rows(recording, f"/schedule/load{k}", "SeriesPoints:names")[0]
+        assert label == [f"{name}: {len(steps)}"]
+        color = rows(recording, f"/schedule/load{k}", "SeriesPoints:colors")[0][0]
+        assert rgb(color) == tuple(colors[k])
+    times = [drawn[k][0] for k in range(1, 11)]
+    np.testing.assert_allclose(times, minutes)
+    gaps = np.diff(times)
+    changes = [a.load != b.load for a, b in zip(PLAN.steps, PLAN.steps[1:], strict=False)]
+    assert gaps[changes].min() > gaps[~np.array(changes)].max()  # changing a load takes longest
+
+
+def test_the_curve_has_the_numbers_and_the_plan_is_a_series_of_its_own(recording):
+    def bars(entity: str) -> dict[float, float]:
+        height = rows(recording, entity, "BarChart:values")[0]
+        at = rows(recording, entity, "BarChart:abscissa")[0]
+        return dict(zip(at[0]["buffer"], height[0]["buffer"], strict=True))
+
+    assert bars("/curve/plan") == {3.0: pytest.approx(12.0)}
+    assert bars("/curve/other") == {2.0: pytest.approx(24.0), 6.0: pytest.approx(8.0)}
+
+
+def test_tables_have_the_numbers_of_the_summary(recording):
+    table = rows(recording, "/words/parameters", "TextDocument:text")[0][0].replace("\\", "")
+    for row in (
+        "| joint_compliance.j1 | 0.040 | 4.00 | µrad/(N·m) | 1.0 % |",
+        "| joint_compliance.j2 | 0.60 | 6.00 | µrad/(N·m) | 10.0 % |",
+        "| target_offset.x | 22 | 0 | µm |   |",
+        "| base_frame.x | 12 |   | µm |   |",
+    ):
+        assert row in table
+    table = rows(recording, "/words/criteria", "TextDocument:text")[0][0].replace("\\", "")
+    assert "| D (this) | 12.0 µm | 24.0 µm | 3.8 % | 132 | 0.020 | 4.00 | 98.7 % |" in table
+    assert "| I | 9.00 µm | 30.0 µm | - | 66.0 | 0.010 | 2.00 | - |" in table
+
+
+def test_the_overview_has_cost_and_predicted_precision(recording):
+    text = "\n".join(
+        rows(recording, f"/words/{x}", "TextDocument:text")[0][0] for x in ("plan", "notes")
+    ).replace("\\", "")
+    assert "⚠" not in text  # remarks are no warnings
+    for told in (
+        "Plan: 3 poses, 10 readings",
+        "**efficiency** of the plan: at least 98.7 % (certified lower bound); not accuracy",
+        "unloaded 6, 10kg 2, pull x 2",
+        "3 load changes by hand 3 min",
+        "± 12.0 µm",
+        "does not see the target in 3 of 10 readings",
+        "hysteresis from 6.00 µm",
+        "cannot detect tracker_drift",
+        "Only 3 candidates are left of load 10kg.",
+    ):
+        assert told in text
+    cards = rows(recording, "/words/step", "TextDocument:text")
+    assert "Step 6 of 10: p1, under 10kg" in cards[6][0]
+    assert "10kg is hung, by hand" in cards[6][0]
+    assert "by hand" not in cards[7][0]
+    assert "everything is taken off" in cards[10][0]
+
+
+def test_what_a_summary_lacks_has_no_view(tmp_path):
+    cell, config = configured()
+    record_plan(cell, config, PLAN, BARE, tmp_path / "x.rrd")
+    assert not {"/curve/plan", "/curve/other"} & entities(tmp_path / "x.rrd")
+    text = rows(tmp_path / "x.rrd", "/words/plan", "TextDocument:text")[0][0]
+    for word in ("efficiency", "±", "None", "nan", "drift"):
+        assert word not in text
+
+
+def test_equal_plans_give_equal_recordings(shadowed, recording, tmp_path):
+    again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
+    record_plan(*shadowed, PLAN, SUMMARY, again)
+    record_plan(*shadowed, replace(PLAN, steps=PLAN.steps[:-1]), SUMMARY, other)
+    compared = [
+        subprocess.run(
+            [executable(), "rrd", "compare", str(recording), str(path)],
+            capture_output=True,
+            check=False,
+        ).returncode
+        for path in (again, other)
+    ]
+    assert compared[0] == 0
+    assert compared[1] != 0
+
+
+def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
+    bad = "█ |漢⟂ *x*"
+    cell, config = configured(
+        loads=[{"name": bad, "mass_kg": 2.0}],
+        obstacles=[{"name": bad, "center_m": [2.0, 2.0, 0.0], "size_m": [0.1, 0.1, 0.1]}],
+        sight={"tracker_m": TRACKER.tolist()},
+    )
+    plan = Plan((bad,), Q[:1], (Step(bad, UNLOADED), Step(bad, bad)))
+    summary = replace(
+        SUMMARY,
+        criterion=bad,
+        loads={bad: 1},
+        parameters=(PredictedParameter(bad, 1.0, 2.0, bad),),
+        detectable=(DetectableEffect(bad, 1e-6), DetectableEffect(bad, None)),
+        remarks=(bad,),
+        criteria=(replace(SUMMARY.criteria[0], criterion=bad),),
+    )
+    path = tmp_path / "x.rrd"
+    record_plan(cell, config, plan, summary, path)
+    found = []
+    for chunk in RrdReader(path).stream().to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.endswith((":text", ":labels", ":names", ":name")):
+                found += [t for row in batch.column(name).to_pylist() for t in row or []]
+    assert len(found) > 10
+    assert [t for t in found if style.safe(t) != t] == []
+
+
+def test_what_does_not_fit_is_refused(shadowed, tmp_path):
+    with pytest.raises(InputError, match="5 joint angles per pose; ur10e has 6"):
+        record_plan(*shadowed, replace(PLAN, q=Q[:, :5]), SUMMARY, tmp_path / "x.rrd")
+    with pytest.raises(InputError, match="no folder"):
+        record_plan(*shadowed, PLAN, SUMMARY, tmp_path / "none" / "x.rrd")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.vulkan
+@pytest.mark.slow
+@pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
+def test_every_view_is_drawn_without_a_report(recording, shadowed, tmp_path):
+    d = plan_digest(*shadowed, PLAN, SUMMARY)
+    names = [plan_layout.STEPS, plan_layout.SCHEDULE, plan_layout.curve_title(d)]
+    names += ["Plan", "This step", "How to read this", "Parameters", "Criteria"]
+    shots = [Shot(tmp_path / f"{i}.png", "step", 6, name) for i, name in enumerate(names)]
+    reports = pictures(recording, shots, (960, 540), 480)
+    assert set(names) <= {v.name for v in reports}
+    assert any(v.name.startswith(plan_layout.TRACKER) for v in reports)
+    assert [v for v in reports if v.problems] == []
+    assert all(shot.png.stat().st_size > 1000 for shot in shots)
