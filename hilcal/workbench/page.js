@@ -13,7 +13,7 @@
     if (answer && answer.offsetParent) {
       const box = answer.getBoundingClientRect(), at = box.top + scrollY;
       if (want === null || (at === last && performance.now() - moved < 1000))
-        want = want === null ? Math.min(box.top, innerHeight - box.height - 16) : box.top;
+        want = want === null ? Math.max(16, Math.min(box.top, innerHeight - box.height - 16)) : box.top;
       if (at !== last) scrollTo(0, at - want);
       last = at;
     }
