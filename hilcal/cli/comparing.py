@@ -1,6 +1,6 @@
 """`compare`: model against measurement, of one campaign or of a later one of the same arm."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,7 @@ from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
 from hilcal.present import text, text_change
@@ -75,13 +76,16 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
         say("looking where it fails")
         places = misfit_breakdown(linearise(found))
         finish(found, say)
-        e = full_prediction(found)
+        e, left_out = full_prediction(found), bool(found.model.background)
+        if left_out:  # a background follows the fitted poses more closely than others
+            raw, w = all_left_out(found)
+            e = replace(e, raw=raw, whitening=w)
         worst = text.worst_poses(e)
     name = text.model_name(titles(found.model, found.readings))
     t.show(text.heading(f"{called(number)}: {name}"))
     t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
     t.show([*text.where_table(places), ""])
-    t.show(text.worst_table(worst))
+    t.show(text.worst_table(worst, left_out))
     t.document(
         {
             "revision": number,

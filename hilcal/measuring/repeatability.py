@@ -36,7 +36,7 @@ class RepeatabilityEstimate:
         instrument: the same as the instrument alone would make it, m.
         joint_std: the scatter of every joint that explains the rest, rad; 0 where none is left.
         iso_9283: the worst pose's RP = mean distance + 3 standard deviations of it, m
-            (ISO 9283, 7.2.2), the instrument's noise included.
+            (ISO 9283, 7.2.2), the instrument's noise included; NaN in campaigns of older versions.
     """
 
     poses: int
@@ -44,13 +44,13 @@ class RepeatabilityEstimate:
     scatter: float
     instrument: float
     joint_std: float
-    iso_9283: float
+    iso_9283: float = float("nan")
 
     @property
     def shown(self) -> bool:
         """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
         total, noise = self.scatter**2, self.instrument**2
-        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * self.dof)))
+        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
 
     def words(self, configured: Floats) -> str:
         """Return it for people, beside the configured standard deviations (n,), rad."""

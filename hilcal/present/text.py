@@ -209,7 +209,10 @@ def before_and_after(fit: Fit) -> str:
         if fit.mode == "deflection"
         else f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
     )
-    return f"{was}; the model leaves {numbers.length(fit.error.rms_m)} (noise alone: {floor})."
+    left = f"the model leaves {numbers.length(fit.error.rms_m)}"
+    if fit.model.background:  # which follows the fitted poses more closely than others
+        left = f"at poses left out the model leaves {numbers.length(fit.holdout.rms_m)}"
+    return f"{was}; {left} (noise alone: {floor})."
 
 
 def remarks(fit: Fit) -> Iterator[RenderableType]:
@@ -366,9 +369,10 @@ def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
     return list(found.values())
 
 
-def worst_table(worst: Sequence[Worst]) -> RenderableType:
-    """Return the table of the worst poses."""
-    out = table("worst poses", "load", "error", "in σ", left=(0, 1))
+def worst_table(worst: Sequence[Worst], left_out: bool = False) -> RenderableType:
+    """Return the table of the worst poses, as fitted or as predicted without themselves."""
+    title = "worst poses, each left out" if left_out else "worst poses"
+    out = table(title, "load", "error", "in σ", left=(0, 1))
     for w in worst:
         out.add_row(w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}")
     return out
