@@ -322,7 +322,8 @@ class Path:
             return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
-        if not background_is_better(last.fit, found, WORTH if proved_together else MUCH):
+        worth = WORTH if proved_together else MUCH
+        if found is None or not background_is_better(last.fit, found, worth):
             return False
         unknown = last.diagnosis.verdict == "unknown_effect"
         if unknown and not predicts_better(last.fit, found):

@@ -149,7 +149,7 @@ def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTH
     found = with_serial_noise(fit(model, with_prior_scatter(model, o.readings), mode))
     if has_background(record):
         say("fitting all effects of the catalogue together")
-        found = with_background(found, found.model.names)
+        found = with_background(found, found.model.names) or found
     judged = diagnose(found, history, say)
     if record.scatter_alone and judged.reason == "arm_scatter" and judged.scatter is not None:
         say("the arm's scatter enters the covariance; diagnosing")

@@ -30,9 +30,6 @@ MUCH = 0.25
 """The same of few readings that do not prove other effects: named ones that are fitted flat to so
 few predict far worse than all together. A choice: of 30 poses of arms with one effect and nothing
 but scatter it fell by 2 to 15 %."""
-UNSURE = 2.0
-"""Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
-choice."""
 TOGETHER = 0.05
 """Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
 there; a choice: the error on poses left out has to fall, too."""
@@ -92,20 +89,13 @@ def p_value_of_others(of: Fit) -> float:
 def background_is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
     """Whether a background belongs to the model.
 
-    The error on poses left out must fall by a share, both weighted by the noise of the latter, and
-    all effects that were not named before be of plausible size (`Effect.most`): those that would
-    have to be larger stand in for one that the catalogue lacks.
+    The error on poses left out must fall by a share, both weighted by the noise of the latter.
 
     Args:
         before: the fit of the named effects alone.
         after: the fit of all, each with its standard deviation.
         worth: the share.
     """
-    random, known = after.model.random, before.model.named
-    new = (e for e in after.model.effects if e.name in random and e.name not in known)
-    plausible = all(np.all(random[e.name] <= UNSURE * e.most() * e.magnitudes) for e in new)
-    if not plausible:
-        return False
     raw, w = all_left_out(after)
     one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
     return other <= (1 - worth) ** 2 * one

@@ -23,6 +23,9 @@ from hilcal.types import Floats
 MOST_ROWS = 1500
 """Elements of readings up to which a background is fitted: with more, effects are named one by one
 until nothing is left, and the equations cost the cube of the columns. A choice."""
+UNSURE = 2.0
+"""Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
+choice."""
 SEED = 0
 """Of the average over the standard deviations, so that equal readings give equal fits."""
 
@@ -99,8 +102,11 @@ def allows_background(of: Fit) -> bool:
     return len(of.white) <= MOST_ROWS and of.model.prior is None
 
 
-def with_background(of: Fit, named: Collection[str]) -> Fit:
-    """Fit all effects of the catalogue.
+def with_background(of: Fit, named: Collection[str]) -> Fit | None:
+    """Fit all effects of the catalogue; None where one of them would be implausibly large.
+
+    Such an effect (`Effect.most`) stands in for one that the catalogue lacks; those of the model,
+    which were proved, may be as large as they are.
 
     The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
     factor of the instrument's makes the standard deviations of the effects smaller by as much,
@@ -112,9 +118,22 @@ def with_background(of: Fit, named: Collection[str]) -> Fit:
     """
     readings = of.readings.as_stated()
     found = mixed_fit(of.model, readings[~of.outlier], of.mode, np.random.default_rng(SEED))
+    if _implausible(found) - set(of.model.names):
+        return None
     if not readings.scatter_stated:
         readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
     return fit(background_model(found, named), readings, of.mode, start=found.theta)
+
+
+def _implausible(found: MixedFit) -> set[str]:
+    """Names of the effects some of whose standard deviations are larger than is plausible."""
+    std = found.prior_std()
+    return {
+        effect.name
+        for effect, mine in zip(found.model.effects, found.model.slices(), strict=True)
+        if effect.role not in FRAME_ROLES
+        and np.any(std[mine] > UNSURE * effect.most() * effect.magnitudes)
+    }
 
 
 def _scatter(found: MixedFit) -> ArmScatter:
