@@ -225,13 +225,14 @@ def test_the_report_passes_what_the_truth_passes(day: Day) -> None:
     page = html.unescape(re.sub(r"<[^>]+>", " ", (day.home / "report.html").read_text("utf-8")))
     page = " ".join(page.split())
     assert said.number(r"PASSED: (\d+) of \d+ errors") == len(day.states())
-    told = re.search(r"k = 2.{0,40}: U = ([\d.]+) mm rms.*? ([\d.]+) mm at most", page)
+    told = re.search(r"expanded uncertainty U = ([\d.]+) (µm|mm) \(3-D, k = 2\)", page)
     assert told is not None
+    U = float(told[1]) * {"µm": 1e-6, "mm": 1e-3}[told[2]]
     states, c = day.states(), day.calibration()
     predicted = c.predict(states.q, states.wrench).position
     off = np.linalg.norm(predicted - seen(day.secret.world, states, c.base_in_tracker()), axis=1)
     assert off.max() < 1e-4
-    assert np.mean(off <= 1e-3 * float(told[2])) > 0.95
+    assert np.mean(off <= U) > 0.95
     assert the_same_base(page) == the_same_base(day.said["refine"].text)
 
 
