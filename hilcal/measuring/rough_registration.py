@@ -18,6 +18,8 @@ PLAUSIBLE_M = 0.1
 """A reading so far from where the nominal arm holds the target is not believed, m."""
 FITS_M = 0.02
 """So far from it, a reading does not fit a registration, m; what the nominal arm lacks is less."""
+STRAYS = 3
+"""Readings that a registration leaves out at most; where more do not fit, the nominal arm does not."""
 APART_M = 0.05
 """A distance between two readings is that of the nominal positions to this, m."""
 STUCK_M = 1e-5
@@ -90,16 +92,21 @@ class RoughRegistration:
         held, seen = (
             np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen)
         )
-        while len(held) >= ENOUGH:
+        if len(held) < ENOUGH:
+            return None
+        whole = _kabsch(held, seen)
+        if not all(self._cell.known_targets):  # a guessed place on the flange fits nowhere
+            return whole
+        for _ in range(STRAYS + 1):
             found = _kabsch(held, seen)
             if found is None or _far(found, held, seen).max() <= FITS_M:
                 return found
-            without = [
-                (np.delete(held, k, axis=0), np.delete(seen, k, axis=0)) for k in range(len(held))
-            ]
-            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in without]
-            held, seen = without[int(np.argmin(worst))]
-        return None
+            if len(held) == ENOUGH:
+                return None
+            rest = [(np.delete(held, k, 0), np.delete(seen, k, 0)) for k in range(len(held))]
+            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in rest]
+            held, seen = rest[int(np.argmin(worst))]
+        return whole
 
     def expected(self, q: Floats) -> Floats | None:
         """Return (T, 3) where the targets are expected, sensor axes, m; None while unknown."""

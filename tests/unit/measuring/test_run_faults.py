@@ -253,3 +253,22 @@ def test_a_reading_of_another_reflector_is_told_as_soon_as_the_tracker_has_its_p
         pose = known.pose()
         assert pose is not None
         assert np.allclose(pose[0], cell.registration[:3, :3], atol=1e-9)
+
+
+@pytest.mark.parametrize(("known", "off_m"), [(False, 0.15), (True, 0.03)])
+def test_a_target_that_is_not_where_it_is_said_refuses_no_reading(
+    known: bool, off_m: float
+) -> None:
+    """Its place is estimated later, or was measured with a ruler."""
+    cell = Cell.load(configs_dir() / "cells" / "demo_ur10e.toml")
+    cell = replace(cell, registration_known=False, target_known=known)
+    joints = np.array([0.0, -1.2, 1.4, -1.7, -1.5, 0.0])
+    joints = joints + np.random.default_rng(1).uniform(-0.7, 0.7, (40, 6))
+    chain = chains.evaluate(cell.arm, joints)
+    places = chain.point(cell.target[:3, 3] + [off_m, 0.0, 0.0]) @ cell.registration[:3, :3].T
+    rough = RoughRegistration(cell)
+    for k, (q, x) in enumerate(zip(joints, places, strict=True)):
+        assert rough.implausible(q, x) is None
+        rough.add(q, x, step=Step(f"p{k}", "none"))
+        assert rough.late_doubts() == []
+    assert rough.pose() is not None
