@@ -19,7 +19,7 @@ PLAUSIBLE_M = 0.1
 FITS_M = 0.02
 """So far from it, a reading does not fit a registration, m; what the nominal arm lacks is less."""
 STRAYS = 3
-"""Readings that a registration leaves out at most; where more do not fit, the nominal arm does not."""
+"""Readings that a registration leaves out at most; where more do not fit, the arm is another."""
 APART_M = 0.05
 """A distance between two readings is that of the nominal positions to this, m."""
 STUCK_M = 1e-5
