@@ -10,18 +10,19 @@ from hilcal.store.plan import Step
 from hilcal.types import Floats
 
 ENOUGH = 4
+"""Readings from which a registration is computed: three fix it, one more checks it."""
 WITNESSES = 2
-"""Readings that agree, from which on another one is judged by its distances from them."""
+"""Readings by whose distances another one is judged, at least."""
 SPREAD_M = 0.05
 """Second extent of a cloud of positions that fixes a rotation, m."""
 PLAUSIBLE_M = 0.1
 """A reading so far from where the nominal arm holds the target is not believed, m."""
 FITS_M = 0.02
-"""So far from it, a reading does not fit a registration, m; what the nominal arm lacks is less."""
+"""Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
 STRAYS = 3
-"""Readings that a registration leaves out at most; where more do not fit, the arm is another."""
+"""Readings that a registration leaves out at most; beyond that the nominal arm is wrong."""
 APART_M = 0.05
-"""A distance between two readings is that of the nominal positions to this, m."""
+"""Largest error of a distance between two readings, m."""
 STUCK_M = 1e-5
 """Two readings so close to each other at poses that are not are one old reading, m."""
 STUCK_SHARE = 0.2
