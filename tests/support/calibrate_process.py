@@ -88,7 +88,7 @@ class Calibration:
             os.killpg(process.pid, signal.SIGKILL)
         code = process.wait()
         assert ended or code == -signal.SIGKILL
-        assert code <= 0, self.words
+        assert code <= 0, f"exit code {code}: {self.words[-500:]}"
         assert self.left_behind() == []
         return not ended
 
