@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
@@ -105,8 +106,9 @@ def allows_background(of: Fit) -> bool:
 def with_background(of: Fit, named: Collection[str]) -> Fit | None:
     """Fit all effects of the catalogue; None where one of them would be implausibly large.
 
-    Such an effect (`Effect.most`) stands in for one that the catalogue lacks; those of the model,
-    which were proved, may be as large as they are.
+    Such an effect (`Effect.most`) stands in for one that the catalogue lacks, and may be so large
+    that the arm has no equilibrium; those of the model, which were proved, may be as large as they
+    are.
 
     The noise is as the mixed model estimates it: the arm's scatter is in the covariance, and a
     factor of the instrument's makes the standard deviations of the effects smaller by as much,
@@ -117,12 +119,15 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
         named: effects that are not of the background.
     """
     readings = of.readings.as_stated()
-    found = mixed_fit(of.model, readings[~of.outlier], of.mode)
-    if _implausible(found) - set(of.model.names):
+    try:
+        found = mixed_fit(of.model, readings[~of.outlier], of.mode)
+        if _implausible(found) - set(of.model.names):
+            return None
+        if not readings.scatter_stated:
+            readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
+        return fit(background_model(found, named), readings, of.mode, start=found.theta)
+    except CannotAnswerError:
         return None
-    if not readings.scatter_stated:
-        readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
-    return fit(background_model(found, named), readings, of.mode, start=found.theta)
 
 
 def _implausible(found: MixedFit) -> set[str]:

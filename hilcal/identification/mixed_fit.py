@@ -12,6 +12,7 @@ import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
+from hilcal.errors import CannotAnswerError
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
@@ -233,9 +234,14 @@ def _iterated(
         step = here.problem.parameters(found.equations.coordinates, model.size) - theta
         for k in range(HALVINGS):
             trial = theta + 0.5**k * step
-            there = _linearise(model, readings, w, trial, parts)
+            try:
+                there = _linearise(model, readings, w, trial, parts)
+            except CannotAnswerError:  # no equilibrium so far away
+                continue
             if there.penalised(trial, found.equations) <= before:
                 break
+        else:
+            return found, theta
         moved = float(np.sqrt(np.mean((there.white - here.white) ** 2)))
         theta, here = trial, there
         if rounds == ROUNDS or moved < CONVERGED:
