@@ -91,7 +91,7 @@ def test_covariance_is_symmetric_to_the_last_bit():
         pytest.param(5, 0.0, marks=pytest.mark.slow),
         (5, 0.4),
         pytest.param(20, 0.0, marks=pytest.mark.slow),
-        (40, 0.2),
+        pytest.param(40, 0.2, marks=pytest.mark.slow),
     ],
 )
 def test_stated_ellipsoid_covers_the_truth_as_often_as_it_says(count, share):

@@ -99,13 +99,6 @@ def test_run_and_check_refuse_it_before_anything_moves(
     assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
 
 
-def test_where_the_arm_may_go_below_its_mount_is_said_in_the_cell() -> None:
-    """On a pedestal: the same plan passes by one line of CELL.toml, and the arm is not stopped."""
-    config = cell(limits={"workspace_min_m": [-2.0, -2.0, -1.0]})
-    assert refused_lines(config, HOME, BELOW) == ()
-    assert stopped(config, BELOW) is None
-
-
 @pytest.mark.parametrize("axis", range(3))
 def test_the_upper_arm_keeps_the_sides_that_leave_the_shoulder_room(axis: int) -> None:
     """A side 0.45 m from the axis: lying towards it, the upper arm alone is outside."""
