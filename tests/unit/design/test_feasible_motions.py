@@ -3,16 +3,12 @@
 from typing import Any
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.design.draw import draw
-from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
-from tests.support.space_cases import TABLE, boxes, cell, space_of
+from tests.support.space_cases import TABLE, cell
 
 
 def plan_of(q: np.ndarray, *steps: tuple[str, str]) -> Plan:
@@ -66,32 +62,3 @@ def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run() -> None:
     assert any("pose p1: " in line and "between tracker and target" in line for line in behind)
     config = cell(sight=sight | {"target_normal": [0.0, 0.0, 1.0], "incidence_max_rad": 0.3})
     assert any("incidence_max_rad is 0.3" in line for line in problems(config, away, away))
-
-
-@settings(max_examples=4, deadline=None)
-@given(boxes, st.integers(0, 99))
-def test_motions_that_are_clear_pass_the_dry_run(box: dict[str, Any], seed: int) -> None:
-    config = cell(obstacles=[TABLE, box], limits={"workspace_min_m": [-1.5, -1.5, 0.0]})
-    space = space_of(config)
-    try:
-        drawn = draw(space, 16, np.random.default_rng(seed))
-    except CannotAnswerError:
-        return
-    for k, load in enumerate(drawn.loads):
-        q = drawn.q[drawn.allowed[:, k]]
-        if len(q) < 2:
-            continue
-        near = q[np.argsort(np.abs(q - q[0]).max(axis=1))]
-        clear = space.passable(near[0], near[1:], load)
-        assert space.passable(near[0], near[:1], load).all()  # staying is
-        for end in near[1:][clear]:
-            found = problems(config, near[0], end, load=load)
-            assert [x for x in found if "beside" not in x and "limit" not in x] == []
-
-
-def test_a_motion_through_a_wall_is_not_clear_though_its_ends_are() -> None:
-    post = {"name": "post", "bottom_m": [-0.8, -0.2, 0.0], "radius_m": 0.01, "height_m": 2.0}
-    space = space_of(cell(obstacles=[post]))
-    ends = np.array([[0.8, *HOME[1:]], [-0.8, *HOME[1:]]])
-    assert space.keeps("obstacle", ends).all()
-    np.testing.assert_array_equal(space.passable(ends[0], ends, UNLOADED), [True, False])
