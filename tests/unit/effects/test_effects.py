@@ -5,13 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.identification.fit import fit
-from hilcal.model.model import Model
-from hilcal.readings.readings import Readings
+from hilcal.effects.protocol import Effect
 from hilcal.robot.statics import Load, slot_wrenches
 from tests.support.arm_cases import slope
-from tests.support.campaigns import campaign, plan
 from tests.support.effect_cases import (
     CELLS,
     ELASTIC,
@@ -20,7 +16,6 @@ from tests.support.effect_cases import (
     VARIANTS,
     effect_class,
     make,
-    numeric_jacobian,
     options_of,
     random_theta,
     situation,
@@ -142,35 +137,3 @@ def test_wrench_columns_are_the_derivative_of_the_slot_wrenches(name, options, a
 
 
 # --- a user's own ---------------------------------------------------------------------------
-
-
-class ForearmGrowth(Effect):
-    """The forearm grows along its own axis in time: a twist of slot 2 along x, m/s."""
-
-    name = "forearm_growth"
-    summary = "the forearm grows in time"
-    needs = ("time",)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter("rate", "m/s", 1e-8),)
-
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        values = s.states.time[:, None, None] * np.eye(6)[:1]
-        return (Columns("twist", np.array([0]), np.array([2]), values),)
-
-
-def test_a_users_effect_takes_part_unchanged():
-    c = campaign(plan_seed=0, registration_known=True)
-    p = plan()
-    grown = make("joint_compliance", c.cell, p.states), ForearmGrowth(c.cell, p.states)
-    model = Model(c.cell, grown)
-    truth = np.append(c.world.physics.joint_compliance, 4e-7)
-    prediction = model.predict(p.states, truth)
-    numeric = numeric_jacobian(model, p.states, truth, np.array([1e-5] * 6 + [1e-7]), 3)[:, :, 6]
-    derived = 1e-7 * model.jacobian(prediction, truth, 3)[:, :, 6]
-    size = np.abs(numeric).max()
-    np.testing.assert_allclose(derived, numeric, rtol=0, atol=1e-6 * size + 1e-12)
-    clean: Readings = replace(c.readings, value=prediction.observation.position)
-    found = fit(model, clean, "absolute")
-    np.testing.assert_allclose(found.theta, truth, rtol=1e-8)

@@ -174,13 +174,6 @@ def test_one_parameter_may_move_every_joint(tmp_path: Path) -> None:
     np.testing.assert_allclose(derived, (ends[1] - ends[0]) / 2e-4, rtol=0, atol=1e-7)
 
 
-def test_a_law_for_seven_joints_is_good(tmp_path: Path, capsys: Capsys) -> None:
-    path = tmp_path / "mine.py"
-    path.write_text(CLASS.replace("np.array([1])", "np.array([6])"), encoding="utf-8")
-    assert [e.name for e in read_effects(path).effects] == ["mine"]
-    ok(capsys, "effects", "--effects-from", path)
-
-
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)
 def test_what_is_built_in_passes_the_check(kind: type[Effect]) -> None:
     check_effect(kind)
