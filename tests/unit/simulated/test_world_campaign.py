@@ -9,7 +9,6 @@ from drivers.simulated.injected_effects import hide, nothing_hidden
 from drivers.simulated.rehearsal import simulate
 from hilcal.errors import InputError
 from studies.random_campaigns import dead_weights, rehearsal_states
-from studies.temperatures import air, joints
 from tests.support.example_cell import ur10e_cell
 
 CELL = ur10e_cell()
@@ -46,12 +45,6 @@ def test_loads_hang_for_seconds_or_minutes_and_never_since_before_the_last_readi
         assert mine.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
 
 
-def test_where_nothing_is_ever_hung_the_time_under_load_goes_on():
-    states, _, load, _ = rehearsal_states(CELL, 5, [], np.random.default_rng(0))
-    assert not load.any()
-    np.testing.assert_allclose(np.diff(states.load_time), np.diff(states.time))
-
-
 def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
     states, _, _, _ = rehearse(n=40)
     warm, hall = states.joint_temperature, states.air_temperature
@@ -70,32 +63,6 @@ def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
     assert np.abs(hall - 22.0).max() < 6.0
     # the quickest is the air conditioning, 0.25 °C in a period of 1200 s
     assert np.all(np.abs(np.diff(hall)) < lasted * 0.0022 + 6 * 0.03)
-
-
-def test_every_campaign_has_its_own_weather():
-    time = np.linspace(0.0, 8000.0, 30)
-    rng = np.random.default_rng(0)
-    rises = [np.ptp(joints(time, 6, rng), axis=0) for _ in range(50)]
-    drifts = [seen[-1] - seen[0] for seen in (air(time, rng) for _ in range(50))]
-    assert np.std(rises) > 2.0
-    assert np.min(rises) > 3.0
-    assert np.ptp(drifts) > 1.0
-    assert np.abs(drifts).max() < 6.0
-
-
-def test_temperatures_are_drawn_apart_from_all_else():
-    with_, without = (
-        (*rehearsal_states(CELL, 6, WEIGHTS, rng, temperatures=told), rng.random(4))
-        for told, rng in ((True, np.random.default_rng(5)), (False, np.random.default_rng(5)))
-    )
-    for name in ("q", "wrench", "time", "load_time", "approach"):
-        np.testing.assert_array_equal(getattr(with_[0], name), getattr(without[0], name))
-    np.testing.assert_array_equal(with_[-1], without[-1])
-    assert without[0].air_temperature is None
-    assert without[0].joint_temperature is None
-    again = rehearsal_states(CELL, 6, WEIGHTS, np.random.default_rng(5))[0]
-    np.testing.assert_array_equal(again.air_temperature, with_[0].air_temperature)
-    np.testing.assert_array_equal(again.joint_temperature, with_[0].joint_temperature)
 
 
 def test_poses_are_feasible_and_spread():
@@ -135,14 +102,6 @@ def test_readings_scatter_about_the_truth_within_their_covariance(m):
     off = readings.value - world.sight(states).value(m)
     white = np.linalg.solve(np.linalg.cholesky(readings.covariance[:, :3, :3]), off[:, :3, None])
     assert np.mean(white**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / white.size))
-
-
-def test_deflections_have_the_size_of_a_real_arm():
-    states, pose, load, cycle = rehearse(n=20)
-    world = nothing_hidden(CELL, np.random.default_rng(1))
-    readings = simulate(world, states, pose, load, cycle, NAMES, np.random.default_rng(2))
-    heavy = np.linalg.norm(readings.value[load == 2] - readings.value[load == 0], axis=1)
-    assert 3e-4 < np.median(heavy) < 3e-3
 
 
 def test_the_same_seed_measures_the_same():
