@@ -107,15 +107,6 @@ def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read() ->
     assert np.allclose(eval(u.code, {"s": s, "np": np}), wanted, rtol=1e-12)
 
 
-def test_a_composed_quantity_needs_the_columns_of_all_its_quantities() -> None:
-    known = named(example())
-    warm = next(v for v in known.values() if v.names == ("air temperature",))
-    time = next(v for v in known.values() if v.names == ("time",))
-    terms = ((1.0, product(Factor(warm, shapes.LINEAR), Factor(time, shapes.LINEAR))),)
-    bent = product(Factor(composed(terms), shapes.ABOVE, (1.0,)))
-    assert bent.needs == ("air_temperature", "time")
-
-
 def words() -> Grammar:
     s = example()
     return grammar([v for v in variables(s) if v.kind in ("angle", "torque")], s, 14)

@@ -8,7 +8,6 @@ import pytest
 from hilcal.effects.protocol import Columns
 from hilcal.model.observe import Motion, Observation, motion, observe
 from hilcal.model.reading_columns import ReadingColumns
-from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load
@@ -148,27 +147,3 @@ def test_motion_by_columns_is_a_slope(field: str, d: Deviation, constant: bool) 
         else:
             change[...] = values[:, p]
         assert_close_relative(found[:, :, p], along(d, field, change))
-
-
-@pytest.mark.parametrize("d", DEVIATIONS)
-def test_motion_by_joints_and_slots_is_a_slope(d: Deviation) -> None:
-    rng = np.random.default_rng(10)
-    dq, twist = rng.normal(size=(COUNT, 2, 6)), rng.normal(size=(COUNT, 2, 7, 6))
-    twist[:, :, 3] = 0.0
-    moves = motion_of(d)
-    found = np.einsum("nmj,npj->nmp", moves.dq, dq)
-    for slot in range(7):
-        found += np.einsum("nme,npe->nmp", moves.by_slot(slot), twist[:, :, slot])
-    for p in range(2):
-        expected = along(d, "dq", dq[:, p]) + along(d, "twist", twist[:, p])
-        assert_close_relative(found[:, :, p], expected)
-
-
-def test_m_is_the_number_of_leading_rows() -> None:
-    np.testing.assert_array_equal(motion_of(FULL, 3).dq, motion_of(FULL, 6).dq[:, :3])
-
-
-def test_observation_of_poses_is_a_rotation() -> None:
-    r = read(FULL).rotation
-    unit = np.broadcast_to(np.eye(3), r.shape)
-    np.testing.assert_allclose(se3.product(r, np.swapaxes(r, 1, 2)), unit, rtol=0, atol=1e-14)

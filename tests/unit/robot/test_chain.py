@@ -6,11 +6,11 @@ import pytest
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import Chain, evaluate, joint_jacobian, slot_jacobian
+from hilcal.robot.chain import evaluate, joint_jacobian, slot_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats
-from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, slots_of, twisted
+from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
 
 TOLERANCE = 1e-12
 COUNT = 12
@@ -152,52 +152,6 @@ def test_jacobians_are_slopes(name: str, size: float) -> None:
 def assert_close_relative(found: Floats, expected: Floats) -> None:
     """Within 1e-7 of the longest motion."""
     assert np.abs(found - expected).max() <= 1e-7 * np.abs(expected).max()
-
-
-def test_slot_jacobian_of_an_untwisted_arm_needs_no_twists() -> None:
-    arm = arm_of("ur5e")
-    q = angles(arm)
-    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
-    for k in range(arm.n + 1):
-        x = plain.position[-1]
-        np.testing.assert_array_equal(slot_jacobian(plain, k, x), slot_jacobian(zero, k, x))
-
-
-def test_nothing_deviates_exactly() -> None:
-    arm = arm_of("ur10e")
-    q = angles(arm)
-    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
-    np.testing.assert_array_equal(plain.rotation, zero.rotation)
-    np.testing.assert_array_equal(plain.position, zero.position)
-    for i in range(COUNT):
-        slots = slots_of(arm, q[i])
-        np.testing.assert_allclose(plain.position[:, i], slots[:, :3, 3], rtol=0, atol=TOLERANCE)
-
-
-def test_a_point_may_differ_from_state_to_state() -> None:
-    arm = arm_of("ur10e")
-    chain = evaluate(arm, angles(arm))
-    offsets = np.random.default_rng(4).normal(size=(COUNT, 3))
-    for i in range(COUNT):
-        np.testing.assert_allclose(
-            chain.point(offsets)[i], chain.point(offsets[i])[i], rtol=0, atol=1e-15
-        )
-
-
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_layout_of_the_input_does_not_matter(order: str) -> None:
-    arm = arm_of("ur10e")
-    q, d = angles(arm), random_deviation(arm, 1e-3)
-    assert d.dq is not None
-    assert d.twist is not None
-    laid = Deviation(
-        dq=np.array(d.dq, order=order),  # type: ignore[call-overload]
-        twist=np.array(d.twist, order=order),  # type: ignore[call-overload]
-    )
-    a: Chain = evaluate(arm, q, d)
-    b: Chain = evaluate(arm, np.array(q, order=order), laid)  # type: ignore[call-overload]
-    np.testing.assert_array_equal(a.position, b.position)
-    np.testing.assert_array_equal(a.rotation, b.rotation)
 
 
 def test_no_states() -> None:

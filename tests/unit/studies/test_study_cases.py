@@ -7,12 +7,10 @@ from drivers.simulated.injected_effects import EFFECTS
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
-from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
-from hilcal.readings.whitening import MODES, Mode
+from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals
@@ -20,7 +18,6 @@ from studies.random_campaigns import dead_weights
 from studies.study_cases import (
     StudyCase,
     effects_shown,
-    laws_shown,
     study_case,
     with_study_loads,
 )
@@ -85,19 +82,6 @@ def test_the_noise_is_as_large_as_stated_or_as_misjudged() -> None:
         assert np.std(np.concatenate(white)) == pytest.approx(1 / stated, rel=0.08)
 
 
-def test_repeats_are_the_same_states_twice() -> None:
-    r = case(cycles=2).readings
-    assert len(r) == 96
-    assert np.array_equal(r.states.q[:48], r.states.q[48:])
-    assert set(r.cycle) == {0, 1}
-
-
-def test_several_effects_are_hidden_at_once() -> None:
-    both = case("creep", "encoder_offset").world.truth
-    names = {name.split(".")[0] for name in both}
-    assert names == {"joint_compliance", "creep", "encoder_offset"}
-
-
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
     for mode in law.readings:
@@ -114,15 +98,6 @@ def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
             change, covariance = change[loaded], covariance[loaded]
         white = np.linalg.solve(np.linalg.cholesky(covariance), change[:, :, None])
         assert np.sqrt(np.mean(white**2)) == pytest.approx(3.0, rel=1e-6)
-
-
-def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
-    for mode in MODES:
-        c = case(mode=mode)
-        f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-        known = {w.variable for w in misfit_breakdown(linearise(f))}
-        for name in laws_shown(mode):
-            assert set(law_named(name).variables) <= known
 
 
 def test_laws_and_effects_that_do_not_fit_are_refused() -> None:

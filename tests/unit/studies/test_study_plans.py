@@ -1,28 +1,22 @@
 """`study plans`: what it counts, what it compares, and what it claims of plans."""
 
-import io
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig, load_config
+from hilcal.config import CellConfig
 from hilcal.design.noise_model import reading_covariance
 from hilcal.engine.engine import open_engine
-from hilcal.errors import CannotAnswerError, InputError
-from hilcal.readings.readings import Readings, States
 from hilcal.types import Floats
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
-from studies.plans_command import SimulatedArm, arms, with_robot
-from studies.plans_errors import Asked, Errors, prepared, readings_asked, run_campaign, subject
+from studies.plans_command import arms
+from studies.plans_errors import Errors, readings_asked
 from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
-from studies.plans_table import as_predicted, halved, report
-from tests.support.cli_cases import CELL, run
+from studies.plans_table import as_predicted
+from tests.support.cli_cases import run
 from tests.support.study_plans_cases import configured
 
 SEED = 5
@@ -126,15 +120,6 @@ def test_deflections_have_their_own_unloaded_reading_each_time(deflection: Scene
     assert set(unloaded.values()) == {1}
 
 
-def test_a_grid_is_regular_and_random_plans_are_not(deflection: Scene) -> None:
-    by_hand = readings_asked(grid(deflection, 100)).states.q
-    assert all(len(np.unique(by_hand[:, j].round(9))) <= 6 for j in range(6))
-    first = at_random(deflection, 100, np.random.default_rng(0))
-    other = at_random(deflection, 100, np.random.default_rng(1))
-    assert not np.array_equal(first.counts, other.counts)
-    assert len(np.unique(readings_asked(first).states.q[:, 0].round(9))) == first.poses
-
-
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
 def test_a_planned_campaign_beats_the_others_where_it_is_asked_to(
     mode: str, request: pytest.FixtureRequest
@@ -166,60 +151,6 @@ def test_the_simulated_noise_is_the_planned_one(known: bool) -> None:
     assert np.allclose(np.linalg.eigvalsh(measured.covariance), axes, rtol=5e-3)
 
 
-def test_arms_differ_and_equal_numbers_give_equal_arms() -> None:
-    config = configured()
-    cell = cell_from_config(config)
-    first, again, other = (arms(0)(cell, config, k).parameters for k in (1, 1, 2))
-    assert np.array_equal(first["joint_compliance"], again["joint_compliance"])
-    assert not np.allclose(first["joint_compliance"], other["joint_compliance"], rtol=1e-3)
-
-
-@dataclass(frozen=True)
-class Noisy:
-    """An arm that is read with more noise than is stated."""
-
-    arm: SimulatedArm
-    factor: float
-
-    @property
-    def parameters(self) -> Mapping[str, Floats]:
-        return self.arm.parameters
-
-    def measure(self, asked: Asked, rng: np.random.Generator) -> Readings:
-        r = self.arm.measure(asked, rng)
-        extra = np.sqrt(self.factor**2 - 1) * np.linalg.cholesky(r.covariance)
-        noise = np.einsum("nij,nj->ni", extra, rng.standard_normal(r.value.shape))
-        return replace(r, value=r.value + noise)
-
-    def position(self, states: States) -> Floats:
-        return self.arm.position(states)
-
-
-@pytest.mark.parametrize("factor", [pytest.param(1.0, marks=pytest.mark.slow), 2.0])
-def test_errors_are_those_of_the_noise_that_is_there(factor: float) -> None:
-    of = scene_of(configured(known=True))
-    plan = prepared(at_random(of, 60, np.random.default_rng(0)))
-    errors = []
-    for number in range(16):
-        made = arms(0)(of.cell, of.config, number)
-        assert isinstance(made, SimulatedArm)
-        told = subject(of, Noisy(made, factor))
-        noise = np.random.default_rng([number, 1])
-        errors.append(run_campaign(of.cell, of.config, plan, told, noise))
-    s = summary(errors)
-    for ratio in (s.spread, s.position_ratio):
-        assert ratio.std < 0.1 * factor
-        assert abs(ratio.value - factor) < 3 * ratio.std
-
-
-def test_too_few_readings_are_refused(deflection: Scene) -> None:
-    plan = at_random(deflection, 5, np.random.default_rng(0))
-    told = subject(deflection, arms(0)(deflection.cell, deflection.config, 0))
-    rng = np.random.default_rng(0)
-    with pytest.raises((CannotAnswerError, InputError)):
-        run_campaign(deflection.cell, deflection.config, prepared(plan), told, rng)
-
-
 @pytest.mark.slow
 def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
     """Not on the number of workers either."""
@@ -246,29 +177,6 @@ def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None
         assert s.parameter_real.value == pytest.approx(
             base.parameter_real.value / own.parameter_real.value
         )
-
-
-def test_people_see_every_plan_and_every_verdict(small: PlansStudy) -> None:
-    console = Console(width=100, file=io.StringIO())
-    for part in report(small):
-        console.print(part)
-    shown = console.file.getvalue()  # type: ignore[attr-defined]
-    assert all(line.kind in shown for line in small.lines)
-    assert max(map(len, shown.splitlines())) <= 100
-    assert halved(small, small.shrinkage()[0]) in shown
-
-
-def test_another_robot_carries_loads_by_its_payload() -> None:
-    config = load_config(CELL)
-    small = with_robot(config, "ur5e")
-    assert small.robot.model == "ur5e"
-    share = cell_from_config(small).arm.payload / cell_from_config(config).arm.payload
-    assert [load.mass_kg for load in small.loads] == pytest.approx(
-        [share * load.mass_kg for load in config.loads]
-    )
-    assert small.loads[-1].force_N == pytest.approx(share * np.array(config.loads[-1].force_N))
-    assert small.loads[0].name == f"{share * 5:.3g}kg"
-    assert with_robot(config, config.robot.model) is config
 
 
 def test_the_command_gives_one_document(capsys: pytest.CaptureFixture[str]) -> None:
