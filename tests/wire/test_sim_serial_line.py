@@ -3,8 +3,6 @@
 import contextlib
 import itertools
 import os
-import stat
-import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -32,10 +30,6 @@ def client(port: PtyPort, baud: int = BAUD, timeout: float = 1.0) -> Iterator[se
         yield line
 
 
-def hamming(a: bytes, b: bytes) -> int:
-    return sum((x ^ y).bit_count() for x, y in zip(a, b, strict=True))
-
-
 def take(port: PtyPort, count: int) -> bytes:
     data = b""
     for _ in range(200):
@@ -55,22 +49,6 @@ def test_carries_every_byte_value_both_ways(port: PtyPort) -> None:
         assert take(port, 256) == every
 
 
-def test_is_a_character_device_behind_a_link(port: PtyPort) -> None:
-    assert port.link.is_symlink()
-    assert stat.S_ISCHR(os.stat(port.link).st_mode)
-
-
-def test_is_raw_before_anybody_has_configured_it(port: PtyPort) -> None:
-    end = os.open(port.link, os.O_RDWR | os.O_NOCTTY)
-    try:
-        port.send(b"a\r\nb\x03\x04\x00")
-        port.drain()
-        assert os.read(end, 100) == b"a\r\nb\x03\x04\x00"
-        assert port.read(0.02) == b""  # no echo
-    finally:
-        os.close(end)
-
-
 def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
     frames = 20
     with client(port) as line:
@@ -84,15 +62,6 @@ def test_bytes_take_ten_bits_each(port: PtyPort) -> None:
         took = time.monotonic() - start
     assert data == b"x" * frames * 100
     assert took >= frames * 100 * 10 / BAUD
-
-
-def test_frames_born_in_the_past_come_at_once(port: PtyPort) -> None:
-    with client(port) as line:
-        start = time.monotonic() - 1.0
-        for k in range(50):
-            port.send(bytes([k]) * 20, start + 0.01 * k)
-        port.pump()
-        assert line.read(1000) == b"".join(bytes([k]) * 20 for k in range(50))
 
 
 def test_a_full_line_drops_whole_frames_and_counts_them(port: PtyPort) -> None:
@@ -132,25 +101,6 @@ def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
         assert line.read(100) == b"new"
 
 
-def test_an_answer_after_the_client_has_flushed_is_seen(port: PtyPort) -> None:
-    with client(port) as line:
-        line.write(b"question")
-        assert take(port, 8) == b"question"
-        line.reset_input_buffer()
-        port.send(b"late answer")
-        port.drain()
-        assert line.read(11) == b"late answer"
-
-
-def test_a_flip_changes_one_bit(port: PtyPort) -> None:
-    port.admin("flip", {"probability": 1.0})
-    with client(port) as line:
-        for _ in range(50):
-            port.send(b"0123456789")
-            port.drain()
-            assert hamming(line.read(10), b"0123456789") == 1
-
-
 def test_flips_come_as_often_as_asked(port: PtyPort) -> None:
     frames, share = 2000, 0.1
     past = time.monotonic() - 100.0
@@ -180,44 +130,6 @@ def test_a_cut_frame_is_a_shorter_beginning(port: PtyPort) -> None:
     assert {len(beginning) for beginning in beginnings} == set(range(1, 10))
 
 
-def test_half_a_frame_once(port: PtyPort) -> None:
-    port.admin("half_frame", {})
-    with client(port) as line:
-        port.send(b"0123456789")
-        port.send(b"abcdefghij")
-        port.drain()
-        assert line.read(15) == b"01234abcdefghij"
-
-
-def test_garbage_and_mute(port: PtyPort) -> None:
-    with client(port) as line:
-        port.admin("garbage", {"count": 33})
-        port.drain()
-        assert len(line.read(33)) == 33
-        port.admin("mute", {"on": True})
-        port.send(b"unheard")
-        port.drain()
-        port.admin("mute", {"on": False})
-        port.send(b"heard")
-        port.drain()
-        assert line.read(5) == b"heard"
-
-
-def test_unplugging_is_what_pyserial_users_know(port: PtyPort) -> None:
-    with client(port) as line:
-        port.admin("unplug", {})
-        assert not port.link.exists()
-        with pytest.raises(serial.SerialException):
-            line.read(1)
-        with pytest.raises(OSError):  # noqa: PT011 - whatever the errno
-            _ = line.in_waiting
-        with pytest.raises(termios.error):
-            line.reset_input_buffer()
-    port.send(b"into the void")
-    port.pump()
-    assert port.read(0.0) == b""
-
-
 def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
     before = os.readlink(port.link)
     port.unplug()
@@ -234,34 +146,8 @@ def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
             os.close(end)
 
 
-@pytest.mark.parametrize("baud", [9600, 230400])
-def test_a_wrong_rate_is_garbage_both_ways(port: PtyPort, baud: int) -> None:
-    text = b"the quick brown fox jumps over the lazy dog" * 3
-    with client(port, baud, timeout=0.3) as line:
-        port.send(text)
-        port.drain()
-        got = line.read(1000)
-        assert got
-        assert text not in got
-        line.write(text)
-        assert take(port, len(text)) != text
-        line.baudrate = BAUD
-        port.send(text)
-        port.drain()
-        assert line.read(len(text)) == text
-        port.admin("baud", {"baud": 57600})
-        port.send(text)
-        port.drain()
-        assert text not in line.read(1000)
-
-
 def test_refuses_what_it_does_not_know(port: PtyPort) -> None:
     with pytest.raises(ValueError, match="no such operation"):
         port.admin("explode", {})
     with pytest.raises(ValueError, match="valid"):
         port.admin("baud", {"baud": 12345})
-
-
-def test_only_one_program_may_hold_it(port: PtyPort) -> None:
-    with client(port), pytest.raises(serial.SerialException, match="exclusively lock"):
-        serial.Serial(str(port.link), BAUD, exclusive=True)

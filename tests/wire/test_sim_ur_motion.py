@@ -105,13 +105,6 @@ def test_slider_slows_and_holds():
     np.testing.assert_array_equal(path.q, held)
 
 
-def test_a_move_to_the_same_place_is_none():
-    path = trajectory()
-    path.start(np.zeros(6), 0.5, 1.0, 100.0)
-    assert not path.moving
-    assert path.arrivals == 5
-
-
 @given(vectors)
 def test_poses_go_there_and_back(given):
     # rotation vectors up to half a turn
