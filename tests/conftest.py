@@ -56,6 +56,7 @@ def pytest_configure() -> None:
 
 LONG = (
     "test_stops",
+    "test_run_watched",
     "test_fault_matrix_serial",
     "test_fault_matrix_arm",
     "test_force_faults",
@@ -71,7 +72,6 @@ LONG = (
     "test_catalogue_sufficiency",
     "test_devices",
     "test_terminal",
-    "test_sim_serial_bota",
     "test_ur_driver_processes",
     "test_user_effects",
     "test_cli",
