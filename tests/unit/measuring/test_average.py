@@ -68,19 +68,6 @@ def test_systematic_share_is_not_averaged_away():
     assert average(samples_of([PLACE] * 10), 1.0).covariance == pytest.approx(V, rel=1e-12)
 
 
-def test_mean_of_stated_covariances_is_what_counts():
-    samples = samples_of([PLACE] * 2)
-    samples[1] = TrackerSample(1, PLACE, 3 * V)
-    assert average(samples).covariance == pytest.approx(20 / 21 * 2 * V / 2, rel=1e-12)
-
-
-def test_covariance_is_symmetric_to_the_last_bit():
-    rng = np.random.default_rng(2)
-    covariance = average(samples_of(drawn(rng, 7)), 0.1).covariance
-    assert np.array_equal(covariance, covariance.T)
-    assert np.all(np.linalg.eigvalsh(covariance) > 0)
-
-
 # calibration
 
 
