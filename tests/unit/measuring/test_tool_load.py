@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi2_law
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.tool_load import identify_tool_load, shift, tare
+from hilcal.measuring.tool_load import identify_tool_load, tare
 from hilcal.measuring.weighing import compare
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
