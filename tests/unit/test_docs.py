@@ -23,7 +23,7 @@ from hilcal.tables.table import write_table
 from hilcal.toml import check_section
 from studies.random_campaigns import rehearse
 from tests.support import readme
-from tests.support.cli_cases import CELL, ok, quickly_planned
+from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -89,7 +89,7 @@ def test_the_guide_to_the_library_runs_as_it_stands(
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     section = (ROOT / "README.md").read_text().split("\n## From Python\n")[1].split("\n## ")[0]
     code = "\n".join(line[4:] for line in section.splitlines() if line.startswith("    "))
@@ -101,7 +101,7 @@ def test_the_python_of_the_readme_runs_as_it_stands(
 
 
 def test_the_guide_to_compensation_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "compensate.md"
     campaign_of("nothing", 20)
@@ -120,7 +120,7 @@ def test_the_guide_to_compensation_runs_as_it_stands(
 
 
 def test_the_guide_to_handing_over_runs_as_it_stands(
-    campaign_of: Callable[..., None], capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "hand-over.md"
     campaign_of("nothing", 20)
@@ -137,7 +137,7 @@ def test_the_guide_to_handing_over_runs_as_it_stands(
 
 
 def test_the_guide_to_imports_is_what_the_commands_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "import-a-table.md"
     monkeypatch.chdir(tmp_path)
@@ -205,7 +205,7 @@ def test_the_driver_of_the_guide_opens_and_reports() -> None:
 def test_the_commands_of_the_guide_to_effects(
     campaign_of: Callable[..., None],
     monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capsys,
 ) -> None:
     guide = HOW_TO / "add-an-effect.md"
     campaign_of("nothing", 6)

@@ -23,9 +23,8 @@ from hilcal.readings.covariance import WHOLE
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned, refused, rehearsal, run
 
-Capsys = pytest.CaptureFixture[str]
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
 

@@ -12,10 +12,9 @@ from hilcal.effects.protocol import Effect
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.user_effect_cases import CLASS, COLUMNS, HEAD
 
-Capsys = pytest.CaptureFixture[str]
 NAME = "soft_side"
 
 # --- files that cannot be used --------------------------------------------------------------

@@ -19,10 +19,9 @@ from hilcal.tables.table import write_table
 from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import CELL, ok, refused
+from tests.support.cli_cases import CELL, Capsys, ok, refused
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
-Capsys = pytest.CaptureFixture[str]
 NAME = "soft_side"
 POSES = 20
 

@@ -25,10 +25,8 @@ from studies.diagnosis_rates import (
 )
 from studies.diagnosis_table import report
 from studies.study_cases import effects_shown, laws_shown
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.study_diagnosis_cases import asked, outcome, quick, refined, said
-
-Capsys = pytest.CaptureFixture[str]
 
 
 def extent(*kinds: str, **given: object) -> Extent:

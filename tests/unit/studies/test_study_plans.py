@@ -16,7 +16,7 @@ from studies.plans_errors import Errors, readings_asked
 from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
 from studies.plans_table import as_predicted
-from tests.support.cli_cases import run
+from tests.support.cli_cases import Capsys, run
 from tests.support.study_plans_cases import configured
 
 SEED = 5
@@ -179,7 +179,7 @@ def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None
         )
 
 
-def test_the_command_gives_one_document(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_gives_one_document(capsys: Capsys) -> None:
     done = run(
         capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",
         "--candidates", "60", "--json",
@@ -208,9 +208,7 @@ def test_the_command_gives_one_document(capsys: pytest.CaptureFixture[str]) -> N
         (("nowhere.toml",), "nowhere.toml"),
     ],
 )
-def test_wrong_input_is_one_line(
-    arguments: tuple[str, ...], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_input_is_one_line(arguments: tuple[str, ...], words: str, capsys: Capsys) -> None:
     done = run(capsys, "studies", "plans", *arguments)
     assert done.code == 2
     assert words in done.err
