@@ -1,4 +1,4 @@
-"""The deviated chain and its Jacobians against Pinocchio, matrix products and differences."""
+"""The deviated chain, its bodies and Jacobians: Pinocchio, matrix products and differences."""
 
 import numpy as np
 import pinocchio as pin
@@ -6,6 +6,7 @@ import pytest
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
+from hilcal.robot.body import body_poses
 from hilcal.robot.chain import evaluate, joint_jacobian, slot_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
@@ -160,3 +161,18 @@ def test_no_states() -> None:
     assert chain.position.shape == (7, 0, 3)
     assert joint_jacobian(chain, chain.position[-1]).shape == (0, 6, 6)
     assert slot_jacobian(chain, 2, chain.position[-1]).shape == (0, 6, 6)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_bodies_and_flange_are_where_pinocchio_has_them(name: str) -> None:
+    arm = arm_of(name)
+    q = np.random.default_rng(3).uniform(-np.pi, np.pi, (4, arm.n))
+    poses = body_poses(arm, q)
+    assert poses.shape == (4, arm.n + 2, 4, 4)
+    model = pinocchio_model(arm)
+    data = model.createData()
+    for angles, found in zip(q, poses, strict=True):
+        pin.framesForwardKinematics(model, data, angles)
+        placed = [np.eye(4), *(data.oMi[k].homogeneous for k in range(1, arm.n + 1))]
+        placed.append(data.oMf[model.getFrameId(FLANGE)].homogeneous)
+        np.testing.assert_allclose(found, placed, rtol=0, atol=1e-12)

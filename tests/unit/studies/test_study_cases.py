@@ -1,4 +1,4 @@
-"""Campaigns of the study of the diagnosis: what is hidden in them, and how strongly."""
+"""Campaigns of the study of the diagnosis: what is hidden in them, and a further round."""
 
 import numpy as np
 import pytest
@@ -7,10 +7,12 @@ from drivers.simulated.injected_effects import EFFECTS
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.readings.whitening import Mode
+from hilcal.readings.whitening import Mode, whitening
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals
@@ -21,6 +23,7 @@ from studies.study_cases import (
     study_case,
     with_study_loads,
 )
+from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make
 
@@ -141,3 +144,36 @@ def test_intervals_hold_true_parameters_and_no_others() -> None:
     doubled = {name: 2 * value for name, value in c.world.truth.items()}
     assert intervals(f, doubled)[0].inside < told.inside
     assert intervals(f, {}) == ()
+
+
+def diagnosed(c) -> Diagnosis:
+    return diagnose(fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection"))
+
+
+def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
+    c = case("link_compliance", mode="deflection", strength=0.5, poses=10)
+    d = diagnosed(c)
+    assert len(suspects(d)) > 1
+    all_ = measure_more(config(), "ur10e", c, d, seed=1, poses=4)
+    assert all_ is not None
+    n = len(c.readings)
+    assert len(all_) > n + 10
+    np.testing.assert_array_equal(all_.value[:n], c.readings.value)
+    assert all_.pose[n:].min() > all_.pose[:n].max()
+    assert len(all_.pose_names) == all_.pose.max() + 1
+    assert np.all(np.diff(np.asarray(all_.states.time)) > 0)
+    # Every loaded reading has its unloaded one, and noise is what the covariance says.
+    loaded = whitening(all_, "deflection", "gc")
+    assert len(loaded.reading) == np.count_nonzero(~all_.unloaded)
+    clean = c.world.sight(all_.states).position
+    white = np.einsum(
+        "nij,nj->ni", np.linalg.inv(np.linalg.cholesky(all_.covariance)), all_.value - clean
+    )
+    assert abs(np.mean(white[n:] ** 2) - 1) < 4 * np.sqrt(2 / white[n:].size)
+
+
+def test_nothing_is_measured_where_one_effect_leads_alone():
+    c = case("hysteresis", mode="deflection", strength=3.0, poses=20)
+    d = diagnosed(c)
+    assert suspects(d) == ("hysteresis",)
+    assert measure_more(config(), "ur10e", c, d, seed=1) is None

@@ -1,4 +1,4 @@
-"""`study plans`: what it counts, what it compares, and what it claims of plans."""
+"""`study plans`: what it counts and compares, and what planning buys on simulated arms."""
 
 from collections import Counter
 
@@ -6,18 +6,32 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig
+from hilcal.config import CellConfig, load_config
 from hilcal.design.noise_model import reading_covariance
 from hilcal.engine.engine import open_engine
 from hilcal.types import Floats
 from studies.plans import DOUBLE, GRID, PARAMETERS, RANDOM, TEST, PlansStudy, plans_study
-from studies.plans_command import arms
+from studies.plans_command import arms, with_robot
 from studies.plans_errors import Errors, readings_asked
 from studies.plans_kinds import Scene, at_random, grid, matching, optimal, scene
 from studies.plans_statistics import Measured, summary
-from studies.plans_table import as_predicted
-from tests.support.cli_cases import Capsys, run
-from tests.support.study_plans_cases import configured
+from studies.plans_table import as_predicted, halved
+from tests.support.cli_cases import CELL, Capsys, run
+
+KNOWN = {"base_xyz_m": (-3.0, 0.5, -0.6), "base_rotvec_rad": (0.0, 0.0, 0.4)}
+
+
+def configured(
+    mode: str = "deflection", *, known: bool = False, robust: bool = False
+) -> CellConfig:
+    """The demo's cell."""
+    config = load_config(CELL)
+    planning = {"readings": mode, **({} if robust else {"against": ()})}
+    update: dict[str, object] = {"planning": config.planning.model_copy(update=planning)}
+    if known:
+        update["tracker"] = config.tracker.model_copy(update=KNOWN)
+    return config.model_copy(update=update)
+
 
 SEED = 5
 
@@ -213,3 +227,47 @@ def test_wrong_input_is_one_line(arguments: tuple[str, ...], words: str, capsys:
     assert done.code == 2
     assert words in done.err
     assert len(done.err.strip().splitlines()) == 1
+
+
+def studied(config: CellConfig, campaigns: int) -> PlansStudy:
+    cell = cell_from_config(config)
+    return plans_study(cell, config, arms(0), campaigns=campaigns, candidates=400)
+
+
+def needs_at_most_half(study: PlansStudy, kind: str) -> bool:
+    """As predicted, and not truly worse than random plans of twice the readings."""
+    (s,) = (s for s in study.shrinkage() if s.kind == kind)
+    assert s.twice.std < 0.1
+    return halved(study, s) != "no"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
+def test_errors_are_those_predicted_and_shrink_as_predicted(robot: str) -> None:
+    """Within 10 %, with a registered tracker: what is predicted then is all that there is."""
+    study = studied(with_robot(configured(known=True), robot), 150)
+    for line in study.lines:
+        r = line.result
+        assert max(r.spread.std, r.position_ratio.std) < 0.05
+        assert abs(r.spread.value - 1.0) <= 0.1, line.kind
+        assert abs(r.position_ratio.value - 1.0) <= 0.1, line.kind
+    for s in study.shrinkage():
+        for ratio in (s.agreement, s.position_agreement):
+            assert ratio.std < 0.06
+            assert as_predicted(ratio) != "no", s.kind
+    assert needs_at_most_half(study, TEST)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["ur10e", "ur5e"])
+def test_half_of_the_readings_of_random_plans_do(robot: str) -> None:
+    """50 campaigns each, registration unknown; each plan in the measure that it was made for."""
+    study = studied(with_robot(configured(robust=True), robot), 50)
+    for line in study.lines:
+        assert as_predicted(line.result.spread) != "no", line.kind
+        # The registration is better than a plan takes for granted: errors are hardly larger.
+        assert line.result.position_ratio.value <= 1.1, line.kind
+    assert all(as_predicted(s.agreement) != "no" for s in study.shrinkage())
+    assert needs_at_most_half(study, TEST)
+    needs = study.of("test, robust").random_readings_open
+    assert needs is None or needs >= 2 * study.readings
