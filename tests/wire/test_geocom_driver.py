@@ -70,14 +70,6 @@ def test_reading_is_the_target_with_the_covariance_it_has(device):
     assert across == pytest.approx(2 * (7.5e-6 + 3e-6 * distance) ** 2, rel=1e-3)
 
 
-def test_target_that_moves_is_seen_to_move(device, station):
-    station.truth(target=np.array([-1.0, -2.0, -0.5]))
-    moved = device.measure().value
-    station.truth(target=np.array(TARGET))
-    assert moved == pytest.approx([-1.0, -2.0, -0.5], abs=1e-3)
-    assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
-
-
 def test_instrument_that_states_larger_errors_of_its_angles_is_believed():
     with simulated.tracker(TARGET, "--transverse-std", "60e-6", "3e-6") as station:
         device = open_tracker(cell(station.port))

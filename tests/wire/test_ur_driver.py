@@ -86,18 +86,6 @@ def test_host_and_options_are_checked():
         open_arm(cases.config("127.0.0.1", recieve_hz=125.0))
 
 
-def test_moves_to_the_goal_and_knows_when_it_has_arrived(arm, sim):
-    goal = cases.away(arm, by=0.2)
-    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)
-    assert arm.moving()
-    cases.finish(arm)
-    np.testing.assert_allclose(sim.admin()["q"], goal, atol=2e-5)
-    np.testing.assert_allclose(arm.sample().q, goal, atol=5e-4)
-    assert not arm.moving()
-    arm.start_move(goal, cases.SPEED, cases.ACCELERATION)  # it is there already
-    cases.finish(arm)
-
-
 def test_bad_goals_are_refused_before_anything_moves(arm, sim):
     q = arm.sample().q
     for goal in (q[:5], np.append(q, 0.0), np.where(np.arange(6) == 2, np.nan, q), q + 10.0):

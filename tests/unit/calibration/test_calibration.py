@@ -251,17 +251,6 @@ def test_the_band_holds_its_share() -> None:
         assert np.mean(drawn <= band(c)[0]) == pytest.approx(0.95, abs=0.012)
 
 
-def test_the_scatter_of_the_joints_is_that_of_drawn_ones() -> None:
-    c, q = calibrated("none"), fresh().q[:1]
-    std = np.array([1.0, 2.0, 0.5, 3.0, 1.0, 2.0]) * 1e-4
-    chain = evaluate(c.model.cell.arm, q)
-    offset = np.array([0.1, 0.0, 0.2])
-    stated = Scatter(std, 0.0, "stated").covariance(c.model.cell, chain, chain.point(offset))[0]
-    rng = np.random.default_rng(0)
-    many = evaluate(c.model.cell.arm, q + std * rng.standard_normal((20000, 6))).point(offset)
-    np.testing.assert_allclose(np.cov(many.T), stated, atol=0.05 * np.trace(stated))
-
-
 def test_coupled_joints_are_compensated_by_the_controllers_values() -> None:
     follows = np.zeros((6, 6))
     follows[2, 1], follows[5, 4] = -1.0, 0.5

@@ -318,8 +318,3 @@ def test_the_work_may_be_a_box(tmp_path: Path) -> None:
 )
 def test_only_a_load_with_a_mass_hangs_unless_told(load: Load, hangs: float) -> None:
     assert load.hanging_m == hangs
-
-
-PLAN = ROBOT + "[planning]\n"
-OBSTACLE = ROBOT + "[[obstacles]]\nname = 'a'\n"
-MASS = "[[loads]]\nname = '5kg'\nmass_kg = 5.0\n"

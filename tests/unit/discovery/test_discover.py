@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from hilcal.discovery import grow, shapes
+from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.law import Form, Part
@@ -193,21 +193,6 @@ def test_screening_is_what_the_columns_themselves_give() -> None:
         assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
 
 
-def test_candidates_beside_a_term_are_those_of_the_model_with_it() -> None:
-    s = screened()
-    problem = Problem(s)
-    seen = np.argwhere(s.square > 0)
-    (one, two) = np.random.default_rng(1).choice(seen, 2, replace=False).tolist()
-    first, second = (Term((tuple(k),), 0.0) for k in (one, two))
-    beside = problem.beside([first])
-    x, y = problem.columns(first)[:, 0], problem.columns(second)[:, 0]
-    mx = s.linear.project_out(x)
-    left = float(y @ s.linear.project_out(y)) - float(y @ mx) ** 2 / float(x @ mx)
-    assert beside.screened.square[tuple(two)] == pytest.approx(left, rel=2e-2)
-    score = beside.score([second])[0].score
-    assert 0 <= score.gain <= problem.rss
-
-
 def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
     thinned = screen(linearise(campaign(LAW)))
@@ -274,32 +259,6 @@ def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
     )
     assert worth_their_length([one, two, three]) == [one, three]
     assert worth_their_length([one, two]) == [one]
-
-
-def test_products_that_were_added_later_are_tried_again_and_extended(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    s = screen(linearise(campaign(LAW)))
-    by = {a.names: k for k, a in enumerate(s.grammar.amplitudes) if a.names and a.cost == 1}
-    one, two = by["joint 3 torque",], by["joint 4 torque",]
-    singles = s.grammar.amplitudes
-    cubed = replace(singles[two].factors[0], shape=shapes.ODD, numbers=(2.7, 0.1))
-    inner = s.grammar.index(Amplitude((cubed,)))
-    place = s.grammar.index(Amplitude((*singles[one].factors, cubed)))
-    assert inner is not None
-    assert place is not None
-    assert min(inner, place) >= len(singles)
-    assert s.grammar.index(Amplitude((cubed,))) == inner
-    beside = Problem(s).beside(())
-    monkeypatch.setattr(grow, "MOST", 3)
-    further = grow._products(beside, 2, by["joint 3 torque",])
-    assert further
-    s.grammar.index(further[0])
-    assert grow._products(beside, 2, by["joint 3 torque",]) == further
-    terms = list(beside._extended(2, place))
-    assert ((2, place), (2, inner)) in [t.parts for t in terms]
-    (values,) = s.grammar.rows([place])
-    assert np.sqrt(np.mean(values**2)) == pytest.approx(1.0, rel=1e-6)
 
 
 def with_zero(symbol: str, *more: Part) -> Form:

@@ -37,16 +37,6 @@ def test_a_product_knows_what_is_left_without_either_factor() -> None:
     assert words.less[:, single].tolist() == [-1, -1]
 
 
-def test_products_with_their_factors_alone_are_those_of_their_columns() -> None:
-    s = screened()
-    for place, f in products(s, 20):
-        for k, less in enumerate(s.grammar.less[:, f].tolist()):
-            x = s.columns([(place, f), (place, less)])
-            own = s.linear.information(x)
-            size = np.sqrt(own[0, 0] * own[1, 1])
-            assert abs(s.across_less[k, place, f] - own[0, 1]) < 1e-3 * size
-
-
 def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
     """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
     s = screened()

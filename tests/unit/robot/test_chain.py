@@ -86,27 +86,6 @@ def test_every_frame_is_its_matrix_product(name: str) -> None:
                 pose = pose @ links[k + 1]
 
 
-@pytest.mark.parametrize("name", ARMS)
-def test_joint_jacobian_is_pinocchios(name: str) -> None:
-    arm = arm_of(name)
-    q, d = angles(arm), random_deviation(arm, 0.02)
-    assert d.dq is not None
-    assert d.twist is not None
-    chain = evaluate(arm, q, d)
-    jacobian = joint_jacobian(chain, chain.position[-1])
-    for i in range(COUNT):
-        model = pinocchio_model(twisted(arm, d.twist[i]))
-        frame = model.getFrameId(FLANGE)
-        expected = pin.computeFrameJacobian(
-            model,
-            model.createData(),
-            q[i] + d.dq[i],
-            frame,
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )
-        np.testing.assert_allclose(jacobian[i], expected, rtol=0, atol=TOLERANCE)
-
-
 def motion_by(arm: Arm, q: Floats, d: Deviation, change: Deviation, offset: Floats) -> Floats:
     """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
     r0 = evaluate(arm, q, d).rotation[-1]
