@@ -8,6 +8,7 @@ from hilcal.diagnosis.background_evidence import (
     MUCH,
     TOGETHER,
     WORTH,
+    background_evidence,
     background_is_better,
     p_value_of_others,
     proved,
@@ -20,13 +21,12 @@ from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnosis.stepwise_alternatives import Alternative
-from hilcal.diagnosis.verdict import NOTHING, judge, with_one_named
+from hilcal.diagnosis.verdict import NOTHING, before_named, judge
 from hilcal.discovery.proposal import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import allows_background, with_background
 from hilcal.identification.carried_evidence import carried_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.mixed_fit import FEW_ROWS
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
@@ -300,25 +300,27 @@ class Path:
         return False
 
     def take_background(self) -> bool:
-        """Fit all other effects of the catalogue together, where the model leaves more than noise.
+        """Fit all other effects of the catalogue together; whether they are in the model now.
 
-        They stay as the background of the model where the readings prove effects together and the
-        error on poses left out falls, or where it falls by much; where the verdict is
-        `unknown_effect`, by more than it scatters from pose to pose, since effects of the catalogue
-        may resemble one that it does not have. Those that the readings prove beside all others are
-        then named, in the order of their evidence, whatever was added before.
-        Returns whether anything was changed.
+        They stay as its background where the error on poses left out falls by a share worth it, and
+        more where the readings do not prove them together; where the verdict is `unknown_effect`,
+        by more than it scatters from pose to pose, since effects of the catalogue may resemble one
+        that it does not have. Where the stated noise explains the residual, and the readings do not
+        prove them, they are not tried. Those that the readings prove beside all others are then
+        named, in the order of their evidence, whatever was added before.
         """
         last = self.steps[-1]
         tried = self._background_tried or bool(last.fit.model.background)
         d = last.diagnosis
-        if tried or not self._room or d.residual_is_noise or d.wrong_figures:
+        if tried or not self._room or d.wrong_figures:
             return False
         self._background_tried = True
         if not allows_background(last.fit):
             return False
         proved_together = p_value_of_others(last.fit) <= TOGETHER
-        if not proved_together and len(last.fit.white) > FEW_ROWS:
+        as_stated = d.residual_is_noise and last.fit.readings.arm_scatter is None
+        # What noise that is correlated along the order leaves looks like effects.
+        if as_stated and (not proved_together or last.fit.readings.serial is not None):
             return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
@@ -329,17 +331,28 @@ class Path:
         if unknown and not predicts_better(last.fit, found):
             return False
         self._say("the background of all effects predicts better; diagnosing")
-        self.append(found, BACKGROUND)
-        judged = self.steps[-1].diagnosis
-        of = judged.background
-        for name in proved(of)[: MOST_REVISIONS - len(self.steps)]:
-            of = tuple(b for b in of if b.effect != name)
-            model = found.model
-            found = replace(found, model=replace(model, background=model.background - {name}))
-            diagnosis = with_one_named(judged, found, self._history(found), of)
-            self.steps.append(Step(found, diagnosis, name))
-            self._seen(self.steps[-1])
+        self._name(found)
         return True
+
+    def _name(self, found: Fit) -> None:
+        """Append a fit with a background, and those that name its effects that are proved."""
+        tested = background_evidence(found)
+        names = proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
+        fits, left = [found], [tested]
+        for name in names:
+            model = fits[-1].model
+            model = replace(model, background=model.background - {name})
+            fits.append(replace(fits[-1], model=model))
+            left.append(tuple(b for b in left[-1] if b.effect != name))
+        self._evidence = Evidence(
+            fits[-1], self._refits.add, self._say, self._regressions, left[-1]
+        )
+        judged = judge(self._evidence, self._history(fits[-1]))
+        for one, of, name in zip(fits, left, (BACKGROUND, *names), strict=True):
+            last = one is fits[-1]
+            d = judged if last else before_named(judged, one, self._history(one), of)
+            self.steps.append(Step(one, d, name))
+            self._seen(self.steps[-1])
 
     def take_scatter(self) -> bool:
         """Fit with the arm's scatter in the covariance; returns whether anything was changed.

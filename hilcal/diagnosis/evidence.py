@@ -6,7 +6,12 @@ from functools import cached_property
 from scipy.stats import chi2
 
 from hilcal.diagnosis.arm_repeatability import instrument_instead
-from hilcal.diagnosis.background_evidence import BackgroundEffect, background_evidence
+from hilcal.diagnosis.background_evidence import (
+    TOGETHER,
+    BackgroundEffect,
+    background_evidence,
+    p_value_of_others,
+)
 from hilcal.diagnosis.backward_elimination import backward_elimination, spoken_against
 from hilcal.diagnosis.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnosis.effect_ranking import (
@@ -42,6 +47,7 @@ class Evidence:
         refit: Callable[[Fit, str], Fit] = add,
         say: Callable[[str], None] = lambda text: None,
         regressions: Regressions | None = None,
+        background: tuple[BackgroundEffect, ...] | None = None,
     ) -> None:
         """Take a fit.
 
@@ -50,6 +56,7 @@ class Evidence:
             refit: returns a fit with one more effect.
             say: takes progress, one line each.
             regressions: of residuals, those that were made.
+            background: the effects of the model's background, where they were tested.
 
         Raises:
             InputError: for a fit whose residual is not whitened.
@@ -58,6 +65,7 @@ class Evidence:
             raise InputError(f"diagnosis needs scaling gc, this fit has {fit.scaling}")
         self.fit, self._refit, self._say = fit, refit, say
         self._regressions = Regressions() if regressions is None else regressions
+        self._background = background
         self._known: dict[tuple[str, frozenset[str]], Alternative] = {}
         self._eliminated: dict[str, FamilyScore] = {}
 
@@ -86,7 +94,12 @@ class Evidence:
     @cached_property
     def background(self) -> tuple[BackgroundEffect, ...]:
         """The effects of the model's background, each tested beside all others."""
-        return background_evidence(self.fit)
+        return background_evidence(self.fit) if self._background is None else self._background
+
+    @cached_property
+    def background_proved(self) -> bool:
+        """Whether the readings prove the effects of the background together."""
+        return bool(self.background) and p_value_of_others(self.fit) <= TOGETHER
 
     @cached_property
     def misfit_breakdown(self) -> tuple[MisfitShare, ...]:

@@ -41,9 +41,10 @@ Noise that is correlated along the order of the readings is in the covariance of
 is judged (see `serial_noise`). Where it is not proved, since effects explain the readings as well,
 3 and 5c become `ambiguous`.
 
-Where the model has a background and its residual is noise of any size, or the arm's scatter,
-effects of the catalogue are there that the readings do not prove one by one: 3, 5 and 6 become
-`ambiguous`, the suspects are those of the background, and the size of the noise is said.
+Where the model has a background, its residual is noise of any size, or the arm's scatter, and the
+readings prove the effects of the background together, effects of the catalogue are there that the
+readings do not prove one by one: 3, 5 and 6 become `ambiguous`, the suspects are those of the
+background, and the size of the noise is said.
 
 A fit whose covariance has the estimated scatter in it (`Readings.arm_scatter`) is judged by the
 same rules, but that it may be smaller than its noise: the scatter is never negative, so that an
@@ -105,21 +106,27 @@ def diagnose(
     return judge(Evidence(fit, say=say), history)
 
 
-def with_one_named(
+def before_named(
     d: Diagnosis, fit: Fit, history: History, background: tuple[BackgroundEffect, ...]
 ) -> Diagnosis:
-    """Return the judgement where an effect of the background is named: what is predicted stays.
+    """Return the judgement before effects of a background are named: what is predicted is the same.
 
     Args:
-        d: of the model with the effect in its background.
-        fit: with it named.
+        d: of the model that names them.
+        fit: with them in its background.
         history: of that model.
         background: the effects of its background.
     """
-    before = {b.effect for b in d.background}
-    others = tuple(s for s in d.suspects if s.effect not in before)
-    suspects = (*as_suspects(background), *others) if d.reason == "background" else d.suspects
-    return replace(d, fit=fit, history=history, suspects=suspects, background=background)
+    known = {b.effect for b in d.background}
+    others = tuple(s for s in d.suspects if s.effect not in known)
+    return replace(
+        d,
+        fit=fit,
+        history=history,
+        reason="background",
+        suspects=(*as_suspects(background), *others),
+        background=background,
+    )
 
 
 def judge(e: Evidence, history: History) -> Diagnosis:
@@ -234,7 +241,8 @@ def _judged(e: Evidence, history: History) -> Diagnosis:
         serial = e.fit.readings.serial
         if reason in ("residual_is_noise", "arm_scatter") and serial and not serial.proved:
             reason = "serial_or_effect"
-        if reason in BESIDE_A_BACKGROUND and e.background:
+        beside = reason == "misjudged_noise" or reason in BESIDE_A_BACKGROUND
+        if beside and e.background and (reason == "misjudged_noise" or e.background_proved):
             reason, suspects = "background", (*as_suspects(e.background), *suspects)
     alone = None
     if reason in ("misjudged_noise", "no_suspect") and e.misfit and not _predicted(e, regression):

@@ -26,8 +26,6 @@ until nothing is left, and the equations cost the cube of the columns. A choice.
 UNSURE = 2.0
 """Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
 choice."""
-SEED = 0
-"""Of the average over the standard deviations, so that equal readings give equal fits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +95,11 @@ def _rms(moves: Floats) -> float:
 def allows_background(of: Fit) -> bool:
     """Whether the readings are few enough for a background, and no other campaign is the prior.
 
-    A prior of another campaign says of its own effects how large they are.
+    A prior of another campaign says of its own effects how large they are. A model that was made
+    without readings cannot take effects by name.
     """
-    return len(of.white) <= MOST_ROWS and of.model.prior is None
+    few = len(of.white) <= MOST_ROWS
+    return few and of.model.prior is None and of.model.readings is not None
 
 
 def with_background(of: Fit, named: Collection[str]) -> Fit | None:
@@ -117,7 +117,7 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
         named: effects that are not of the background.
     """
     readings = of.readings.as_stated()
-    found = mixed_fit(of.model, readings[~of.outlier], of.mode, np.random.default_rng(SEED))
+    found = mixed_fit(of.model, readings[~of.outlier], of.mode)
     if _implausible(found) - set(of.model.names):
         return None
     if not readings.scatter_stated:

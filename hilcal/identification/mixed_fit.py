@@ -14,8 +14,8 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.spec import EffectSpec
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.residual import residual
+from hilcal.mixed.equations import Equations
 from hilcal.mixed.families import LogStdPrior, families_of
-from hilcal.mixed.posterior import average
 from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import Variances, estimate_variances
@@ -32,6 +32,8 @@ ROUNDS = 5
 """Most linearisations; a choice, three are usual."""
 CONVERGED = 0.02
 """Change of the predicted readings, in units of their noise, at which the linearisation stays."""
+HALVINGS = 6
+"""Most trials of a step, each half as long as the one before; a choice."""
 SCATTER_RAD = 3e-5
 """Ordinary scatter of a joint, rad: 30 µm at 1 m, as makers state it; η of it is about zero."""
 INSTRUMENT, SCATTER = "instrument", "arm's scatter"
@@ -42,11 +44,6 @@ LITTLE = 1e-3
 """Share by which the arm's scatter turns rows that the instrument's parts leave alike."""
 NOISE_SPREAD = 1.5
 """Of the log of the noise: a factor of 4.5 either way; a choice."""
-FEW_ROWS = 300
-"""Rows up to which the variances are averaged over; beyond, their estimate is as good, and a step
-of the walk costs the cube of the rows. A choice."""
-WALK = 600
-"""Steps of the walk; a choice: twice as many change errors by less than 1 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,14 +144,13 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
     return model
 
 
-def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Generator) -> MixedFit:
+def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:
     """Fit all effects at once.
 
     Args:
         model: frames, and effects that have to be in it.
         readings: without gross errors.
         mode: "deflection" or "absolute".
-        rng: for the average over the posterior of the variances.
 
     Raises:
         CannotAnswerError: no static equilibrium, or no likelihood.
@@ -163,12 +159,7 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode, rng: np.random.Gener
     model = with_all_effects(model, readings.states)
     w = whitening(readings, mode, "gc")
     found, theta = _iterated(model, readings, w)
-    problem = found.equations.problem
-    if len(problem.y) > FEW_ROWS:
-        return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
-    mean = average(found, rng, WALK)
-    theta = problem.parameters(mean.coordinates, model.size)
-    return MixedFit(model, readings, w, theta, found, mean.covariance)
+    return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
 
 
 def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) -> Variances:
@@ -180,13 +171,31 @@ def mixed_fit_at(model: Model, readings: Readings, mode: Mode, theta: Floats) ->
         mode: "deflection" or "absolute".
         theta: where the model is linearised.
     """
-    return estimate_variances(linearised_problem(model, readings, mode, theta))
+    problem = linearised_problem(model, readings, mode, theta)
+    return estimate_variances(problem, sizes_at(problem, model, theta))
 
 
 def linearised_problem(model: Model, readings: Readings, mode: Mode, theta: Floats) -> MixedProblem:
     """Return the linear problem of a model at parameters theta (P,); arguments as above."""
     w = whitening(readings, mode, "gc")
-    return _linearised(model, readings, w, theta)[0]
+    return _linearise(model, readings, w, theta).problem
+
+
+def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
+    """Log s and η (F + N,) of a fit: of the standard deviations of its model, else of theta (P,).
+
+    The priors' means for families that are not in it.
+    """
+    std = theta.copy()
+    for effect, mine in zip(model.effects, model.slices(), strict=True):
+        if effect.name in model.random:
+            std[mine] = model.random[effect.name]
+    out = problem.log_std_prior[0].copy()
+    for k, f in enumerate(problem.families.random):
+        size = float(np.sqrt(np.mean((std[f.parameters] / f.magnitude) ** 2)))
+        if size > 0.0 and not f.known:
+            out[k] = np.log(size)
+    return out
 
 
 def variances_with_noise(
@@ -210,37 +219,71 @@ def variances_with_noise(
 def _iterated(
     model: Model, readings: Readings, w: Whitening, parts: Sequence[Part] = ()
 ) -> tuple[Variances, Floats]:
-    """Estimate the variances, linearised at the parameters (P,) that they predict; and those."""
-    theta, white = np.zeros(model.size), np.full(w.m * len(w), np.inf)
-    start: Floats | None = None
-    rounds = 0
+    """Estimate the variances, linearised at the parameters (P,) that they predict; and those.
+
+    A step that makes the penalised squares larger is halved: large parameters that cancel in the
+    linear model do not do so exactly.
+    """
+    theta, start = np.zeros(model.size), None
+    here, rounds = _linearise(model, readings, w, theta, parts), 0
     while True:
-        problem, now = _linearised(model, readings, w, theta, parts)
-        found = estimate_variances(problem, start)
-        theta = problem.parameters(found.equations.coordinates, model.size)
-        rounds, start = rounds + 1, found.log_std
-        if rounds == ROUNDS or np.sqrt(np.mean((now - white) ** 2)) < CONVERGED:
+        found = estimate_variances(here.problem, start, search=True)
+        start, rounds = found.log_std, rounds + 1
+        before = here.penalised(theta, found.equations)
+        step = here.problem.parameters(found.equations.coordinates, model.size) - theta
+        for k in range(HALVINGS):
+            trial = theta + 0.5**k * step
+            there = _linearise(model, readings, w, trial, parts)
+            if there.penalised(trial, found.equations) <= before:
+                break
+        moved = float(np.sqrt(np.mean((there.white - here.white) ** 2)))
+        theta, here = trial, there
+        if rounds == ROUNDS or moved < CONVERGED:
             return found, theta
-        white = now
 
 
-def _linearised(
+@dataclass(frozen=True, slots=True, eq=False)
+class _Linearised:
+    """A linear problem at some parameters.
+
+    Attributes:
+        problem: of it.
+        white: (R,) residual there, in the rows of the problem.
+    """
+
+    problem: MixedProblem
+    white: Floats
+
+    def penalised(self, theta: Floats, at: Equations) -> float:
+        """Squares of the residual and of the parameters (P,), each in its standard deviations."""
+        p = self.problem
+        std = np.exp(at.log_std)
+        sizes = sum(
+            float(np.sum((theta[f.parameters] / (s * f.magnitude)) ** 2))
+            for f, s in zip(p.families.random, std, strict=False)
+        )
+        return float(np.sum((self.white / at.noise_std) ** 2)) + sizes
+
+
+def _linearise(
     model: Model,
     readings: Readings,
     w: Whitening,
     theta: Floats,
     parts: Sequence[Part] = (),
-) -> tuple[MixedProblem, Floats]:
-    """Return the linear problem at theta (P,), and the whitened residual (R,) there."""
+) -> _Linearised:
+    """Linearise at theta (P,)."""
     prediction = model.predict(readings.states, theta)
     now = w.whiten(residual(readings, prediction, w)).reshape(-1)
     jacobian = w.whiten_readings(model.jacobian(prediction, theta, w.m))
-    rows = np.column_stack([now + jacobian @ theta, jacobian])
+    rows = np.column_stack([now, jacobian])
     if parts:
         rows, noise = _noise_of(parts, readings, w, rows)
     else:
         rows, noise = _noise(model, readings, w, rows)
-    return mixed_problem(rows[:, 0], rows[:, 1:], families_of(model), noise), now
+    white, jacobian = rows[:, 0], rows[:, 1:]
+    problem = mixed_problem(white + jacobian @ theta, jacobian, families_of(model), noise)
+    return _Linearised(problem, white)
 
 
 def _noise(

@@ -32,6 +32,9 @@ from scipy.linalg.lapack import dpotri
 from hilcal.mixed.problem import MixedProblem
 from hilcal.types import Floats
 
+EIGENVALUE = 1e-12
+"""Share of the largest below which an eigenvalue is zero."""
+
 
 class _ByColumns:
     """P by Cholesky's factor of C (K, K)."""
@@ -226,6 +229,23 @@ class Equations:
         rhs[p.flat + np.arange(len(p.family)), p.family] = 2.0 * self.c[p.flat :]
         rhs[:, first:] = -self.rows.T @ self.working[:, first:]
         return np.asarray(self.scale[:, None] * (self.projection.inverse @ rhs))
+
+    def profile(self, family: int, log_std: Floats) -> Floats:
+        """Gain of ℓ (G,) where one family has other sizes log s (G,), exactly.
+
+        With Z_fᵀ P Z_f = U diag(μ) Uᵀ, κ = 1 − s_f² μ and g = Uᵀ Z_fᵀ P y, without the family the
+        eigenvalues are μ/κ and 2 ℓ(s) = Σ [g²/(μ κ) s² μ/κ / (1 + s² μ/κ) − log(1 + s² μ/κ)].
+        """
+        own = self.problem.family == family
+        inner, score = self.score(self.problem.x[:, self.problem.flat :][:, own])
+        mu, u = np.linalg.eigh((inner + inner.T) / 2)
+        seen = mu > EIGENVALUE * max(float(mu.max(initial=0.0)), 1e-300)
+        mu, g = mu[seen], u[:, seen].T @ score
+        own_size = float(self.log_std[family])
+        kappa = np.maximum(1.0 - np.exp(2 * own_size) * mu, EIGENVALUE)
+        without = np.exp(2 * np.append(log_std, own_size))[:, None] * mu / kappa
+        twice = (g**2 / (mu * kappa) * without / (1 + without) - np.log1p(without)).sum(axis=1)
+        return np.asarray((twice[:-1] - twice[-1]) / 2)
 
     def score(self, columns: Floats) -> tuple[Floats, Floats]:
         """Return Zᵀ P Z (q, q) and Zᵀ P y (q,) of columns Z (R, q) that are not in the problem."""

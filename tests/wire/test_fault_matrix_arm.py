@@ -53,6 +53,8 @@ def unlock(s: Site) -> None:
 
 
 def release(s: Site) -> None:
+    """As on the pendant; the dashboard powers an arm on in remote mode only."""
+    s.ask("arm", "remote_mode")
     s.ask("arm", "release_emergency_stop")
     s.dashboard("power on", "brake release")
     s.until(lambda: s.ask("arm", "state")["robot_mode"] == 7)

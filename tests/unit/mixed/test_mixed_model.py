@@ -7,10 +7,9 @@ from scipy.stats import kstest
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations
 from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import Families, Family, LogStdPrior
-from hilcal.mixed.posterior import average, walk
 from hilcal.mixed.prediction import predict
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
-from hilcal.mixed.variances import estimate_variances, log_posterior
+from hilcal.mixed.variances import estimate_variances
 from hilcal.types import Floats
 
 FLAT = LogStdPrior(0.0, 3.0)
@@ -193,40 +192,30 @@ def test_the_outcome_does_not_depend_on_the_order_of_families() -> None:
         np.testing.assert_allclose(mean, other, rtol=0.01, atol=0.01)
 
 
-def test_coordinates_are_averaged_over_the_posterior() -> None:
-    """Against a sum over a grid, with rows that hardly tell the standard deviation."""
+@pytest.mark.parametrize("over", [0, 60])
+def test_the_likelihood_of_one_size_is_exact(over: int) -> None:
     rng = np.random.default_rng(9)
-    jacobian = rng.standard_normal((9, 4))
-    families = Families(np.arange(2), (family("a", 2, 2, LogStdPrior(0.0, 1.5)),))
-    p = mixed_problem(
-        rng.standard_normal(9),
-        jacobian,
-        families,
-        [instrument(9, 1.0)],
-    )
-    grid = np.linspace(-5.0, 5.0, 41)
-    all_of_them = [equations(p, np.array([s, eta])) for s in grid for eta in grid]
-    weight = np.exp([log_posterior(e) for e in all_of_them])
-    mean = weight @ np.array([e.coordinates for e in all_of_them]) / weight.sum()
-    found = estimate_variances(p)
-    averaged = average(found, np.random.default_rng(0), steps=6000)
-    np.testing.assert_allclose(averaged.coordinates, mean, atol=0.03)
-    off = np.array([e.coordinates for e in all_of_them]) - mean
-    covariance = np.einsum("g,gij->ij", weight, [e.covariance for e in all_of_them])
-    covariance = (covariance + (weight * off.T) @ off) / weight.sum()
-    np.testing.assert_allclose(averaged.covariance, covariance, rtol=0.1, atol=0.05)
-    assert np.abs(found.equations.coordinates - mean).max() > 0.06
+    p = problem(rng, scatter=True, over=over)
+    at = 0.3 * rng.standard_normal(len(p.priors))
+    sizes = np.linspace(-6.0, 4.0, 9)
+    for family in range(2):
+        gain = equations(p, at).profile(family, sizes)
+        there = np.tile(at, (9, 1))
+        there[:, family] = sizes
+        exact = [equations(p, x).log_likelihood for x in there]
+        np.testing.assert_allclose(
+            gain, np.array(exact) - equations(p, at).log_likelihood, rtol=1e-6, atol=1e-6
+        )
 
 
-def test_standard_deviations_are_drawn_from_their_posterior() -> None:
-    """Rows that tell them well: a posterior as Laplace says."""
+def test_a_family_does_not_stay_small_where_the_iteration_began() -> None:
+    """At a size of e⁻⁷ the likelihood has hardly a slope."""
     made, *_ = drawn(np.random.default_rng(10), (1.0, 0.5), 0.3, 60)
-    found = estimate_variances(made)
-    walked = [e.log_std for e in walk(found, np.random.default_rng(0), 3000)]
-    off = np.mean(walked, axis=0) - found.log_std
-    std = np.sqrt(np.diag(found.covariance))
-    assert np.all(np.abs(off) < 0.5 * std)
-    np.testing.assert_allclose(np.std(walked, axis=0), std, rtol=0.35)
+    usual = estimate_variances(made)
+    begun = np.array([-7.0, -7.0, 0.5])
+    assert np.abs(equations(made, begun).slope[:2]).max() < 0.1
+    found = estimate_variances(made, begun, search=True)
+    np.testing.assert_allclose(found.log_std, usual.log_std, atol=0.05)
 
 
 def test_rows_are_turned_so_that_blocks_of_noise_are_diagonal() -> None:
