@@ -91,7 +91,8 @@ class Calibration:
         code = process.wait()
         assert ended or code == -signal.SIGKILL
         assert code <= 0, f"exit code {code}: {self.words[-500:]}"
-        assert not (left := self.left_behind()), left
+        left = self.left_behind()
+        assert not left, left
         return not ended
 
     def finish(self) -> None:
