@@ -36,7 +36,7 @@ from hilcal.calibration.tool import Tool, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
-from hilcal.identification.predictive import open_prior, position_factor, predictive
+from hilcal.identification.predictive import position_factor, predictive
 from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames
 from hilcal.identification.whole_turns import whole_turns
 from hilcal.model.model import Model, Prediction
@@ -131,7 +131,7 @@ class Calibration:
             if model.prior is not None
             else Learnt(
                 p.excess.of_readings(used, found.mode),
-                open_prior(model, found.theta, prior),
+                p.prior,
                 p.noise,
                 kappa,
             ),

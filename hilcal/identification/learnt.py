@@ -9,7 +9,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.posterior import LearntEffect, Posterior, Source, determined
-from hilcal.identification.predictive import family_prior, parameter_factor, predictive
+from hilcal.identification.predictive import parameter_factor, predictive
 from hilcal.identification.priors import scales_of
 from hilcal.readings.ranges import ranges_of
 from hilcal.readings.same_readings import prints
@@ -75,7 +75,7 @@ def _information(fit: Fit, scale: Floats) -> tuple[Floats, Floats]:
         w = whitening(p.excess.of_readings(fit.readings[~fit.outlier], fit.mode), fit.mode, "gc")
     a = whitened_jacobian(model, s.prediction, s.theta, w, np.arange(model.size))
     a *= scale
-    std = family_prior(model, s.prior) / scale
+    std = np.where(np.isinf(s.prior), np.inf, p.prior) / scale
     with np.errstate(divide="ignore"):
         own = np.where(std > 0, 1.0 / std**2, np.inf)
     # Of a family of which nothing is left at all: as ordinary as it starts.

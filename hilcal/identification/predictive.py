@@ -17,6 +17,10 @@ prior precision,
 W is the stated covariance V, with more for positions or attitudes where their residual asks for it
 (`excess`): a misfit has not the shape of an instrument's noise. W, C and the residual that
 parameters with this W and Λ leave belong together; they are found by turns.
+Where the model has a background its standard deviations are in units of the instrument's noise,
+σ is the factor of that as the mixed model estimates it, and κ at least what the uncertainty of the
+variances makes of it (see `variance_spread`). Else σ² is from the residual, at least 1.
+
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
 that was found there: what repeats itself in new poses. The variance is that of the folds as they
 are left out, F of rows Y, with X the same whitened by W and multiplied by the root of C: the mean
@@ -35,6 +39,7 @@ from hilcal.identification.folds import distinct_poses, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.holdout import ordinary
 from hilcal.identification.residual import residual
+from hilcal.identification.variance_spread import variance_spread
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Whitening, whitening
@@ -60,9 +65,11 @@ class Predictive:
         model: the model.
         theta: (P,) its parameters.
         covariance: (P, P) C.
+        prior: (P,) prior standard deviations, Λ = diag(prior)⁻².
         excess: what W has beyond V.
         noise: σ², noise factor of the fitted readings in units of W.
         factor: κ.
+        least: what κ is at least, by the uncertainty of the variances.
         leverage: (D,) largest eigenvalue of a fitted measurement's leverage: variance of the
             prediction over that of the noise.
         scatter: mean variance of the fitted readings by σ² W, in units of V.
@@ -74,9 +81,11 @@ class Predictive:
     model: Model
     theta: Floats
     covariance: Floats
+    prior: Floats
     excess: Excess
     noise: float
     factor: float
+    least: float
     leverage: Floats
     scatter: float
     left_out: float
@@ -115,6 +124,11 @@ def predictive(
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
+    known, least = None, 1.0
+    if model.background and fitted.arm_scatter is not None:
+        known = fitted.arm_scatter.instrument_factor**2
+        prior = prior * np.sqrt(known)
+        least = variance_spread(model, theta, fitted, mode)
     of = coordinates_of(model)
     chosen = of.prior(prior)
     std = of.prior(open_prior(model, theta, prior))
@@ -125,12 +139,14 @@ def predictive(
     more, w = Excess(), stated
     for step in range(ROUNDS):
         a = _rows(model, prediction, theta, of, std, w)
-        values, vectors, noise = _spectrum(a, raw, w)
+        values, vectors, noise = _spectrum(a, raw, w, known)
         root = vectors * np.sqrt(noise / (values + noise))
         # Where the parameters are with this noise and this prior: a residual and its leverage.
         moved = root @ (root.T @ (a.T @ w.whiten(raw).reshape(-1) / noise - pull))
         at = model.predict(fitted.states, theta + of.transform(std * moved))
         left = residual(fitted, at, stated)
+        if known is not None:  # what the misfit has more of is in the background
+            break
         found = excess(left, stated, w, a, root / np.sqrt(noise), more)
         if found.near(more):
             break
@@ -138,7 +154,7 @@ def predictive(
         w = whitening(more.of_readings(fitted, mode), mode, "gc")
     else:
         a = _rows(model, prediction, theta, of, std, w)
-        values, vectors, noise = _spectrum(a, raw, w)
+        values, vectors, noise = _spectrum(a, raw, w, known)
         root = vectors * np.sqrt(noise / (values + noise))
     shares = []
     for k in range(0, len(a), CHUNK * w.m):
@@ -157,10 +173,10 @@ def predictive(
     left_out, left_out_m2 = _left_out(a, rows, ((b, rows), (position, points)), root, noise)
     scatter_m2 = noise * float(np.trace(wider[:, :3, :3], axis1=1, axis2=2).mean())
     root = of.transform(root * std[:, None])
-    factor = max(1.0, left_out_sigma**2 / (scatter + left_out))
+    factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
-        model, theta, root @ root.T, more, noise, factor, leverage, scatter, left_out,
-        scatter_m2, 3 * left_out_m2,
+        model, theta, root @ root.T, open_prior(model, theta, prior), more, noise, factor, least,
+        leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
     )  # fmt: skip
 
 
@@ -178,10 +194,14 @@ def _rows(
     return a
 
 
-def _spectrum(a: Floats, raw: Floats, w: Whitening) -> tuple[Floats, Floats, float]:
-    """Eigenvalues and eigenvectors of AᵀA, and σ²."""
+def _spectrum(
+    a: Floats, raw: Floats, w: Whitening, known: float | None
+) -> tuple[Floats, Floats, float]:
+    """Eigenvalues and eigenvectors of AᵀA, and σ², which may be known."""
     values, vectors = np.linalg.eigh(a.T @ a)
     values = np.maximum(values, 0.0)
+    if known is not None:
+        return values, vectors, known
     white = w.whiten(raw).reshape(-1)
     rss, noise = float(white @ white), 1.0
     for _ in range(ITERATIONS):
@@ -243,7 +263,7 @@ def parameter_factor(p: Predictive, left_out_sigma: float) -> float:
         p: what a fit knows.
         left_out_sigma: rms of the whitened residual on poses left out.
     """
-    return max(1.0, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
+    return max(p.least, (left_out_sigma**2 - max(p.scatter, 1.0)) / max(p.left_out, 1e-12))
 
 
 def position_factor(p: Predictive, left_out_m: float) -> float:
@@ -257,4 +277,4 @@ def position_factor(p: Predictive, left_out_m: float) -> float:
         p: what a fit knows.
         left_out_m: rms of the 3-D position errors on poses left out.
     """
-    return max(1.0, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
+    return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))

@@ -9,8 +9,9 @@ of estimators of fixed and random effects in mixed linear models*, JASA 79 (1984
 
 import numpy as np
 
+from hilcal.mixed.equations import Equations
 from hilcal.mixed.variances import Variances
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 
 def coordinates_covariance(found: Variances) -> Floats:
@@ -33,3 +34,25 @@ def predict(found: Variances, jacobian: Floats) -> tuple[Floats, Floats]:
     x = found.equations.problem.coordinates(jacobian)
     covariance = coordinates_covariance(found)
     return x @ found.equations.coordinates, x @ covariance @ np.swapaxes(x, -1, -2)
+
+
+def left_out(e: Equations, fold: Ints) -> tuple[Floats, Floats]:
+    """Predict rows without their fold F, at given variances.
+
+        y_F − ŷ_F = D (P_FF)⁻¹ P_F t,    covariance D (P_FF)⁻¹ D,    D² = R_FF
+
+    Args:
+        e: the equations of all rows.
+        fold: (R,) number of each row's fold.
+
+    Returns:
+        (R,) measured minus predicted, and (R,) its variance, that of the noise included.
+    """
+    p = e.projection.project(np.eye(len(fold)))
+    off, variance = np.empty(len(fold)), np.empty(len(fold))
+    for f in range(int(fold.max()) + 1):
+        mine = fold == f
+        inverse, std = np.linalg.inv(p[np.ix_(mine, mine)]), e.noise_std[mine]
+        off[mine] = std * (inverse @ e.residual[mine])
+        variance[mine] = std**2 * np.diagonal(inverse)
+    return off, variance

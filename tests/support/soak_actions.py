@@ -144,7 +144,7 @@ class Soak:
                 self.starved += 1
             else:
                 where = f"{way.__name__} {self._met}: {at.name}:{at.lineno}"
-                self.findings.append(f"{where}: {words[:600]}")
+                self.findings.append(f"{where}: {words[:200]} … {words[-1500:]}")
             self.close()
 
     def one_fault(self) -> str:

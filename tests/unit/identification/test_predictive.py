@@ -45,7 +45,9 @@ def test_the_stated_mean_square_is_what_was_found_and_never_less_than_the_fit_ha
     c = campaign("none", "absolute", plan_seed=0)
     model = with_effects(c.cell, c.readings, "absolute", (), {}, installed())
     none = np.zeros(0)
-    p = Predictive(model, none, none[:, None], Excess(), 1.0, 1.0, none, 1.0, 3.0, 25e-10, 75e-10)
+    p = Predictive(
+        model, none, none[:, None], none, Excess(), 1.0, 1.0, 1.0, none, 1.0, 3.0, 25e-10, 75e-10
+    )  # fmt: skip
     for sigma, metres in ((2.0, 1e-4), (4.0, 2e-4)):
         by_v, by_position = parameter_factor(p, sigma), position_factor(p, metres)
         assert p.scatter + by_v * p.left_out == pytest.approx(sigma**2)

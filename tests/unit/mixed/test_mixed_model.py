@@ -1,5 +1,7 @@
 """The mixed model against dense formulas, finite differences, and its own sampling spread."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
@@ -7,7 +9,7 @@ from scipy.stats import kstest
 from hilcal.mixed.equations import _ByColumns, _ByRows, equations
 from hilcal.mixed.evidence import evidence
 from hilcal.mixed.families import Families, Family, LogStdPrior
-from hilcal.mixed.prediction import predict
+from hilcal.mixed.prediction import left_out, predict
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import estimate_variances
 from hilcal.types import Floats
@@ -206,6 +208,23 @@ def test_the_likelihood_of_one_size_is_exact(over: int) -> None:
         np.testing.assert_allclose(
             gain, np.array(exact) - equations(p, at).log_likelihood, rtol=1e-6, atol=1e-6
         )
+
+
+@pytest.mark.parametrize("over", [0, 60])
+def test_rows_left_out_are_predicted_by_the_others(over: int) -> None:
+    """Against the equations of the other rows, at the same variances."""
+    rng = np.random.default_rng(12)
+    p = problem(rng, scatter=True, over=over)
+    at, fold = 0.3 * rng.standard_normal(len(p.priors)), rng.integers(0, 4, len(p.y))
+    off, variance = left_out(equations(p, at), fold)
+    for f in range(4):
+        mine, others = fold == f, fold != f
+        noise = tuple(replace(n, variance=n.variance[others]) for n in p.noise)
+        e = equations(replace(p, y=p.y[others], x=p.x[others], noise=noise), at)
+        np.testing.assert_allclose(off[mine], p.y[mine] - p.x[mine] @ e.coordinates, rtol=1e-6)
+        own = equations(p, at).noise_std[mine] ** 2
+        spread = np.einsum("ri,ij,rj->r", p.x[mine], e.covariance, p.x[mine])
+        np.testing.assert_allclose(variance[mine], own + spread, rtol=1e-6)
 
 
 def test_a_family_does_not_stay_small_where_the_iteration_began() -> None:
