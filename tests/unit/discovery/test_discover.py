@@ -288,7 +288,9 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.Mo
     def fails(*_: object) -> None:
         raise CannotAnswerError("it finds no equilibrium")
 
-    monkeypatch.setattr(sys.modules[discover.__module__], "exact", fails)
+    module = sys.modules[discover.__module__]
+    monkeypatch.setattr(module, "search", lambda _: searched())
+    monkeypatch.setattr(module, "exact", fails)
     d = discover(campaign(LAW), name="bent")
     assert d.reason == "no_law"
     said = silence(d)
