@@ -56,9 +56,10 @@ def pytest_configure() -> None:
 
 LONG = (
     "test_stops",
+    "test_run_watched",
     "test_fault_matrix_serial",
     "test_fault_matrix_arm",
-    "test_force_faults",
+    "test_force_drivers",
     "test_one_verdict",
     "test_next_cli",
     "test_ur_driver_faults",
@@ -71,8 +72,6 @@ LONG = (
     "test_catalogue_sufficiency",
     "test_devices",
     "test_terminal",
-    "test_sim_serial_bota",
-    "test_ur_driver_processes",
     "test_user_effects",
     "test_cli",
     "test_plan_optimum",

@@ -5,7 +5,6 @@ shortest times are compared. Nothing is asserted of times; `make bench` prints t
 end, each with the limit that README states, and stores them in `extra_info`.
 """
 
-import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from hilcal.readings.whitening import Whitening, whitening
 from hilcal.types import Floats
 from tests.benchmarks.conftest import Claim
 from tests.support.arm_cases import arm_of, cell_of
+from tests.support.timing import shortest
 
 pytestmark = pytest.mark.slow
 
@@ -108,17 +108,6 @@ def lapack_qr(a: Floats) -> Floats:
     return np.asarray(sl.qr(a, mode="r", check_finite=False)[0])
 
 
-def shortest(works: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Shortest processor time of each piece of work, s; they are done in turn."""
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(ROUNDS):
-        for name, work in works.items():
-            start = time.process_time()
-            work()
-            times[name].append(time.process_time() - start)
-    return {name: min(seconds) for name, seconds in times.items()}
-
-
 def works_of(p: Problem) -> dict[str, Callable[[], object]]:
     prediction = p.model.predict(p.readings.states, p.theta)
     w = whitening(p.readings, "absolute")
@@ -138,7 +127,7 @@ def test_a_step_against_qr(benchmark: Any, claim: Claim) -> None:
     """`ratio`: whitening, assembling and solving over LAPACK's QR."""
     p = problem_of(READINGS)
     prediction = p.model.predict(p.readings.states, p.theta)
-    seconds = shortest(works_of(p))
+    seconds = shortest(works_of(p), ROUNDS)
     ratios = {name: s / seconds["qr"] for name, s in seconds.items()}
     benchmark.extra_info["ratio"] = ratios["step"]
     benchmark.extra_info["ratios"] = ratios
@@ -157,7 +146,7 @@ def test_time_is_linear_in_the_readings(benchmark: Any, claim: Claim) -> None:
     per_reading: dict[str, dict[int, float]] = {"step": {}, "predicting": {}}
     for count in SIZES:
         works = works_of(problem_of(count))
-        found = shortest({name: works[name] for name in per_reading})
+        found = shortest({name: works[name] for name in per_reading}, ROUNDS)
         for name, seconds in found.items():
             per_reading[name][count] = 1e6 * seconds / count
     benchmark.extra_info["us_per_reading"] = per_reading

@@ -5,8 +5,6 @@ compared; of one thread's own work, so that what else runs does not count. Nothi
 times; `make bench` prints the ratios at its end and stores them in `extra_info`.
 """
 
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -22,22 +20,12 @@ from hilcal.readings.whitening import Mode
 from tests.benchmarks.conftest import Claim
 from tests.support.campaigns import campaign
 from tests.support.effect_cases import make
+from tests.support.timing import shortest
 
 pytestmark = pytest.mark.slow
 
 LOADS = 5  # readings of a pose
 ROUNDS = 3
-
-
-def shortest(works: dict[str, Callable[[], object]]) -> dict[str, float]:
-    """Shortest processor time of each piece of work, s; they are done in turn."""
-    times: dict[str, list[float]] = {name: [] for name in works}
-    for _ in range(ROUNDS):
-        for name, work in works.items():
-            start = time.process_time()
-            work()
-            times[name].append(time.process_time() - start)
-    return {name: min(seconds) for name, seconds in times.items()}
 
 
 def fitted(readings: int, mode: Mode) -> Fit:
@@ -73,7 +61,8 @@ def test_scoring_against_a_fit_of_the_largest_model(
             "fit": lambda: fit(model, found.readings, mode),
             "scoring": lambda: score(found),
             "diagnose": lambda: diagnose(found),
-        }
+        },
+        ROUNDS,
     )
     ratio = seconds["scoring"] / seconds["fit"]
     benchmark.extra_info.update(
@@ -96,7 +85,7 @@ def test_diagnosing_what_nothing_explains(mode: Mode, benchmark: Any, claim: Cla
     c = campaign("none", mode, poses=1000 // LOADS)
     readings = replace(c.readings, covariance=c.readings.covariance / 4)
     found = fit(baseline(c.cell, readings, mode), readings, mode)
-    seconds = shortest({"diagnose": lambda: diagnose(found)})["diagnose"]
+    seconds = shortest({"diagnose": lambda: diagnose(found)}, ROUNDS)["diagnose"]
     benchmark.extra_info["diagnose_s"] = seconds
     what = f"1000 {mode} readings of twice the stated noise: the whole diagnosis, s"
     claim(what, f"{seconds:.2f}", "aim: 1")

@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -117,3 +118,13 @@ class Bench:
         path = self.folder / name
         path.write_bytes(data)
         return path
+
+    def of_run(self, name: str) -> Callable[[], str]:
+        """Return what gives the text of a document that belongs to `run`."""
+
+        def text() -> str:
+            assert self.run
+            found = getattr(self, name)
+            return found.read_text() if isinstance(found, Path) else str(found)
+
+        return text

@@ -2,7 +2,7 @@
 
 import json
 import tomllib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from random import Random
 from typing import Any
@@ -173,8 +173,3 @@ def _all_to(values: list[Any], to: object) -> None:
             _all_to(value, to)
         else:
             values[k] = to
-
-
-def some(ways: Sequence[Callable[[Random], bytes]]) -> Callable[[Random], bytes]:
-    """One of several ways, by chance."""
-    return lambda rng: rng.choice(ways)(rng)

@@ -11,12 +11,11 @@ from random import Random
 import numpy as np
 
 import hilcal as hc
-from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.handover import urdf
 from hilcal.calibration.points import read_points
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
-from hilcal.identification import parameters_document, posterior_document
+from hilcal.identification import parameters_document
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.dh import arm_from_dh
 from hilcal.robot.urdf import arm_from_urdf
@@ -25,7 +24,7 @@ from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import load_mapping
 from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench
-from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged
+from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, toml_damaged, words_damaged
 from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
 from tests.fuzz.packed import packed
 from tests.support.campaigns import configuration
@@ -175,30 +174,17 @@ def _campaign_chain(bench: Bench, damaged: Parser) -> Parser:
     return Parser("campaign_chain", damaged.make, parse, limit_s=120.0)
 
 
-def _mapping(bench: Bench) -> Parser:
-    texts = [p.read_text() for p in sorted((configs_dir() / "mappings").glob("*.toml"))]
-    return _toml(bench, "mapping", texts, load_mapping)
+def _toml(bench: Bench, name: str, folder: str, read: Callable[[Path], object]) -> Parser:
+    texts = [p.read_text() for p in sorted((configs_dir() / folder).glob("*.toml"))]
 
-
-def _toml(bench: Bench, name: str, texts: list[str], read: Callable[[Path], object]) -> Parser:
     def make(by: Random) -> bytes:
-        if by.random() < 0.01:
-            return (b"a = " + b"[" * 5000) if by.random() < 0.5 else b"a." * 5000 + b"b = 1"
-        text = by.choice(texts)
-        if by.random() < 0.3:
-            return bytes_damaged(text.encode(), by)
-        return words_damaged(text, by).encode("utf-8", "replace")
+        return toml_damaged(by.choice(texts), by)
 
     def parse(data: bytes) -> bool:
         read(bench.path(f"{name}.toml", data))
         return True
 
     return Parser(name, make, parse)
-
-
-def _cell_toml(bench: Bench) -> Parser:
-    texts = [p.read_text() for p in sorted((configs_dir() / "cells").glob("*.toml"))]
-    return _toml(bench, "cell", texts, hc.Cell.load)
 
 
 def _document(
@@ -216,14 +202,6 @@ def _document(
         return True
 
     return Parser(name, make, parse)
-
-
-def _used(path: Path) -> None:
-    """Read a calibration and ask it."""
-    found = Calibration.load(path)
-    predicted = found.predict(np.zeros((1, found.model.cell.arm.n)), np.zeros((1, 6)))
-    if not np.all(np.isfinite(predicted.position)):
-        raise Accepted("calibration: a position that is not finite")
 
 
 def _urdf(bench: Bench) -> Parser:
@@ -271,24 +249,15 @@ def parsers() -> list[Parser]:
 
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     bench = Bench(folder)
-    arms = [p.read_text() for p in sorted((configs_dir() / "robots").glob("*.toml"))]
-
-    def of_run(name: str) -> Callable[[], str]:
-        def text() -> str:
-            assert bench.run
-            found = getattr(bench, name)
-            return found.read_text() if isinstance(found, Path) else str(found)
-
-        return text
 
     campaigns = _campaign_fit(bench)
     return [
         _table(bench),
         _points(bench),
         *packed(bench),
-        _mapping(bench),
-        _cell_toml(bench),
-        _toml(bench, "arm", arms, arm_from_dh),
+        _toml(bench, "mapping", "mappings", load_mapping),
+        _toml(bench, "cell", "cells", hc.Cell.load),
+        _toml(bench, "arm", "robots", arm_from_dh),
         _document(
             bench,
             "config",
@@ -296,9 +265,7 @@ def parsers() -> list[Parser]:
             lambda p: CellConfig.from_json(p.read_text(errors="replace")),
         ),
         _document(bench, "plan", lambda: bench.plan, load_plan),
-        _document(bench, "calibration", of_run("calibration"), _used),
-        _document(bench, "posterior", of_run("posterior"), posterior_document.read),
-        _document(bench, "parameters", of_run("parameters"), parameters_document.read),
+        _document(bench, "parameters", bench.of_run("parameters"), parameters_document.read),
         _urdf(bench),
         campaigns,
         *stored.parsers(bench),

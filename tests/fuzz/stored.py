@@ -22,22 +22,20 @@ from hilcal.identification.carried import carried_prior, check_arm
 from hilcal.present import text_info
 from hilcal.present.two_revisions import two_revisions
 from hilcal.procedure.state import next_step, settings_of
-from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.robot.catalogue import load_arm
 from hilcal.store import revision, run_log
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
 from hilcal.store.rows import _reading_crc, text_crc
 from hilcal.tables.guessing.propose import propose
-from hilcal.tables.mapping import load_mapping
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.tables.revision_table import revision_table
 from hilcal.transfer.members import LIST, entries
-from tests.fuzz.bench import CELL, Bench
+from tests.fuzz.bench import Bench
 from tests.fuzz.damage import (
     NUMBERS,
     bytes_damaged,
     document_damaged,
-    toml_damaged,
     words_damaged,
 )
 from tests.fuzz.harness import Accepted, Parser
@@ -245,7 +243,8 @@ def _compensated(path: Path) -> None:
     """Read a calibration, predict, and compensate with uncertainty."""
     found = Calibration.load(path)
     q, wrench = np.full((2, found.model.cell.arm.n), 0.3), np.zeros((2, 6))
-    found.predict(q, wrench)
+    if not np.all(np.isfinite(found.predict(q, wrench).position)):
+        raise Accepted("calibration: a position that is not finite")
     if zlib.crc32(path.read_bytes()) % 20 == 0:
         with np.errstate(all="ignore"):
             found.compensate(q, wrench)
@@ -265,19 +264,6 @@ def _carried(bench: Bench) -> Callable[[Path], None]:
             raise Accepted("prior: numbers that are not finite")
 
     return use
-
-
-def _mapped(bench: Bench) -> Parser:
-    texts = [p.read_text() for p in sorted((configs_dir() / "mappings").glob("*.toml"))]
-
-    def make(by: Random) -> bytes:
-        return toml_damaged(by.choice(texts), by)
-
-    def parse(data: bytes) -> bool:
-        load_mapping(bench.path("m.toml", data))
-        return True
-
-    return Parser("mappings", make, parse)
 
 
 def _preview(bench: Bench) -> Parser:
@@ -316,13 +302,7 @@ def _stream(bench: Bench) -> Parser:
 def parsers(bench: Bench) -> list[Parser]:
     """All of them."""
 
-    def of_run(name: str) -> Callable[[], str]:
-        def text() -> str:
-            assert bench.run
-            found = getattr(bench, name)
-            return found.read_text() if isinstance(found, Path) else str(found)
-
-        return text
+    of_run = bench.of_run
 
     def stored_revision() -> str:
         path = bench.path("of.hilcal", bench.run)
@@ -343,11 +323,9 @@ def parsers(bench: Bench) -> list[Parser]:
         ),
         _text(bench, "revision", stored_revision, document_damaged, _revision, ".json"),
         _text(
-            bench, "compensation", of_run("calibration"), document_damaged, _compensated, ".json"
+            bench, "calibration", of_run("calibration"), document_damaged, _compensated, ".json"
         ),
-        _text(bench, "prior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
-        _text(bench, "cells", CELL.read_text, toml_damaged, hc.Cell.load, ".toml"),
-        _mapped(bench),
+        _text(bench, "posterior", of_run("posterior"), document_damaged, _carried(bench), ".json"),
         _preview(bench),
         _stream(bench),
     ]  # fmt: skip

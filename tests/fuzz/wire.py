@@ -253,8 +253,6 @@ def modbus_rtu_crc(data: bytes) -> bytes:
 
 def parsers() -> list[Parser]:
     """All of them."""
-    from tests.fuzz.devices import parsers as servers
-
     return [
         *(_force(name) for name in ("ft300", "bota", "hex")),
         _geocom(),
@@ -262,5 +260,4 @@ def parsers() -> list[Parser]:
         controller.rtde(),
         controller.dashboard_server(),
         controller.packet(),
-        *servers(),
     ]

@@ -12,7 +12,7 @@ import psutil
 from hilcal.procedure.state import Files
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
-from tests.support.campaign_run import LOOK_S
+from tests.support.campaign_run import LOOK_S, still_running
 
 ROOT = Path(__file__).resolve().parents[2]
 CELL = """\
@@ -107,12 +107,7 @@ class Calibration:
 
     def left_behind(self) -> list[str]:
         """Return its processes that still run, after a moment: one may be starting just then."""
-        end = time.monotonic() + STARTING
-        while True:
-            names = [name for pid in self._family if (name := _alive(pid))]
-            if not names or time.monotonic() > end:
-                return names
-            time.sleep(0.02)
+        return still_running(self._family, STARTING)
 
     def every_reading_once(self) -> int:
         """Check that each step of each plan was measured once; returns the number of readings."""
@@ -151,13 +146,3 @@ class Calibration:
         except psutil.Error:
             return
         self._family |= {pid, *(child.pid for child in children)}
-
-
-def _alive(pid: int) -> str:
-    try:
-        process = psutil.Process(pid)
-        if process.status() == psutil.STATUS_ZOMBIE:
-            return ""
-        return " ".join(process.cmdline())
-    except psutil.Error:
-        return ""

@@ -159,13 +159,17 @@ class Run:
 
     def left_behind(self) -> list[str]:
         """Processes that it has left behind, after a moment."""
-        end = time.monotonic() + 3.0
-        while True:
-            there = [_alive(pid) for pid in self._family]
-            names = [name for name in there if name]
-            if not names or time.monotonic() > end:
-                return names
-            time.sleep(0.02)
+        return still_running(self._family, 3.0)
+
+
+def still_running(processes: set[int], seconds: float) -> list[str]:
+    """Commands of those of some processes that have not ended after so long."""
+    end = time.monotonic() + seconds
+    while True:
+        names = [name for pid in processes if (name := _alive(pid))]
+        if not names or time.monotonic() > end:
+            return names
+        time.sleep(0.02)
 
 
 def _limited(size: int) -> None:

@@ -19,6 +19,7 @@ from hilcal.tables.table import write_table
 from studies.__main__ import main as studies
 from studies.random_campaigns import rehearse
 
+Capsys = pytest.CaptureFixture[str]
 CELL = configs_dir() / "cells" / "demo_ur10e.toml"
 POSES = 14
 
@@ -41,7 +42,7 @@ class Outcome:
         return dict(json.loads(self.out))
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Outcome:
+def run(capsys: Capsys, *arguments: str | Path) -> Outcome:
     """Run a command in this process; one of `python -m studies` where it begins with "studies"."""
     capsys.readouterr()
     command, given = (
@@ -54,14 +55,14 @@ def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Outcome:
     return Outcome(ended.value.code, told.out, told.err)
 
 
-def ok(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> Outcome:
+def ok(capsys: Capsys, *arguments: str | Path) -> Outcome:
     """Run a command that must succeed."""
     result = run(capsys, *arguments)
     assert result.code == 0, result.err
     return result
 
 
-def refused(capsys: pytest.CaptureFixture[str], code: int, *arguments: str | Path) -> str:
+def refused(capsys: Capsys, code: int, *arguments: str | Path) -> str:
     """Run a command that must be refused; returns the one line on stderr that says why."""
     result = run(capsys, *arguments)
     assert result.code == code, result

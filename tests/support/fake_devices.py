@@ -33,7 +33,7 @@ class FakeArm:
         w = self.world
         w.call("arm.sample")
         q = w.joints()
-        speed = (w.goal - w.start) / w.lasts / w.hurry if w.is_moving else np.zeros(6)
+        speed = (w.goal - w.start) / w.lasts / w.hurried if w.is_moving else np.zeros(6)
         if not w.is_moving:
             q = q + w.jitter * w.rng.standard_normal(6)
         return ArmSample(
@@ -71,6 +71,7 @@ class FakeArm:
         assert w.control, "a motion without control"
         w.start, w.goal, w.begun = w.joints().copy(), q.copy(), w.time
         way = float(np.abs(w.goal - w.start).max())
+        w.hurried = w.hurry
         w.lasts = max(way / speed / w.hurry, 1e-6)
         w.is_moving = True
         w.at_start.append((q.copy(), w.load))

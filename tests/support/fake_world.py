@@ -50,7 +50,8 @@ class World:
     extra_speed: float = 0.0
     shift: Floats = field(default_factory=lambda: np.zeros(3))  # of the target
     creep: float = 0.0  # m/s, of the target while at rest
-    hurry: float = 10.0  # how much faster than commanded the arm moves
+    hurry: float = 20.0  # how much faster than commanded the arm moves, from the next motion on
+    hurried: float = 1.0  # the same of the motion under way
     jitter: float = 0.0  # rad, of the joints from sample to sample at rest
     lost: int = 0  # the next so many measurements see no target
     not_found: int = 0  # the next so many searches find none

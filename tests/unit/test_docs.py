@@ -1,22 +1,29 @@
-"""The documents: links lead somewhere, and the Python in them runs."""
+"""The documents: links lead somewhere, their Python runs, each block is what the program takes."""
 
 import re
 import sys
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
+from textwrap import dedent
 from types import ModuleType
+from typing import Any
 
 import pytest
 
 import hilcal as hc
-from hilcal.config import load_config
+from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
+from hilcal.effects.catalogue import ENTRY_POINT_GROUP
+from hilcal.measuring.devices import TRACKERS
 from hilcal.readings.covariance import WHOLE
-from hilcal.robot.catalogue import configs_dir
+from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
+from hilcal.toml import check_section
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import ok, quickly_planned
+from tests.support import readme
+from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -36,6 +43,19 @@ def test_links_lead_to_files_of_the_tree(path: Path) -> None:
     assert missing == []
 
 
+@pytest.fixture
+def campaign_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """Go to a folder, and make run.hilcal of so many poses with an effect there."""
+    monkeypatch.chdir(tmp_path)
+
+    def make(effect: str, poses: int, config: CellConfig | None = None) -> None:
+        config = config or load_config(CELL)
+        with CampaignFile.create("run.hilcal", config.to_json(), str(CELL.parent), "test") as file:
+            file.append_readings(rehearse(config, effect, 3, poses).readings)
+
+    return make
+
+
 def test_the_effect_of_the_guide_is_a_working_effect() -> None:
     code = blocks(ROOT / "docs" / "how-to" / "add-an-effect.md")
     known: dict[str, object] = {"__name__": "cable_pull"}
@@ -47,16 +67,13 @@ def test_the_effect_of_the_guide_is_a_working_effect() -> None:
 
 
 def test_the_guide_to_the_library_runs_as_it_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    campaign_of: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = configs_dir() / "cells" / "demo_ur10e.toml"
-    config = quickly_planned(load_config(cell))
-    readings = rehearse(config, "creep", 3, 10).readings
-    monkeypatch.chdir(tmp_path)
+    config = quickly_planned(load_config(CELL))
+    campaign_of("creep", 10, config)
     Path("CELL.toml").write_text(to_toml(config), encoding="utf-8")
-    write_table(readings, Path("readings.csv"), WHOLE)
-    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
-        file.append_readings(readings)
+    with CampaignFile.open("run.hilcal") as file:
+        write_table(file.readings(), Path("readings.csv"), WHOLE)
     pyplot = ModuleType("matplotlib.pyplot")
     drawn: list[object] = []
     monkeypatch.setattr(pyplot, "plot", lambda *given: drawn.append(given), raising=False)
@@ -72,15 +89,11 @@ def test_the_guide_to_the_library_runs_as_it_stands(
 
 
 def test_the_python_of_the_readme_runs_as_it_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     section = (ROOT / "README.md").read_text().split("\n## From Python\n")[1].split("\n## ")[0]
     code = "\n".join(line[4:] for line in section.splitlines() if line.startswith("    "))
-    cell = configs_dir() / "cells" / "demo_ur10e.toml"
-    config = load_config(cell)
-    monkeypatch.chdir(tmp_path)
-    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
-        file.append_readings(rehearse(config, "joint_tilt_compliance", 3, 10).readings)
+    campaign_of("joint_tilt_compliance", 10)
     exec(code, {})
     assert "missing_effect" in capsys.readouterr().out
     with hc.Campaign.open("run.hilcal") as run:
@@ -88,14 +101,10 @@ def test_the_python_of_the_readme_runs_as_it_stands(
 
 
 def test_the_guide_to_compensation_runs_as_it_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "compensate.md"
-    cell = configs_dir() / "cells" / "demo_ur10e.toml"
-    config = load_config(cell)
-    monkeypatch.chdir(tmp_path)
-    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
-        file.append_readings(rehearse(config, "nothing", 3, 20).readings)
+    campaign_of("nothing", 20)
     given = ("--effects", "joint_compliance,encoder_offset")
     ok(capsys, "identify", "run.hilcal", "--readings", "absolute", *given)
     (table,) = blocks(guide, "csv")
@@ -111,14 +120,10 @@ def test_the_guide_to_compensation_runs_as_it_stands(
 
 
 def test_the_guide_to_handing_over_runs_as_it_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    campaign_of: Callable[..., None], capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "hand-over.md"
-    cell = configs_dir() / "cells" / "demo_ur10e.toml"
-    config = load_config(cell)
-    monkeypatch.chdir(tmp_path)
-    with CampaignFile.create("run.hilcal", config.to_json(), str(cell.parent), "test") as file:
-        file.append_readings(rehearse(config, "nothing", 3, 20).readings)
+    campaign_of("nothing", 20)
     given = ("--effects", "joint_compliance,encoder_offset")
     ok(capsys, "identify", "run.hilcal", "--readings", "absolute", *given)
     for line in "".join(blocks(guide, "sh")).splitlines():
@@ -132,7 +137,7 @@ def test_the_guide_to_handing_over_runs_as_it_stands(
 
 
 def test_the_guide_to_imports_is_what_the_commands_do(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:
     guide = ROOT / "docs" / "how-to" / "import-a-table.md"
     monkeypatch.chdir(tmp_path)
@@ -153,3 +158,68 @@ def test_the_first_example_of_the_library_is_short() -> None:
     """A fit, its diagnosis and a plot of the residuals with one import of hilcal."""
     first = blocks(ROOT / "docs" / "how-to" / "use-the-library.md")[0]
     assert len([line for line in first.splitlines() if line.strip()]) <= 8
+
+
+HOW_TO = ROOT / "docs" / "how-to"
+
+
+def in_a_cell(text: str) -> CellConfig:
+    """The README's cell with the sections of a block in place of its own."""
+    cell: dict[str, Any] = tomllib.loads(readme.cell())
+    return check_section({**cell, **tomllib.loads(text)}, CellConfig, "block")
+
+
+def test_the_cells_of_the_guides_are_accepted() -> None:
+    urdf, _, signs = blocks(HOW_TO / "add-a-robot.md", "toml")
+    assert in_a_cell(urdf).robot.tip_link == "tool0"
+    assert in_a_cell(signs).robot.joint_sign == (1, 1, 1, -1, 1, 1)
+    _, driver = blocks(HOW_TO / "add-a-device.md", "toml")
+    assert in_a_cell(driver).tracker.options == {"averaging": 4}
+    text = (HOW_TO / "measure-several-targets.md").read_text(encoding="utf-8")
+    lines = [line[4:] for line in text.splitlines() if line.startswith("    ")]
+    assert [t.name for t in in_a_cell("\n".join(lines)).tool.targets] == ["R1", "R2", "R3"]
+
+
+def test_the_arm_of_the_guide_is_an_arm(tmp_path: Path) -> None:
+    path = tmp_path / "my_arm.toml"
+    path.write_text(blocks(HOW_TO / "add-a-robot.md", "toml")[1], encoding="utf-8")
+    assert load_arm(str(path)).n == 1
+
+
+def test_the_entry_points_of_the_guides_are_those_that_are_read() -> None:
+    found = {}
+    for page in ("add-a-device.md", "add-an-effect.md"):
+        for text in blocks(HOW_TO / page, "toml"):
+            found |= tomllib.loads(text).get("project", {}).get("entry-points", {})
+    assert set(found) == {TRACKERS, ENTRY_POINT_GROUP}
+
+
+def test_the_driver_of_the_guide_opens_and_reports() -> None:
+    (code,) = blocks(HOW_TO / "add-a-device.md")
+    known: dict[str, Any] = {"__name__": "mytracker"}
+    exec(dedent(code), known)
+    tracker = known["open_tracker"](load_config(CELL))
+    assert tracker.report().device == "tracker"
+
+
+def test_the_commands_of_the_guide_to_effects(
+    campaign_of: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: Capsys,
+) -> None:
+    guide = HOW_TO / "add-an-effect.md"
+    campaign_of("nothing", 6)
+    lines = guide.read_text(encoding="utf-8").splitlines()
+    commands = [line.split("#")[0].split()[1:] for line in lines if line.startswith("    hilcal ")]
+    rehearsed = [words for words in commands if words[0] in ("demo", "simulate")]
+    assert [words[0] for words in commands[: -len(rehearsed) or None]] == ["effects", "diagnose"]
+    for words in commands:
+        if words not in rehearsed:  # hiding an effect of one's own: test_own_law
+            ok(capsys, *words)
+    module = ModuleType("cable_pull")
+    law, check, *_ = blocks(guide)
+    exec(law, module.__dict__)
+    monkeypatch.setitem(sys.modules, "cable_pull", module)
+    known: dict[str, Any] = {}
+    exec(check, known)
+    known["test_the_law_is_consistent"]()

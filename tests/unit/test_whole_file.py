@@ -103,29 +103,6 @@ def test_those_that_may_write_straight_still_do() -> None:
     assert idle == [], "take them from the list"
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        'open(p, "w")',
-        'p.open("x")',
-        'p.open(mode="ab")',
-        'open(p, mode="r+")',
-        "p.write_text(t)",
-        "np.savez(p, a)",
-        "json.dump(x, f)",
-        "os.replace(a, b)",
-        "a.replace(b)",
-        "os.open(p, os.O_CREAT | os.O_WRONLY)",
-        "shutil.copy(a, b)",
-        "sqlite3.connect(p)",
-        "parquet.write_table(t, p)",
-    ],
-)
-def test_a_direct_write_would_be_found(line: str) -> None:
-    assert list(_direct_writes(ast.parse(line)))
-    assert not list(_direct_writes(ast.parse(f"with replacing(p) as new:\n    {line}")))
-
-
 def test_a_file_that_could_not_be_written_is_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
 

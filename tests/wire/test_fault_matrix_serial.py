@@ -205,5 +205,6 @@ def test_an_operator_who_keeps_hanging_the_wrong_load_ends_the_run(
     finish(short, path)
 
 
+@pytest.mark.slow
 def test_the_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
     finish(cell, path)

@@ -1,7 +1,13 @@
-"""The drivers of force sensors against simulated ones, over the bytes of a serial line."""
+"""Drivers of force sensors against simulated ones: readings, and what goes wrong on the line."""
 
+import binascii
 import os
+import signal
+import struct
+import threading
 import time
+import tty
+from contextlib import contextmanager, suppress
 
 import numpy as np
 import pytest
@@ -159,3 +165,206 @@ def test_an_ft300_at_the_end_of_its_range(index, value):
     assert not ft300.SENSOR.overload(wrench, 0)
     wrench[index] = value
     assert "over its range" in ft300.SENSOR.overload(wrench, 0)
+
+
+OVERLOADED = r"loaded over its range|overloaded"
+
+
+@ALL
+def test_unplugged_while_streaming_and_replugged(kind, simulated):
+    with opened(kind, simulated.port) as sensor:
+        sensor.latest()
+        simulated.admin("unplug")
+        fails(sensor.latest, "is gone; was its adapter unplugged")
+        fails(lambda: sensor.average(1.0), "is gone; was its adapter unplugged")
+        assert "unplugged" in sensor.report().problems[0]
+    fails(lambda: OPEN[kind](config(kind, simulated.port)), "there is no port")
+    simulated.admin("replug")
+    with opened(kind, simulated.port) as sensor:
+        assert steady(sensor, 0.2).frames > 10
+
+
+@BOTH
+def test_unplugged_in_the_middle_of_a_mean(kind, simulated):
+    with opened(kind, simulated.port) as sensor:
+        timer = threading.Timer(0.3, lambda: simulated.admin("unplug"))
+        timer.start()
+        fails(lambda: sensor.average(30.0), "unplugged")
+        timer.join()
+
+
+@BOTH
+@pytest.mark.parametrize("fault", ["mute", "stall"])
+def test_a_stream_that_stops_is_stale_and_comes_back(kind, simulated, fault):
+    with opened(kind, simulated.port) as sensor:
+        time.sleep(0.2)
+        simulated.admin(fault, on=True)
+        fails(sensor.latest, "nothing came for .* s; check the sensor's power and cable")
+        fails(lambda: sensor.average(0.1), "nothing came")
+        stopped = time.monotonic()
+        assert "nothing came" in sensor.report().problems[0]
+        time.sleep(0.2)
+        simulated.admin(fault, on=False)
+        missing = (time.monotonic() - stopped) * simulated.admin("state")["rate"]
+        time.sleep(0.1)
+        time.sleep(0.2)
+        assert sensor.losses().lost > 0.9 * missing
+
+
+@BOTH
+def test_frames_that_come_late_are_waited_for(kind, simulated):
+    """As on a busy computer: nothing comes during the whole window, all of it soon after."""
+    with opened(kind, simulated.port) as sensor:
+        time.sleep(0.2)
+        os.kill(simulated.process.pid, signal.SIGSTOP)
+        timer = threading.Timer(0.25, os.kill, (simulated.process.pid, signal.SIGCONT))
+        timer.start()
+        began = time.monotonic()
+        mean = sensor.average(0.1)
+        timer.join()
+        assert time.monotonic() - began > 0.2
+        assert mean.frames >= 5  # half of what 100 Hz, the slowest, gives in the window
+
+
+@BOTH
+def test_a_mute_sensor_and_a_wrong_rate_are_told_when_opening(kind, simulated):
+    fails(
+        lambda: OPEN[kind](config(kind, simulated.port, baud=57600)),
+        f"{simulated.port}.* at 57600 Bd.*rate",
+    )
+    simulated.admin("mute", on=True)
+    fails(lambda: OPEN[kind](config(kind, simulated.port)), "check the sensor's power")
+    simulated.admin("mute", on=False)
+    assert readers() == []
+    with opened(kind, simulated.port) as sensor:
+        sensor.latest()
+
+
+@BOTH
+def test_a_rate_that_changes_while_streaming_is_told(kind, simulated):
+    with opened(kind, simulated.port) as sensor:
+        sensor.latest()
+        simulated.admin("baud", baud=57600)
+        fails(sensor.latest, "bytes come at .* Bd, but no whole frame")
+
+
+@ALL
+def test_damage_on_the_line_lets_no_wrong_reading_through(kind, simulated):
+    with opened(kind, simulated.port) as sensor:
+        mean, noise, off = truth_of(simulated)
+        time.sleep(0.3)
+        simulated.admin("flip", probability=0.02)
+        simulated.admin("cut", probability=0.02)
+        end = time.monotonic() + (3.0 if kind == "ft300" else 1.5)
+        seen = 0
+        while time.monotonic() < end:
+            try:
+                sample = steady(sensor, 0.3)
+            except DeviceError:
+                continue  # a machine that does other work; no reading is no wrong reading
+            seen += sample.frames
+            spread = np.sqrt(np.diagonal(sample.covariance))
+            assert np.all(np.abs(sample.wrench - mean) < 6 * noise / np.sqrt(sample.frames) + off)
+            assert np.all(spread < 3 * noise)  # one wrong frame would be a gross outlier
+        assert seen > 100
+        count = sensor.losses()
+        assert count.corrupt > 0
+        assert count.skipped > 0
+        assert count.lost >= 0.8 * count.corrupt
+        assert any("frames lost on port" in problem for problem in sensor.report().problems)
+
+
+@BOTH
+def test_half_a_frame_and_garbage_cost_a_frame_or_two(kind, simulated):
+    with opened(kind, simulated.port) as sensor:
+        time.sleep(0.2)
+        simulated.admin("half_frame")
+        time.sleep(0.2)
+        simulated.admin("garbage", count=200)
+        time.sleep(1.2)  # at 19200 Bd it holds up the frames behind it for 0.1 s
+        count = settled(sensor, lambda count: 1 <= count.lost <= 4)
+        assert 1 <= count.lost <= 4
+        assert count.skipped >= 200
+
+
+@ALL
+def test_overload_is_no_reading(kind, simulated):
+    force = [0.0, 0.0, 5000.0, 0.0, 0.0, 0.0]
+    with opened(kind, simulated.port) as sensor:
+        steady(sensor, 0.1)
+        simulated.admin("overload", force=force)
+        fails(lambda: sensor.average(0.2), OVERLOADED)
+        fails(sensor.latest, OVERLOADED)
+        assert "load" in sensor.report().problems[0]
+        simulated.admin("overload", force=[0.0] * 6)
+        time.sleep(0.1)
+        assert np.linalg.norm(steady(sensor, 0.1).wrench) < 100.0
+
+
+def test_the_wrong_sensor_is_told(instruments):
+    port = instruments("bota").port
+    fails(
+        lambda: ft300.open_force_sensor(config("ft300", port, baud=460800)),
+        "what comes is no answer; .* or it is no FT 300",
+    )
+    port = instruments("hex").port
+    fails(
+        lambda: bota.open_force_sensor(config("bota", port, baud=1_000_000)),
+        "no whole frame .* or it is no Bota sensor",
+    )
+
+
+def bota_frame(number, wrench, status=0):
+    """A frame with the standard library's CRC, which is the mirror image of X-25's."""
+    body = struct.pack("<H6fIf", status, *wrench, number * 1000 % 2**32, 30.0)
+    mirror = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+    crc = binascii.crc_hqx(body.translate(mirror), 0xFFFF)
+    return b"\xaa" + body + struct.pack("<H", int(f"{crc:016b}"[::-1], 2) ^ 0xFFFF)
+
+
+@contextmanager
+def talker(tmp_path, frame):
+    """A line on which frame(k) comes every millisecond, for ever."""
+    master, slave = os.openpty()
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    path = tmp_path / "line"
+    path.symlink_to(os.ttyname(slave))
+    stop = threading.Event()
+
+    def talk() -> None:
+        start, number = time.monotonic(), 0
+        while not stop.wait(0.002):
+            while number < (time.monotonic() - start) * 1000:
+                with suppress(BlockingIOError):
+                    os.write(master, frame(number))
+                number += 1
+
+    thread = threading.Thread(target=talk)
+    thread.start()
+    try:
+        yield path
+    finally:
+        stop.set()
+        thread.join()
+        path.unlink()
+        os.close(master)
+        os.close(slave)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
+def test_values_that_cannot_be_never_pass(tmp_path, bad):
+    good = (1.0, 2.0, 3.0, 0.1, 0.2, 0.3)
+    wrong = (1.0, 2.0, bad, 0.1, 0.2, 0.3)
+    with (
+        talker(tmp_path, lambda k: bota_frame(k, good if k % 10 else wrong)) as path,
+        opened("bota", path) as sensor,
+    ):
+        sample = steady(sensor, 0.2)
+        assert sample.wrench == pytest.approx(good)
+        assert sensor.losses().corrupt > 0
+    with talker(tmp_path, lambda k: bota_frame(k, wrong)) as path:
+        fails(
+            lambda: OPEN["bota"](config("bota", path)),
+            "their values or their clock were impossible",
+        )

@@ -200,22 +200,6 @@ def test_the_person_is_asked_and_presses_enter(sit):
     assert person.found() == ([], ["done", "done", "done"])
 
 
-def test_the_person_gives_up(sit):
-    person = sit(["5kg", ""])
-    person.sees(END)
-    person.types("q\n")
-    assert person.found() == ([], ["error: stopped by the operator"])
-
-
-def test_another_answer_is_asked_again(sit):
-    person = sit(["5kg", ""])
-    person.sees(END)
-    person.types("yes [bold]\n")
-    assert "'yes [bold]' is no answer" in person.sees(END)
-    person.types("\n")
-    assert person.found() == ([], ["done"])
-
-
 def test_what_was_typed_before_the_question_is_no_answer(sit):
     person = sit(["5kg", ""])
     person.types("q\n")  # typed ahead, while the program starts
@@ -232,13 +216,6 @@ def test_a_closed_terminal_is_no_answer(sit):
         [],
         ["error: operator: the terminal was closed before it was answered"],
     )
-
-
-def test_ctrl_c_goes_through(sit):
-    person = sit(["5kg", ""])
-    person.sees(END)
-    person.types("\x03")
-    assert person.found() == ([], ["interrupted"])
 
 
 def test_without_a_terminal_nobody_is_asked(sit):

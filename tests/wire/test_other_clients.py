@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from drivers.frames import crc_modbus, crc_x25
-from drivers.ft300 import STREAM, STREAM_REGISTER
 from drivers.simulated.force.ft300 import Ft300
 from drivers.simulated.geocom.protocol import crc16_arc
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
@@ -137,41 +136,6 @@ def crc(data: bytes) -> bytes:
             if out:
                 register ^= 0xA001
     return bytes([register & 0xFF, register >> 8])
-
-
-class Master:
-    """Asks a slave, and takes its answers apart."""
-
-    def __init__(self, slave: Ft300) -> None:
-        self.slave = slave
-
-    def ask(self, pdu: bytes, address: int = 9) -> bytes:
-        """Return the PDU of the answer, empty for none."""
-        answer = self.slave.receive(
-            bytes([address]) + pdu + crc(bytes([address]) + pdu), np.zeros(6)
-        )
-        if not answer:
-            return b""
-        assert answer[0] == address
-        assert crc(answer[:-2]) == answer[-2:]
-        return answer[1:-2]
-
-
-def test_reading_and_writing_registers_as_any_master_does() -> None:
-    sensor = Ft300()
-    master = Master(sensor)
-    answer = master.ask(struct.pack(">BHH", 3, 500, 6))
-    assert answer[:2] == bytes([3, 12])
-    assert len(answer) == 14
-    assert master.ask(struct.pack(">BHH", 4, 180, 6)) == bytes([4, 12]) + bytes(12)
-    assert master.ask(struct.pack(">BHH", 3, 500, 0)) == b"\x83\x03"  # ILLEGAL DATA VALUE
-    assert master.ask(struct.pack(">BHH", 3, 500, 126)) == b"\x83\x03"
-    assert master.ask(struct.pack(">BHH", 3, 9999, 1)) == b"\x83\x02"  # ILLEGAL DATA ADDRESS
-    assert master.ask(b"\x2b\x0e\x01\x00\x00") == b"\xab\x01"  # ILLEGAL FUNCTION
-    assert master.ask(struct.pack(">BHH", 3, 500, 1), address=10) == b""  # of another slave
-    pdu = struct.pack(">BHHBH", 16, STREAM_REGISTER, 1, 2, STREAM)
-    assert master.ask(pdu) == struct.pack(">BHH", 16, STREAM_REGISTER, 1)
-    assert sensor.streaming
 
 
 def test_a_request_that_the_line_has_damaged_is_not_answered() -> None:

@@ -51,17 +51,6 @@ def line(tmp_path: Path) -> Iterator[Line]:
         line.unplug()
 
 
-def test_bytes_go_both_ways(line):
-    port = open_port("tracker", str(line.path), 19200)
-    try:
-        port.write(b"\x00\x03\x11\x13\r\n\xff")
-        assert os.read(line.master, 100) == b"\x00\x03\x11\x13\r\n\xff"
-        os.write(line.master, b"\x00\x03\x11\x13\r\n\xff")
-        assert port.read(7) == b"\x00\x03\x11\x13\r\n\xff"
-    finally:
-        close_port(port)
-
-
 def test_a_port_that_another_program_uses_is_refused_and_named(line):
     other = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(line.path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
@@ -75,13 +64,6 @@ def test_a_port_that_another_program_uses_is_refused_and_named(line):
         assert str(caught.value).startswith("force sensor: ")
         other.kill()  # as its death may be; the lock dies with it
     close_port(open_port("force sensor", str(line.path), 19200))
-
-
-def test_a_port_is_free_again_after_close_and_may_be_closed_twice(line):
-    port = open_port("tracker", str(line.path), 19200)
-    close_port(port)
-    close_port(port)
-    close_port(open_port("tracker", str(line.path), 19200))
 
 
 def test_a_port_that_does_not_exist(tmp_path):
@@ -126,11 +108,6 @@ def test_an_unplugged_adapter_is_one_line_whatever_was_tried(line, action):
             actions[action]()
     finally:
         close_port(port)
-
-
-def test_other_errors_pass_through():
-    with pytest.raises(ValueError, match="mine"), line_failures("tracker", "port"):
-        raise ValueError("mine")
 
 
 def test_a_line_is_drained_until_quiet(line):

@@ -10,6 +10,7 @@ from drivers.simulated.cell_processes import SimulatedCell
 from hilcal.campaign.campaign import Campaign
 from hilcal.measuring.devices import PointingTracker, TargetLostError
 from hilcal.robot.catalogue import configs_dir
+from tests.support.cli_cases import Capsys
 from tests.support.cli_cases import run as command
 from tests.support.living_cell import config, world_of
 from tests.support.reflector_cases import NAMES, OFFSETS
@@ -45,9 +46,7 @@ def test_the_station_measures_the_reflector_that_it_is_pointed_to(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_whole_run_with_three_reflectors(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_whole_run_with_three_reflectors(tmp_path: Path, capsys: Capsys) -> None:
     text = (configs_dir() / "cells" / "demo_ur10e.toml").read_text()
     tables = "".join(
         f'[[tool.targets]]\nname = "{t["name"]}"\ntarget_m = {t["target_m"]}\n'

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
-from scipy.spatial.transform import Rotation
 
-from drivers.simulated.ur.kinematics import GRAVITY, Kinematics, pose, rotation, transform
+from drivers.simulated.ur.kinematics import GRAVITY, Kinematics
 from drivers.simulated.ur.motion import Trajectory, line
 from drivers.simulated.ur.script import ScriptStream
 from hilcal.robot.catalogue import load_arm
@@ -39,20 +38,6 @@ def test_speed_is_the_derivative_and_limits_hold(goal, speed, acceleration):
     assert np.max(np.abs(np.diff(rate))) <= acceleration * step * (1 + 1e-6) + 1e-12
 
 
-def test_line_in_joint_space_and_end():
-    path = trajectory()
-    path.start(GOAL, 0.5, 1.0, 100.0)
-    for now in np.arange(100.0, 103.6, 0.01):
-        path.advance(now)
-        if path.moving:
-            np.testing.assert_allclose(path.q * GOAL[5], path.q[5] * GOAL, atol=1e-12)
-    assert not path.moving
-    np.testing.assert_allclose(path.q, GOAL, atol=1e-15)
-    assert path.rest_time == pytest.approx(100.0 + 1.5 / 0.5 + 0.5 / 1.0)
-    assert path.arrivals == 6
-    np.testing.assert_array_equal(path.side, [1, -1, 1, 1, 1, -1])
-
-
 @pytest.mark.parametrize("when", [0.2, 1.5, 3.1, 3.45])
 def test_stop_is_smooth_and_stays_on_the_line(when):
     path = trajectory()
@@ -72,21 +57,6 @@ def test_stop_is_smooth_and_stays_on_the_line(when):
     assert np.all(np.abs(path.q) <= np.abs(GOAL) + 1e-12)
 
 
-def test_a_new_move_under_way_stops_first():
-    path = trajectory()
-    path.start(GOAL, 0.5, 1.0, 100.0)
-    path.advance(101.0)
-    path.start(np.zeros(6), 0.5, 1.0, 101.0)
-    assert path.moving
-    path.advance(101.001)
-    assert np.max(np.abs(path.qd)) > 0.4
-    path.advance(110.0)
-    assert not path.moving
-    np.testing.assert_allclose(path.q, 0.0, atol=1e-12)
-    assert path.arrivals == 7
-    np.testing.assert_array_equal(path.side, [-1, 1, 1, -1, 1, 1])
-
-
 def test_slider_slows_and_holds():
     path = trajectory()
     path.start(GOAL, 0.5, 1.0, 100.0)
@@ -103,32 +73,6 @@ def test_slider_slows_and_holds():
     path.stop(1.0, 151.0)
     assert not path.moving
     np.testing.assert_array_equal(path.q, held)
-
-
-def test_a_move_to_the_same_place_is_none():
-    path = trajectory()
-    path.start(np.zeros(6), 0.5, 1.0, 100.0)
-    assert not path.moving
-    assert path.arrivals == 5
-
-
-@given(vectors)
-def test_poses_go_there_and_back(given):
-    # rotation vectors up to half a turn
-    given[3:] *= np.pi / max(np.pi, np.linalg.norm(given[3:]))
-    place = transform(given)
-    np.testing.assert_allclose(
-        place[:3, :3], Rotation.from_rotvec(given[3:]).as_matrix(), atol=1e-12
-    )
-    np.testing.assert_allclose(transform(pose(place)), place, atol=1e-6)
-
-
-@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 3.0, np.pi - 1e-7, np.pi])
-def test_rotation_vectors_near_their_limits(angle):
-    vector = angle * np.array([0.36, -0.48, 0.8])
-    back = pose(transform(np.concatenate([np.zeros(3), vector])))[3:]
-    np.testing.assert_allclose(rotation(back), rotation(vector), atol=1e-6)
-    assert np.linalg.norm(back) == pytest.approx(angle, abs=1e-6)
 
 
 def test_jacobian_and_weight_are_derivatives():

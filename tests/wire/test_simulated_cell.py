@@ -104,15 +104,6 @@ def test_the_configuration_leads_to_the_devices_and_keeps_the_rest(cell):
     assert filled == type(filled).from_json(filled.to_json())
 
 
-def test_what_is_true_when_the_cell_is_ready_belongs_to_its_arm(cell):
-    board = Blackboard.attach(cell.directory / "world.bin")
-    assert board.scale == 20.0
-    arm, truth = board.read("arm"), board.read("truth")
-    assert arm["alive"] == 1.0
-    np.testing.assert_allclose(truth["encoder"], arm["q"], atol=1e-4)
-    assert truth["arrivals"] == arm["arrivals"]
-
-
 def test_two_cells_have_arms_of_their_own(cell, tmp_path):
     with start(tmp_path, config()) as other:
         assert tuple(other.processes()) == DEVICES[:3]  # no force sensor was configured
@@ -149,13 +140,6 @@ def test_a_killed_device_comes_back_at_the_same_place(cell, device):
     cell.ask("world", "hang", name=None)
 
 
-def test_restarting_what_runs_replaces_it(cell):
-    before = cell.processes()["tracker"]
-    cell.restart("tracker")
-    assert cell.processes()["tracker"] != before
-    assert not running(before)
-
-
 def test_the_truth_goes_on_with_the_arm_after_a_restart_of_the_world(cell):
     cell.restart("world")
     board = Blackboard.attach(cell.directory / "world.bin")
@@ -182,13 +166,6 @@ def test_nothing_is_left_behind(tmp_path):
     assert psutil.Process().num_threads() == threads
     assert not list(tmp_path.glob("*.sock"))
     cell.close()
-
-
-def test_a_directory_can_be_used_again(tmp_path):
-    with start(tmp_path, config()) as first:
-        first.ask("world", "hang", name="5kg")
-    with start(tmp_path, config()) as second:
-        assert second.ask("world", "state")["load"] is None
 
 
 PARENT = """
@@ -232,15 +209,6 @@ def test_an_address_that_another_program_took_is_not_insisted_on(tmp_path, monke
         with start(tmp_path) as cell:
             assert cell.config.robot.host == free
             assert isinstance(cell.ask("arm", "state"), dict)
-
-
-def test_a_free_address_is_one_where_all_ports_are_free():
-    seen = {free_host() for _ in range(20)}
-    assert len(seen) > 1
-    for host in seen:
-        for port in UR_PORTS:
-            with socket.socket() as line:
-                line.bind((host, port))
 
 
 def broken(monkeypatch, module, *arguments):

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
 from tests.soak import soak
-from tests.support.campaign_cases import Fault
 from tests.support.soak_actions import Soak
 
 MINUTES = float(os.environ.get("HILCAL_SOAK_MINUTES", "10"))
@@ -69,35 +68,3 @@ def test_any_order_of_faults_stops_and_recoveries(tmp_path_factory: pytest.TempP
             suppress_health_check=list(HealthCheck),
         ),
     )
-
-
-def test_a_check_that_fails_is_kept_and_the_soak_goes_on(tmp_path: Path) -> None:
-    s = Soak(Random(0), tmp_path)
-
-    def wrong() -> str:
-        raise AssertionError("a reading is lost or doubled")
-
-    s.do(wrong)
-    assert [line.split()[0].rstrip(":") for line in s.findings] == ["wrong"]
-    assert s.counts["wrong"] == 1
-
-    def starved() -> str:
-        raise AssertionError("error: no new data over RTDE for 0.2 s")
-
-    s.do(starved)
-    assert len(s.findings) == 1
-    assert s.starved == 1
-
-
-def test_faults_are_drawn_from_the_whole_matrix(tmp_path: Path) -> None:
-    s = Soak(Random(0), tmp_path)
-    drawn: dict[str, Fault] = {}
-    for _ in range(3000):
-        for moment in ("moving", "measuring", "any"):
-            fault = s._drawn(moment)
-            drawn[fault.name] = fault
-    from tests.wire.test_fault_matrix_arm import MOTION, REST
-    from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
-
-    assert {f.name for f in (*MOTION, *REST, *TRACKER, *FORCE)} <= set(drawn)
-    assert {f"{d} {op}" for d, rows in OVERCOME.items() for op, *_ in rows} <= set(drawn)

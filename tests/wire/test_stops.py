@@ -209,5 +209,6 @@ def test_a_campaign_that_is_gone_is_said_and_found(
     finish(short, path)
 
 
+@pytest.mark.slow
 def test_the_stopped_campaign_has_every_reading_exactly_once(cell: Site, path: Path) -> None:
     finish(cell, path)

@@ -9,7 +9,7 @@ from hilcal.config.write import to_toml
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
 from tests.support.campaign_site import Site
-from tests.support.cli_cases import run
+from tests.support.cli_cases import Capsys, run
 from tests.support.screen import AtTerminal
 
 __all__ = ["cell", "nothing_goes_on"]  # fixtures
@@ -73,9 +73,7 @@ def at_the_first_question(person: AtTerminal) -> None:
     person.keeps("Done: nothing hangs.")
 
 
-def test_check_gives_every_fact_as_a_field(
-    cell: Site, toml: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_check_gives_every_fact_as_a_field(cell: Site, toml: Path, capsys: Capsys) -> None:
     result = run(capsys, "check", toml, "--json")
     assert result.code == 3  # nobody is at a terminal here
     devices = {d["device"]: d for d in result.document["devices"]}

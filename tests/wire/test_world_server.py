@@ -2,16 +2,14 @@
 
 import time
 
-import numpy as np
 import pytest
 
 from drivers.simulated.admin import ask
 from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.device_process import DeviceProcess
 from drivers.simulated.world_file import write_world
-from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
-from tests.support.living_cell import SIDE, WEIGHT, Q, config, same, states, world_of
+from tests.support.living_cell import config, world_of
 
 
 def wait_until(condition, seconds=10.0):
@@ -32,26 +30,6 @@ def process(tmp_path):
     process.check()
     yield process
     process.end()
-
-
-def test_the_process_follows_the_arm(process, tmp_path):
-    world = world_of(CellConfig.from_json(config().to_json()))
-    board = Blackboard.attach(tmp_path / "world.bin")
-    assert board.scale == 20.0
-    board.write("arm", q=Q, side=SIDE, arrivals=3, moving=0.0, alive=1.0)
-    wait_until(lambda: board.read("truth")["arrivals"] == 3)
-    assert ask(process.socket, "hang", name="5kg") == "5kg"
-    truth = board.read("truth")
-    state = ask(process.socket, "state")
-    assert state["load"] == "5kg"
-    want = world.sight(states(Q, WEIGHT, 0.0), np.array([state["slip"]]))
-    assert same(truth["target"], want.position[0])
-    assert same(state["target"], want.position[0])
-    assert state["sensor_wrench"] == truth["sensor_wrench"].tolist()
-    # while it moves, it is followed too
-    board.write("arm", q=Q + 0.5, moving=1.0)
-    moved = world.rest(states(Q + 0.5, WEIGHT, 0.0), np.array([state["slip"]])).flange[0]
-    wait_until(lambda: same(board.read("truth")["flange"], moved))
 
 
 def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):

@@ -72,19 +72,6 @@ def test_poses_follow_the_branch_of_the_point_before(tmp_path: Path, metric: boo
         on_branch(p, ARM, TOOL, None)
 
 
-def test_of_all_branches_the_nearest_is_taken(tmp_path: Path) -> None:
-    """From joint values from which Newton's method goes to another branch, or nowhere."""
-    rng = np.random.default_rng(3)
-    for q in rng.uniform(-2.0, 2.0, (6, 6)):
-        goal = poses(q[None])
-        near = q + rng.uniform(-1.0, 1.0, 6)
-        rows = np.hstack([goal[:, :3, 3], se3.rotation_vector(goal[:, :3, :3])])
-        text = "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad\n" + ",".join(f"{v:.15g}" for v in rows[0]) + "\n"
-        found = on_branch(read_points(written(tmp_path, text), ARM, LOADS), ARM, TOOL, near)
-        np.testing.assert_allclose(poses(found), goal, atol=1e-8)
-        assert np.linalg.norm(found[0] - near) <= np.linalg.norm(q - near) + 1e-6
-
-
 def test_tables_as_import_takes_them(tmp_path: Path) -> None:
     """Semicolons, decimal commas, columns of the exchange table, positions alone; a mapping."""
     goal = poses(Q)

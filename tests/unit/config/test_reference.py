@@ -13,11 +13,10 @@ from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
 from hilcal.present.text_config import page
 from hilcal.toml import Section, section_of
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.paths import ROOT
 
 TABLES = {t.name: t for t in tables(DRIVERS_OWN)}
-Capsys = pytest.CaptureFixture[str]
 
 
 def fields(section: type[Section], name: str) -> Iterator[tuple[str, str, FieldInfo]]:

@@ -89,7 +89,7 @@ def test_a_newer_version_is_refused_in_words(tmp_path: Path, capsys: pytest.Capt
     assert path.read_bytes() == before
 
 
-@pytest.mark.parametrize("command", ["info", "compare", "identify", "diagnose", "next", "export"])
+@pytest.mark.parametrize("command", ["info", "identify", "export"])
 def test_changed_readings_are_found_by_their_hash(
     command: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
@@ -106,10 +106,7 @@ def test_changed_readings_are_found_by_their_hash(
     db.close()
     with pytest.raises(InputError, match="the readings were changed after revision 1"):
         CampaignFile.open(path)
-    arguments = {
-        "next": ["-o", str(tmp_path / "plan.json")],
-        "export": ["--readings", str(tmp_path / "t.csv")],
-    }
+    arguments = {"export": ["--readings", str(tmp_path / "t.csv")]}
     with pytest.raises(SystemExit) as end:
         main([command, str(path), *arguments.get(command, [])])
     assert end.value.code == 2

@@ -12,9 +12,7 @@ from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from hilcal.types import Floats
-from tests.support.cli_cases import CELL, ok, rehearsal
-
-Capsys = pytest.CaptureFixture[str]
+from tests.support.cli_cases import CELL, Capsys, ok, rehearsal
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from hilcal.errors import DeviceError, InputError
 from hilcal.names import escaped
 from hilcal.readings.readings import Readings, States
-from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
@@ -137,18 +136,6 @@ def test_a_write_that_the_system_refuses_loses_nothing(tmp_path: Path) -> None:
     assert stored > 0
     with CampaignFile.open(path) as campaign:
         assert campaign.n_readings == len(RunLog(campaign).done()) == stored
-
-
-def test_files_of_the_first_version_open(tmp_path: Path) -> None:
-    path = tmp_path / "old.hilcal"
-    with CampaignFile.create(path, "{}", ".", "a table") as campaign:
-        campaign.append_readings(_reading(STEPS[0]))
-        for table in ("details", "events"):
-            campaign.connection.execute(f"DROP TABLE {table}")
-        campaign.connection.execute("PRAGMA user_version = 1")
-    with CampaignFile.open(path) as campaign:
-        assert campaign.n_readings == 1
-    assert schema.VERSION > 1
 
 
 names = st.text(min_size=1, max_size=6).filter(lambda name: escaped(name) == name)

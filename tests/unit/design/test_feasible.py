@@ -1,7 +1,5 @@
-"""Candidate poses: none ever breaks a limit, and what leaves nothing is named."""
+"""Candidate poses and motions: none ever breaks a limit, and what leaves nothing is named."""
 
-import re
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +10,10 @@ from hypothesis import strategies as st
 from hilcal.cell import cell_from_config, tracker_place
 from hilcal.config import CellConfig
 from hilcal.design.draw import draw
-from hilcal.design.feasible import PLANNED, REASONS, Space
+from hilcal.design.feasible import REASONS, Space
 from hilcal.errors import CannotAnswerError
-from hilcal.store.plan import UNLOADED
+from hilcal.measuring.dry_run import dry_run
+from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.space_cases import (
     TABLE,
     along,
@@ -257,18 +256,6 @@ def test_what_leaves_nothing_is_named(sections: dict[str, Any], message: str) ->
     assert "\n" not in str(raised.value)
 
 
-def test_bodies_that_touch_are_named_with_what_to_look_at() -> None:
-    c = cell()
-    space = Space(cell_from_config(c), c, replace(PLANNED, itself=3.0))
-    with pytest.raises(CannotAnswerError) as raised:
-        draw(space, 10, np.random.default_rng(0))
-    assert re.search(
-        r"0 do not touch themselves \(\w.* and \w.* touch in \d+ % of the others; look at \[tool\] "
-        r"target_m, load_point_m",
-        str(raised.value),
-    )
-
-
 def test_too_few_is_told_by_what_takes_most() -> None:
     sight = {"tracker_m": [3, 0, 0.5], "target_normal": [0, 0, 1], "incidence_max_rad": 0.05}
     with pytest.raises(CannotAnswerError, match=r"only \d+ poses, 5,000 are needed: .* turn the t"):
@@ -304,13 +291,60 @@ def test_where_the_tracker_stands() -> None:
     assert any("tracker's place is not known" in line for line in drawn_of(cell(), 5).remarks)
 
 
-def test_the_floor_of_a_plan_hides_no_tracker_below_it() -> None:
-    limits = {"workspace_min_m": [-2.0, -2.0, 0.1]}
-    config = cell(limits=limits, sight={"tracker_m": [2.5, 0.0, -0.5]})
-    assert len(drawn_of(config, 30).q) == 30
-
-
 def test_a_tripod_under_the_tracker_is_not_in_its_way() -> None:
     tripod = {"name": "tripod", "bottom_m": [2.5, 0.0, -1.0], "radius_m": 0.4, "height_m": 1.8}
     config = cell(obstacles=[TABLE, tripod], sight={"tracker_m": [2.5, 0.0, 0.8]})
     assert len(drawn_of(config, 30).q) == 30
+
+
+def plan_of(q: np.ndarray, *steps: tuple[str, str]) -> Plan:
+    names = ("reference", *(f"p{k}" for k in range(1, len(q))))
+    return Plan(names, q, tuple(Step(*step) for step in steps))
+
+
+def problems(config: CellConfig, *states: Any, load: str = UNLOADED) -> tuple[str, ...]:
+    plan = plan_of(np.array(states, dtype=float), ("p1", load))
+    return dry_run(cell_from_config(config), config, plan).problems
+
+
+HOME = (0.0, -1.2, 1.5, -1.5, -1.5, 0.0)
+
+
+def test_an_edited_plan_that_collides_is_refused_by_name() -> None:
+    config = cell(obstacles=[TABLE])
+    assert problems(config, HOME, (0.5, -1.0, 1.4, -1.2, -1.2, 0.3)) == ()
+    folded = problems(config, HOME, (0.0, -1.5, 3.0, -1.5, -1.5, 0.0))
+    told = "pose p1: upper arm and wrist 1 collide: they overlap by "
+    assert any(line.startswith(told) for line in folded), folded
+    low = problems(config, HOME, (0.0, 0.4, 0.3, -1.5, -1.5, 0.0))
+    assert any(line.startswith("pose p1: forearm and table collide") for line in low)
+    # what the ends do not show: over to the other side, through a post
+    post = {"name": "post", "bottom_m": [-0.8, -0.2, 0.0], "radius_m": 0.05, "height_m": 2.0}
+    config = cell(obstacles=[post])
+    between = problems(config, (0.8, *HOME[1:]), (-0.8, *HOME[1:]))
+    assert between
+    assert all(line.startswith("between reference and p1") for line in between)
+    assert any("and post collide: they overlap by" in line for line in between)
+
+
+def test_what_hangs_is_seen_by_the_dry_run() -> None:
+    limits = {"workspace_min_m": [-3.0, -3.0, 0.0]}
+    config = cell(obstacles=[TABLE], limits=limits)
+    up = (0.0, -1.2, 1.5, -1.9, 1.57, 0.0)  # the load point above the wrist
+    assert problems(config, HOME, up) == ()
+    found = problems(config, HOME, up, load="5kg")
+    assert any("wrist 3 and what hangs (5kg) collide" in line for line in found), found
+    long = [{"name": "5kg", "mass_kg": 5.0, "hang_m": 1.5}]
+    found = problems(cell(limits=limits, loads=long), HOME, HOME, load="5kg")
+    assert any("what hangs (5kg) is" in line and "outside the workspace" in line for line in found)
+
+
+def test_what_the_tracker_would_not_see_is_seen_by_the_dry_run() -> None:
+    sight = {"tracker_m": [3.0, 0.0, 0.6]}
+    config = cell(sight=sight)
+    away = (np.pi, *HOME[1:])  # the tool on the tracker's side
+    assert problems(config, away, away) == ()
+    behind = problems(config, away, HOME)
+    assert any("pose p1: " in line and "between tracker and target" in line for line in behind)
+    config = cell(sight=sight | {"target_normal": [0.0, 0.0, 1.0], "incidence_max_rad": 0.3})
+    assert any("incidence_max_rad is 0.3" in line for line in problems(config, away, away))

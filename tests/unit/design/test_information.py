@@ -1,14 +1,10 @@
 """What a plan predicts is what identification then states, and what the parameters scatter by."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.cell import tracker_place
-from hilcal.config import CellConfig
 from hilcal.design.information import problem
 from hilcal.design.noise_model import reading_covariance
 from hilcal.design.nominal_model import after, nominal_model, nominal_states
@@ -19,7 +15,6 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.measuring.average import average
 from hilcal.measuring.devices import TrackerSample
-from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from tests.support.arm_cases import ARMS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import (
@@ -189,45 +184,6 @@ def test_averaging_leaves_the_systematic_share(m):
     mine = reading_covariance(a, config, prediction)[0]
     size = np.sqrt(np.outer(np.diag(mine), np.diag(mine)))
     assert np.max(np.abs(np.mean(stated, axis=0) - mine) / size) < 0.02
-
-
-def test_the_tracker_stands_where_the_configuration_says():
-    config = config_of()
-    cell = cell_of()
-    assert tracker_place(cell, config) is None
-    assert any("tracker_m" in note for note in nominal_model(cell, config).notes)
-    there = config.model_copy(
-        update={"sight": config.sight.model_copy(update={"tracker_m": (0.5, -3.0, 1.0)})}
-    )
-    a = nominal_model(cell, there)
-    assert a.notes == ()
-    o = a.model.predict(nominal_states(poses_of(4), np.zeros((4, 6))), a.theta).observation
-    noise = tracker_noise(config.tracker)
-    still = there.model_copy(
-        update={"repeatability": there.repeatability.model_copy(update={"joint_std_rad": 0.0})}
-    )
-    prediction = a.model.predict(nominal_states(poses_of(4), np.zeros((4, 6))), a.theta)
-    expected = tracker_covariance(o.base_position, noise, (0.5, -3.0, 1.0))
-    assert reading_covariance(a, still, prediction) == pytest.approx(expected, rel=1e-12)
-    # In base axes the beam starts at the station; readings do not turn.
-    based = CellConfig.model_validate(
-        {"robot": {"model": "ur10e"}, "tracker": {"frame": "base", "station_m": [2.0, 2.0, 0.0]}}
-    )
-    known = cell_of(registration_known=True)
-    assert tracker_place(known, based) == pytest.approx([2.0, 2.0, 0.0])
-    r = known.registration
-    assert r[:3, :3] @ tracker_place(known, config) + r[:3, 3] == pytest.approx(np.zeros(3))
-
-
-def test_what_is_assumed_of_the_compliances_matters_little():
-    config = config_of("deflection", model=("joint_compliance", "joint_tilt_compliance"))
-    cell, q = cell_of(registration_known=True), poses_of(15)
-    a = nominal_model(cell, config)
-    stds = []
-    for factor in (0.3, 1.5):
-        p = problem(replace(a, theta=factor * a.theta), config, q)
-        stds.append(predicted(p, everything_once(p)).std)
-    assert stds[0] == pytest.approx(stds[1], rel=0.03)
 
 
 def test_units_are_what_may_be_taken():

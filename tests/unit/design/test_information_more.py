@@ -1,12 +1,9 @@
 """Potential terms, where the robot will work, and telling effects apart."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from scipy.stats import chi2
 
-from hilcal.design.discriminated_pairs import LEVEL, discriminated_pairs, power
+from hilcal.design.discriminated_pairs import discriminated_pairs
 from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model, nominal_states
 from hilcal.design.potential import MOST_ORDINARY, MOST_PARAMETERS
@@ -151,31 +148,6 @@ def test_named_work_and_a_box():
     away = config_of("absolute", work_min_m=(5.0, 5.0, 5.0), work_max_m=(6.0, 6.0, 6.0))
     with pytest.raises(CannotAnswerError, match="widen the box"):
         prediction_poses(a, away, q, lambda x: x[:, 0] > 0.1)
-
-
-def test_power_is_the_share_of_campaigns_that_find_the_effect():
-    """Whitened campaigns with the effect in them, tested against model and rival."""
-    p = made(against=("joint_tilt_compliance", "joint_stiffening"), poses=8)
-    counts = everything_once(p)
-    of = discriminated_pairs(p)
-    assert set(of.names) == {
-        ("joint_tilt_compliance", "joint_stiffening"),
-        ("joint_stiffening", "joint_tilt_compliance"),
-    }
-    m = of.prior + p.units.information(counts)
-    rows = p.units.rows[counts > 0].reshape(-1, len(p.terms))
-    rng = np.random.default_rng(1)
-    for strong in (of.pairs[0], of.pairs[-1]):
-        u = strong.residual(m)
-        pair = replace(strong, beta=strong.beta * np.sqrt(9.0 / (u @ m @ u)))
-        nuisance, effect = rows[:, pair.nuisance], rows[:, pair.effect]
-        fitted = np.linalg.qr(nuisance)[0]
-        both = np.linalg.qr(np.hstack([nuisance, effect]))[0]
-        y = effect @ pair.beta + rng.standard_normal((3000, len(rows)))
-        gain = np.sum((y @ both) ** 2, axis=1) - np.sum((y @ fitted) ** 2, axis=1)
-        found = np.mean(gain > chi2.isf(LEVEL, len(pair.effect)))
-        assert 0.05 < found < 0.95  # else the test could not fail
-        assert power(pair, m) == pytest.approx(found, abs=0.04)
 
 
 def test_given_strengths_and_wrong_suspects():

@@ -173,26 +173,6 @@ def test_pairs_that_no_measurement_separates_are_said_so() -> None:
     )
 
 
-def test_a_pair_that_looks_the_same_everywhere_is_left_out() -> None:
-    """Two families with the same columns: neither can be told, whatever is measured."""
-    first = doubtful(TILT, 1)
-    config = config_of("deflection", against=(TILT, LINK))
-    of = problem(after(first.fit, config), config, poses_of(6))
-    rows, measured, prior = of.units.rows.copy(), of.measured.copy(), of.prior.copy()
-    a, b = of.of_effect(TILT), of.of_effect(LINK)[: len(of.of_effect(TILT))]
-    n = min(len(a), len(b))
-    rows[:, :, of.of_effect(LINK)] = 0.0
-    rows[:, :, a] = 0.0
-    rows[:, :, a[:n]] = rows[:, :, b[:n]] = of.units.rows[:, :, a[:n]]
-    for matrix in (measured, prior):
-        size = of.model_size
-        matrix[size:] = 0.0
-        matrix[:, size:] = 0.0
-    alike = replace(of, units=replace(of.units, rows=rows), measured=measured, prior=prior)
-    with pytest.raises(CannotAnswerError, match=f"in this cell separates {TILT} from {LINK}"):
-        discriminated_pairs(alike, fitted={})
-
-
 @pytest.mark.parametrize("suspects", [(TILT,), (TILT, TILT)])
 def test_one_suspect_is_refused(suspects: tuple[str, ...]) -> None:
     first = doubtful(TILT, 1)

@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.design.barrier import Program
 from hilcal.design.compound_criteria import CompoundDeterminant, CompoundVariance
 from hilcal.design.criteria import A, D, MeanVariance
-from hilcal.design.criterion import Criterion, require_determined, soft_least
+from hilcal.design.criterion import Criterion, require_determined
 from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError
@@ -54,7 +53,6 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
     "compound variance": compound_variance,
     "compound determinant": lambda: CompoundDeterminant(4),
 }
-CONCAVE = [name for name in CRITERIA if name != "K"]
 seeds = st.integers(0, 10**6)
 every = pytest.mark.parametrize("name", CRITERIA)
 
@@ -63,28 +61,6 @@ def information(rng: np.random.Generator, rows: int = 12) -> Floats:
     """A regular information matrix of parameters of different size."""
     a = rng.normal(size=(rows, P)) * np.exp(rng.uniform(-1, 1, P))
     return np.asarray(a.T @ a)
-
-
-def direction(rng: np.random.Generator) -> Floats:
-    d = rng.normal(size=(P, P))
-    return d + d.T
-
-
-def central(f: Callable[[float], float], h: float) -> float:
-    return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h)
-
-
-@pytest.mark.parametrize("name", [n for n in CRITERIA if not CRITERIA[n]().kinked])
-def test_the_bound_of_a_smooth_criterion_is_its_tangent(name: str) -> None:
-    criterion = CRITERIA[name]()
-    for seed in range(5):
-        rng = np.random.default_rng(seed)
-        m, d = information(rng), direction(rng)
-        slope = central(lambda h, m=m, d=d: float(criterion.value(m + h * d)), 1e-3 / 20)  # type: ignore[misc]
-        here = criterion.surrogate(m, 0.1)(m)
-        assert here is not None
-        g = here.above
-        assert np.sum(g * d) == pytest.approx(slope, rel=1e-6, abs=1e-8 * np.abs(g).sum())
 
 
 def test_compound_criteria_are_means_of_both_efficiencies() -> None:
@@ -96,66 +72,6 @@ def test_compound_criteria_are_means_of_both_efficiencies() -> None:
     q = 0.7 * np.trace(c @ np.linalg.inv(m))
     q += 1.9 * np.trace(c[:4, :4] @ np.linalg.inv(m[:4, :4]))
     assert float(both.value(m)) == pytest.approx(1 / q)
-
-
-@every
-@pytest.mark.parametrize("order", [0.5, 0.02])
-def test_surrogate_has_the_derivatives_it_says(name: str, order: float) -> None:
-    """Its gradient and its curvature in the weights of units, which are of one or more rows."""
-    criterion = CRITERIA[name]()
-    rng = np.random.default_rng(1)
-    m = information(rng)
-    f = criterion.surrogate(m, order)
-    here = f(m)
-    assert here is not None
-    for size in (1, 3):  # by rows, and by matrices
-        rows = rng.normal(size=(4, size, P)) * 0.3
-        program = Program(criterion, rows, np.ones(4), 1.0, np.inf, np.zeros((P, P)))
-        second = program.curvature(here)
-        units = np.matmul(rows.transpose(0, 2, 1), rows)
-        assert np.linalg.eigvalsh(second)[0] > -1e-9 * np.abs(second).max() or name == "K"
-
-        def value(h: float, k: int, units: Floats = units) -> float:
-            there = f(m + h * units[k])
-            assert there is not None
-            return there.value
-
-        def slope(h: float, k: int, n: int, units: Floats = units) -> float:
-            there = f(m + h * units[k])
-            assert there is not None
-            return float(np.sum(there.gradient * units[n]))
-
-        for k in range(4):
-            first = central(lambda h, k=k: value(h, k), 1e-4)  # type: ignore[misc]
-            assert slope(0.0, k, k) == pytest.approx(first, rel=1e-6, abs=1e-9)
-            for n in range(4):
-                bend = central(lambda h, k=k, n=n: slope(h, k, n), 1e-4)  # type: ignore[misc]
-                assert -second[k, n] == pytest.approx(
-                    bend, rel=1e-5, abs=1e-6 * np.abs(second).max()
-                )
-
-
-@pytest.mark.parametrize("name", CRITERIA)
-@given(seeds, st.floats(0.01, 100.0))
-def test_homogeneous(name: str, seed: int, factor: float) -> None:
-    criterion = CRITERIA[name]()
-    m = information(np.random.default_rng(seed))
-    power = 0 if name == "K" else 1
-    expected = factor**power * float(criterion.value(m))
-    assert float(criterion.value(factor * m)) == pytest.approx(expected, rel=1e-7)
-
-
-@pytest.mark.parametrize("name", CRITERIA)
-@given(seeds, st.floats(0.0, 1.0))
-def test_concave(name: str, seed: int, share: float) -> None:
-    """Between two matrices at least the mean of the two; of K at least the less."""
-    criterion = CRITERIA[name]()
-    rng = np.random.default_rng(seed)
-    m, n = information(rng), information(rng, 7)
-    a, b = float(criterion.value(m)), float(criterion.value(n))
-    mixed = float(criterion.value(share * m + (1 - share) * n))
-    least = min(a, b) if name == "K" else share * a + (1 - share) * b
-    assert mixed >= least * (1 - 1e-9)
 
 
 @pytest.mark.parametrize("name", CRITERIA)
@@ -175,21 +91,6 @@ def test_bound_holds_for_any_information(name: str, seed: int, order: float) -> 
         assert float(criterion.value(n)) <= bound * (1 + 1e-9)
     if name in ("D", "A", "I"):  # exact at M itself
         assert np.sum(s.above * m) == pytest.approx(float(criterion.value(m)), rel=1e-9)
-
-
-@pytest.mark.parametrize("name", ["E", "K", "separate"])
-def test_bound_of_a_kink_closes_with_the_order(name: str) -> None:
-    criterion = CRITERIA[name]()
-    m = information(np.random.default_rng(3))
-    value = float(criterion.value(m))
-    excess = []
-    for order in (1e-1, 1e-3, 1e-5):
-        s = criterion.surrogate(m, order)(m)
-        assert s is not None
-        bound = np.sum(s.above * m) / (1.0 if s.below is None else np.sum(s.below * m))
-        excess.append(bound / value - 1)
-    assert 0 <= excess[2] < 2 * P * 1e-5
-    assert excess[0] > 10 * excess[1] > 100 * excess[2] >= 0
 
 
 @every
@@ -247,18 +148,6 @@ def test_separation_is_what_a_fit_leaves(twice: bool) -> None:
     for pair, expected in zip(criterion.pairs, left, strict=True):
         u = pair.residual(a.T @ a)
         assert np.sum((a @ u) ** 2) == pytest.approx(expected, rel=1e-8)
-
-
-@given(st.lists(st.floats(0.0, 10.0), min_size=1, max_size=8), st.floats(1e-6, 1.0))
-def test_soft_least(numbers: list[float], width: float) -> None:
-    s = np.array(numbers)
-    value, p = soft_least(s, width)
-    assert p.sum() == pytest.approx(1.0)
-    assert (p > 0).all()
-    assert s.min() - 1e-9 <= p @ s <= s.min() + (len(s) - 1) * width * (1 + 1e-6) + 1e-9
-    # p solves p_i (s_i − t) = μ for one t
-    assert np.ptp(s - width / p) == pytest.approx(0.0, abs=1e-6 * (1 + s.max()))
-    assert value <= s.min() + len(s) * width * (1 + np.log(len(s)) + np.log1p(s.max() / width))
 
 
 def test_says_which_parameters_nothing_determines() -> None:

@@ -15,11 +15,10 @@ from hilcal.design.compound_criteria import CompoundDeterminant, CompoundVarianc
 from hilcal.design.criteria import A, D, MeanVariance
 from hilcal.design.criterion import Criterion
 from hilcal.design.eigenvalue_criteria import E, K
-from hilcal.design.exact_design import exact
 from hilcal.design.optimum import best
 from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 
 def compound_variance() -> CompoundVariance:
@@ -130,13 +129,6 @@ def test_known_optima(criterion: Criterion, degree: int, expected: dict[float, f
     assert found.value * (1 - 1e-9) <= found.bound <= found.value * (1 + 1e-6)
 
 
-def test_condition_of_a_straight_line() -> None:
-    """Two readings far apart and none else: the condition number of {1, x} on [−1, 1] is 1."""
-    found = relax(polynomial(1, GRID), K(), 10.0)
-    assert found.value == pytest.approx(1.0, abs=1e-3)
-    assert 1.0 - 1e-9 <= found.bound <= 1.0 + 2e-3
-
-
 @every
 def test_small_problems_against_all_shares(name: str) -> None:
     """Four units of three parameters: all shares in steps of 1/16, with a prior and without."""
@@ -233,32 +225,6 @@ def test_tiny_plans_against_all_plans(name: str) -> None:
     assert np.median(shares) > 1 - 1e-9
 
 
-def multiplicative(units: CandidateSet, rounds: int) -> float:
-    """det^(1/P) of the D-optimal shares by the multiplicative algorithm alone (Titterington)."""
-    w = np.full(len(units), 1 / len(units))
-    for _ in range(rounds):
-        inverse = np.linalg.inv(units.information(w))
-        leverage = np.sum((units.rows @ inverse) * units.rows, axis=(1, 2))
-        w *= leverage / units.size
-    return float(np.linalg.slogdet(units.information(w))[1])
-
-
-def test_peer_problem_against_another_algorithm() -> None:
-    """300 poses, 24 parameters."""
-    rng = np.random.default_rng(6)
-    units = CandidateSet(rng.normal(size=(300, 3, 24)) * np.exp(rng.normal(size=24)), np.ones(300))
-    found = relax(units, D(), 1.0)
-    reference = np.exp(multiplicative(units, 400) / 24)
-    assert found.value >= reference * (1 - 1e-6)
-    assert found.bound >= reference
-    assert found.gap <= 1e-6
-    # the equivalence theorem, by itself: no unit's leverage exceeds the number of parameters
-    inverse = np.linalg.inv(units.information(found.weight, found.index))
-    leverage = np.einsum("krp,pq,krq->k", units.rows, inverse, units.rows)
-    assert leverage.max() <= 24 * (1 + 1e-5)
-    assert len(found.index) < 300
-
-
 @pytest.mark.parametrize("most", [None, 1])
 def test_many_units(most: int | None) -> None:
     """Columns are generated until the equivalence theorem holds for all units."""
@@ -275,22 +241,6 @@ def test_many_units(most: int | None) -> None:
         assert found.value * top / 8 <= found.value * (1 + 1e-5)
 
 
-def test_a_cap_tightens_the_bound() -> None:
-    units = random_units(4, 30)
-    free = relax(units, D(), 20.0)
-    once = relax(units, D(), 20.0, most=1)
-    assert free.weight.max() > 1.5
-    assert once.bound < 0.99 * free.bound
-    for most in (1, 2, 3):
-        assert relax(units, D(), 20.0, most=most).gap <= 1e-6
-    assert relax(units, D(), 30.0, most=1).value == pytest.approx(
-        float(D().value(units.information(np.ones(30))))
-    )
-    more = best(units, D(), 99.0, None, np.random.default_rng(0), most=1)
-    assert (more.counts == 1).all()
-    assert more.efficiency == 1.0
-
-
 def test_the_plan_depends_on_the_generator_alone() -> None:
     units = random_units(5, 300, 6)
     one, two = (best(units, D(), 9.0, None, np.random.default_rng(3)).counts for _ in range(2))
@@ -305,47 +255,6 @@ def test_scale_of_a_parameter_does_not_matter_to_d() -> None:
     two = best(scaled, D(), 12.0, None, np.random.default_rng(3), tolerance=1e-7)
     assert two.efficiency == pytest.approx(one.efficiency, abs=0.01)
     assert two.bound == pytest.approx(one.bound * np.prod(factor) ** (2 / 6), rel=1e-5)
-
-
-def test_units_that_are_always_in() -> None:
-    """What is measured already enters through the prior; the rest makes up for what it lacks."""
-    points = np.array([-1.0, 0.0, 1.0])
-    units = polynomial(2, points)
-    fixed = units.information(np.array([4.0, 4.0, 0.0]))
-    design = best(units, D(), 4.0, fixed, np.random.default_rng(0), tolerance=1e-7)
-    np.testing.assert_array_equal(design.counts, [0, 0, 4])
-    assert design.efficiency == pytest.approx(1.0, abs=1e-5)
-
-
-def test_dear_units_are_taken_where_they_are_worth_it() -> None:
-    """A unit of two rows that costs as much as both is as good as they are; at more it is not."""
-    rows = np.zeros((3, 2, 2))
-    rows[0, 0, 0] = rows[1, 0, 1] = rows[2, 0, 0] = rows[2, 1, 1] = 1.0
-    for price, expected in ((1.5, [0, 0, 4]), (2.5, [3, 3, 0])):
-        units = CandidateSet(rows, np.array([1.0, 1.0, price]))
-        design = best(units, D(), 6.0, None, np.random.default_rng(0), tolerance=1e-7)
-        np.testing.assert_array_equal(design.counts, expected)
-        assert design.efficiency == pytest.approx(1.0, abs=1e-5)
-
-
-def test_exchange_improves_on_rounding() -> None:
-    gained = []
-    for seed in range(6):
-        units = random_units(seed, 500, 10)
-        relaxed = relax(units, D(), 13.0)
-
-        def value(counts: Ints, units: CandidateSet = units) -> float:
-            assert counts.sum() == 13
-            return float(D().value(units.information(counts.astype(float))))
-
-        rng = np.random.default_rng(seed)
-        rough = value(exact(units, D(), 13.0, None, relaxed, rng, effort=0))
-        fine = value(exact(units, D(), 13.0, None, relaxed, rng, effort=500))
-        drawn = [value(np.bincount(rng.choice(500, 13), minlength=500)) for _ in range(50)]
-        assert max(drawn) < 0.8 * rough
-        assert rough <= fine <= relaxed.bound
-        gained.append(fine / rough - 1)
-    assert max(gained) > 0.01
 
 
 def test_budget_too_small_for_the_parameters() -> None:

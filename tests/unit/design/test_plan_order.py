@@ -130,14 +130,6 @@ def test_the_same_seed_gives_the_same_order_and_another_one_another() -> None:
     assert made[0] == made[1] != made[2]
 
 
-def test_repeats_make_second_unloaded_cycles() -> None:
-    world = World(6, 0.0, 1)
-    plan = world.ordered(everything(world), 0, Ordering(repeats=4)).plan
-    again = [s for s in plan.steps if s.cycle == 1 and s.pose != REFERENCE]
-    assert len(again) == 4
-    assert {s.load for s in again} == {UNLOADED}
-
-
 def test_absolute_readings_of_a_pose_share_no_more_than_they_must() -> None:
     world = World(3, 0.0, 1)
     chosen = [Chosen("p0", (UNLOADED,), 2), Chosen("p0", (LOADS[0],), 2), Chosen("p1", (LOADS[1],))]

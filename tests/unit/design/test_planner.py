@@ -1,7 +1,6 @@
 """From a cell to a plan: what it promises, what it keeps, and what it refuses."""
 
 import csv
-import json
 import sys
 from collections import Counter
 from functools import cache
@@ -24,9 +23,8 @@ from hilcal.readings.covariance import WHOLE
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned, refused, rehearsal, run
 
-Capsys = pytest.CaptureFixture[str]
 SMALL = {"candidates": 60, "against": ("joint_tilt_compliance",)}
 
 
@@ -211,17 +209,6 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys
     assert "More would give, predicted for the deflection: 30 poses ±" in words
 
 
-def test_an_edited_plan_is_checked(tmp_path: Path, capsys: Capsys) -> None:
-    cell, plan = cell_file(tmp_path, small()), tmp_path / "plan.json"
-    ok(capsys, "plan", cell, "-o", plan, "--poses", "3", "--quick")
-    document = json.loads(plan.read_text(encoding="utf-8"))
-    document["poses"][1]["q_rad"][1] = 0.6  # through the table
-    plan.write_text(json.dumps(document), encoding="utf-8")
-    config = small()
-    problems = dry_run(cell_from_config(config), config, load_plan(plan)).problems
-    assert any(document["poses"][1]["name"] in line for line in problems)
-
-
 def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     r = rehearsal("nothing")
     table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
@@ -242,31 +229,6 @@ def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "words"),
-    [
-        ({"tool": {"mass_kg": 14.0}}, "0 keep the payload ([tool] mass_kg"),
-        ({"limits": {"workspace_min_m": (1.0, 1.0, 1.0)}}, "workspace_min_m"),
-        (
-            {"sight": {"tracker_m": (3.0, 0, 1), "target_normal": (0, 0, 1.0),
-                       "incidence_max_rad": 1e-4}},
-            "incidence_max_rad",
-        ),
-    ],
-)  # fmt: skip
-def test_a_cell_that_leaves_nothing_says_which_limit_it_is(
-    changed: dict[str, dict[str, object]], words: str, tmp_path: Path, capsys: Capsys
-) -> None:
-    config = small()
-    sections = {
-        name: getattr(config, name).model_copy(update=keys) for name, keys in changed.items()
-    }
-    cell = cell_file(tmp_path, config.model_copy(update=sections))
-    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json")
-    assert words in line
-    assert not (tmp_path / "p.json").exists()
-
-
-@pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("--criterion", "best"), "valid: D, A, E, K, I, separate"),
@@ -280,14 +242,6 @@ def test_numbers_and_names_that_cannot_be(
 ) -> None:
     cell = cell_file(tmp_path, small())
     assert words in refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *arguments)
-
-
-def test_loads_that_are_all_too_heavy_are_named(tmp_path: Path, capsys: Capsys) -> None:
-    config = small()
-    heavy = tuple(load.model_copy(update={"mass_kg": 20.0}) for load in config.loads[:2])
-    cell = cell_file(tmp_path, config.model_copy(update={"loads": heavy}))
-    line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json")
-    assert 'load "5kg": tool and load are 20.8 kg; the payload of ur10e is 12.5 kg' in line
 
 
 def test_too_few_readings_say_so(tmp_path: Path, capsys: Capsys) -> None:

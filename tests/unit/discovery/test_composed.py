@@ -12,7 +12,6 @@ from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.composed import Composed, composed
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.grammar import Grammar, grammar
 from hilcal.discovery.law import Form, Part
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen
@@ -107,38 +106,6 @@ def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read() ->
     assert np.allclose(eval(u.code, {"s": s, "np": np}), wanted, rtol=1e-12)
 
 
-def test_a_composed_quantity_needs_the_columns_of_all_its_quantities() -> None:
-    known = named(example())
-    warm = next(v for v in known.values() if v.names == ("air temperature",))
-    time = next(v for v in known.values() if v.names == ("time",))
-    terms = ((1.0, product(Factor(warm, shapes.LINEAR), Factor(time, shapes.LINEAR))),)
-    bent = product(Factor(composed(terms), shapes.ABOVE, (1.0,)))
-    assert bent.needs == ("air_temperature", "time")
-
-
-def words() -> Grammar:
-    s = example()
-    return grammar([v for v in variables(s) if v.kind in ("angle", "torque")], s, 14)
-
-
-def test_composed_functions_pay_more_the_more_there_are_of_them() -> None:
-    made = words()
-    known = {v.symbol: v for v in made.known}
-    one = product(waved(known["q_5"]))
-    two = product(waved(known["q_5"]), waved(known["q_6"]))
-
-    def price(inner: Amplitude, shape: Shape = shapes.ABOVE) -> float:
-        u = composed(((1.0, inner),))
-        return made.price_of(product(Factor(u, shape, (0.1, 1.0))), 30)
-
-    assert price(one) < price(two)
-    assert price(one, shapes.ABOVE_POWER) == pytest.approx(price(one) + np.log(2.0))
-    # All of them, at every site, were to choose from.
-    count = np.bincount(made.cost[made.smooth])
-    more = np.log(count[2] / count[1]) + np.log(2.0)
-    assert price(two) - price(one) == pytest.approx(more)
-
-
 @cache
 def campaign() -> tuple[Fit, Floats]:
     """Deflections with a joint that gives way where two quantities together pass a level."""
@@ -151,22 +118,6 @@ def campaign() -> tuple[Fit, Floats]:
     moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
     readings = replace(readings, value=readings.value + moved)
     return fit(baseline(cell, readings, "deflection"), readings, "deflection"), moved
-
-
-def test_bends_are_screened_as_their_columns_themselves_say() -> None:
-    at = screen(linearise(campaign()[0]))
-    all_ = at.bends
-    some = [c for c in range(0, len(all_.argument), len(all_.argument) // 40) if all_.square[2, c]]
-    assert {all_.shape[c].name for c in some} >= {"above", "below"}
-    for c in some:
-        u = composed(((1.0, at.grammar.at(int(all_.argument[c]))),))
-        k = at.grammar.index(product(Factor(u, all_.shape[c], all_.numbers[c])))
-        assert k is not None
-        x = at.columns([(2, k), (2, at.one)])
-        wanted = at.linear.information(x)
-        assert all_.square[2, c] == pytest.approx(wanted[0, 0], rel=1e-3)
-        size = np.sqrt(wanted[0, 0] * wanted[1, 1])
-        assert all_.across_one[2, c] == pytest.approx(wanted[0, 1], abs=1e-3 * size)
 
 
 @cache

@@ -1,16 +1,12 @@
 """Products one of whose factors has a free zero, as (T − T0)·d: screened as pairs of columns."""
 
-from dataclasses import replace
-
 import numpy as np
 
-from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude
 from hilcal.discovery.problem import Problem
 from hilcal.discovery.screen import Screen
-from hilcal.discovery.search import _preference, _simplicity, search
-from hilcal.discovery.terms import Scored, Term
-from hilcal.regression.evidence import FamilyScore
+from hilcal.discovery.search import search
+from hilcal.discovery.terms import Term
 from tests.unit.discovery.test_discover import screened
 
 
@@ -39,16 +35,6 @@ def test_a_product_knows_what_is_left_without_either_factor() -> None:
         assert words.at(without_second) == Amplitude((first,))
     single = words.amplitudes.index(Amplitude((words.singles[0],)))
     assert words.less[:, single].tolist() == [-1, -1]
-
-
-def test_products_with_their_factors_alone_are_those_of_their_columns() -> None:
-    s = screened()
-    for place, f in products(s, 20):
-        for k, less in enumerate(s.grammar.less[:, f].tolist()):
-            x = s.columns([(place, f), (place, less)])
-            own = s.linear.information(x)
-            size = np.sqrt(own[0, 0] * own[1, 1])
-            assert abs(s.across_less[k, place, f] - own[0, 1]) < 1e-3 * size
 
 
 def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
@@ -80,44 +66,3 @@ def _nearly_alike(s: Screen) -> tuple[int, int, int, np.ndarray]:
                 between = unit[:, 0] - np.sign(cosine) * unit[:, 1]
                 return place, f, less, between / np.linalg.norm(between)
     raise AssertionError("no such pair")
-
-
-def test_a_free_zero_is_as_simple_as_an_exponent_off_the_grid() -> None:
-    s = screened()
-    words = s.grammar
-    root = next(f for f in words.singles if f.shape is shapes.ODD and f.numbers[0] == 0.5)
-    other = next(
-        f for f in words.singles if f.shape is shapes.LINEAR and f.variable is not root.variable
-    )
-    off_grid = replace(root, numbers=(0.7, *root.numbers[1:]))
-    product, tuned, alone = (
-        words.index(Amplitude(factors)) for factors in ((root, other), (off_grid, other), (other,))
-    )
-    assert product is not None
-    assert tuned is not None
-    assert alone is not None
-
-    def simple(*amplitudes: int) -> float:
-        return _simplicity(s, Term(tuple((0, k) for k in amplitudes), 0.0))[0]
-
-    assert simple(product) < simple(product, alone) == simple(tuned)
-
-
-def test_of_equally_simple_terms_the_likelier_is_taken_whatever_its_functions() -> None:
-    s = screened()
-    by = {f.shape.name: f for f in s.grammar.singles if f.variable.names == ("joint 3 torque",)}
-    plus, minus = (s.grammar.index(Amplitude((by[name],))) for name in ("plus", "minus"))
-    assert plus is not None
-    assert minus is not None
-    assert by["plus"].shape.rank < by["minus"].shape.rank
-    likely, less = (
-        _scored(Term(((2, k),), 0.0), odds) for k, odds in ((minus, 12.0), (plus, 10.0))
-    )
-    same = _scored(Term(((2, plus),), 0.0), 12.0)
-    assert _preference(s, likely) < _preference(s, less)
-    assert _preference(s, same) < _preference(s, likely)
-
-
-def _scored(t: Term, odds: float) -> Scored:
-    score = FamilyScore(1.0, odds, 0.0, 0.0, 1, 0.0, 0.0, 0.0, np.zeros(1), None, 0.0)
-    return Scored(t, score)

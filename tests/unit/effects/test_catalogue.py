@@ -41,14 +41,13 @@ class Sag(Effect):
 
 
 def test_no_module_outside_of_the_effects_asks_for_one_by_its_name() -> None:
-    root = Path(hilcal.__file__).parent
+    root, names = Path(hilcal.__file__).parent, {*NAMES} - OF_THE_CELL
     found = [
         f"{path.relative_to(root)}:{node.lineno}: {node.value}"
         for path in sorted(root.rglob("*.py"))
         if path.parent.name not in ("effects", CONFIGURATION)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Constant)
-        and str(node.value).split(".")[0] in {*NAMES} - OF_THE_CELL
+        if isinstance(node, ast.Constant) and str(node.value).split(".")[0] in names
     ]
     assert not found
 

@@ -95,28 +95,6 @@ def test_each_effect_alone(name):
     assert_slope(model, states, theta, 6)
 
 
-@pytest.mark.parametrize("form", ["common", "each"])
-def test_a_joint_that_creeps_shows_more_of_its_compliance(form):
-    """With a creep of the size of the elastic twist, which no neglect could hide."""
-    cell = CELLS["odd"]
-    states = some_states(cell, 4)
-    joints, creep = (make("joint_compliance", cell, states),
-                     make("creep", cell, states, {"form": form}))  # fmt: skip
-    model = Model(cell, (creep, joints))
-    rng = np.random.default_rng(8)
-    k = rng.uniform(0.3, 1.0, len(creep.parameters))
-    c = 1e-4 * rng.uniform(0.5, 1.0, cell.arm.n) * [p.scale for p in joints.parameters]
-    assert_slope(model, states, np.concatenate([k, c]), 3)
-    plain = Model(cell, (joints,))
-    alone = plain.jacobian(plain.predict(states, c), c, 3)
-    whole = model.jacobian(model.predict(states, np.concatenate([k, c])), np.append(k, c), 3)
-    more = 1 + k * np.log10(1 + states.load_time)[:, None]  # (N, 1) or (N, n)
-    expected = alone * np.broadcast_to(more, (len(states), cell.arm.n))[:, None, :]
-    np.testing.assert_allclose(
-        whole[:, :, len(k) :], expected, rtol=0, atol=1e-3 * np.abs(expected).max()
-    )
-
-
 class Coupled(JointCompliance):
     """dq_j = c_j τ_{j+1}: each joint yields to the torque of the next; the first to the last's."""
 

@@ -139,58 +139,6 @@ def rigid_position(cell: Cell, states: States) -> np.ndarray:
     return Model(cell, ()).predict(states, np.zeros(0)).observation.position
 
 
-def test_a_tilt_turns_across_the_joint_axis_by_the_moment_there():
-    cell = CELLS["odd"]
-    s = situation(cell)
-    effect = make("joint_tilt_compliance", cell, s.states)
-    k = 1e-6 * np.arange(1, cell.arm.n + 1)
-    twist = effect.deviation(k, s).twist
-    axis = np.swapaxes(s.chain.rotation[:-1, :, :, 2], 0, 1)
-    in_slots = np.moveaxis(s.chain.rotation[:-1], 0, 1)
-    turn = np.einsum("njab,njb->nja", in_slots, twist[:, :-1, 3:])
-    moment = np.einsum("njab,njb->nja", in_slots, s.wrench[:, :-1, 3:])
-    across = moment - axis * np.sum(axis * moment, axis=2, keepdims=True)
-    np.testing.assert_allclose(turn, k[:, None] * across, rtol=0, atol=1e-15)
-    assert np.all(twist[:, :, :3] == 0)
-    assert np.all(twist[:, -1] == 0)
-
-
-@pytest.mark.parametrize("arm", CELLS)
-def test_base_compliance_turns_the_arm_about_the_base_origin(arm):
-    """To first order the target moves by (B t_0) × x, with t_0 the moment about the origin."""
-    cell = CELLS[arm]
-    states = some_states(cell)
-    model = Model(cell, (make("base_compliance", cell, states),))
-    rigid = model.predict(states, np.zeros(3))
-    b = 1e-9 * np.array([3.0, 1.0, 2.0])
-    bent = model.predict(states, b)
-    chain, arm_ = rigid.situation.chain, cell.arm
-    weight = cell.gravity
-    moment = states.wrench[:, 3:] + np.cross(chain.point(cell.load_point), states.wrench[:, :3])
-    moment = moment + np.cross(chain.point(cell.tool_com), cell.tool_mass * weight)
-    for mass, com in zip(arm_.masses, chain.com, strict=True):
-        moment = moment + np.cross(com, mass * weight)
-    turn = b * moment
-    expected = np.cross(turn, rigid.observation.base_position)
-    moved = bent.observation.position - rigid.observation.position
-    reach = arm_.reach + 1.0
-    second_order = np.abs(turn).max() ** 2 * reach * 10
-    np.testing.assert_allclose(
-        moved @ cell.registration[:3, :3], expected, rtol=0, atol=second_order + 1e-14
-    )
-
-
-def test_a_zero_error_of_the_first_joint_is_a_turn_of_the_base_about_z():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    offset = Model(cell, (make("encoder_offset", cell, states),))
-    frame = Model(cell, (make("base_frame", cell, states),))
-    a = offset.predict(states, 0.01 * np.eye(6)[0]).observation
-    b = frame.predict(states, 0.01 * np.eye(6)[5]).observation
-    np.testing.assert_allclose(a.position, b.position, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(a.rotation, b.rotation, rtol=0, atol=1e-14)
-
-
 def test_harmonics_and_sides_are_what_they_say():
     cell = CELLS["ur10e"]
     s = situation(cell)

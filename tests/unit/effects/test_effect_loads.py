@@ -6,52 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.effects.link_mass import LinkMass
 from hilcal.errors import CannotAnswerError
 from hilcal.model.model import Model
-from hilcal.robot.chain import evaluate
-from hilcal.robot.deviation import Deviation
-from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats
 from tests.support.effect_cases import CELLS, TURN, joints, make, position, soft, some_states
-
-
-@pytest.mark.parametrize("arm", CELLS)
-def test_first_moments_are_the_same_as_other_centres_of_mass(arm):
-    cell = CELLS[arm]
-    states = some_states(cell)
-    moved = np.random.default_rng(0).normal(size=cell.arm.coms.shape) * 0.05
-    heavy = cell.arm.masses > 0
-    moments = np.where(heavy[:, None], moved * cell.arm.masses[:, None], 0.0)
-    assert heavy.any()
-    model = soft(cell, states, "link_mass")
-    other = replace(
-        cell, arm=replace(cell.arm, coms=cell.arm.coms + np.where(heavy[:, None], moved, 0))
-    )
-    plain = Model(other, (make("joint_compliance", other, states),))
-    a = position(model, states, joints(cell), moments.ravel())
-    b = position(plain, states, joints(cell))
-    as_configured = position(model, states, joints(cell), 0 * moments.ravel())
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-    assert np.abs(a - as_configured).max() > 1e-5
-
-
-def test_first_moments_turn_with_the_link_that_has_them():
-    """Wherever joints and links stand: by a radian off, here, and twisted by a third of one."""
-    arm = CELLS["odd"].arm
-    rng = np.random.default_rng(4)
-    q = rng.uniform(-np.pi, np.pi, (5, arm.n))
-    bent = Deviation(dq=rng.normal(size=(5, arm.n)), twist=0.3 * rng.normal(size=(5, arm.n + 1, 6)))
-    moments = rng.normal(size=(arm.n, 3))
-    load = Load(rng.normal(size=(5, 6)), np.ones(3), 1.0, np.zeros(3), np.array([3.0, -7.0, 4.0]))
-    told = replace(load, first_moment=moments)
-    other = replace(arm, coms=arm.coms + moments / arm.masses[:, None])
-    np.testing.assert_allclose(
-        slot_wrenches(arm, evaluate(arm, q, bent), told),
-        slot_wrenches(other, evaluate(other, q, bent), load),
-        rtol=0,
-        atol=1e-11,
-    )
 
 
 def acting(wrench: Floats, flange: Floats, name: str, theta: Floats, turn: Floats) -> Floats:
@@ -116,16 +74,6 @@ def test_a_load_that_only_turns_is_a_load_too():
     assert np.linalg.norm(moved, axis=1).min() > 1e-6
 
 
-def test_a_common_gain_is_a_factor_on_what_the_load_does():
-    """Without weights, (1 + g) of every axis is the same as compliances 1/(1 + g)."""
-    cell = replace(CELLS["odd"], gravity=np.zeros(3))
-    states = some_states(cell)
-    model = soft(cell, states, "wrench_gain")
-    a = position(model, states, joints(cell), np.full(6, 0.05))
-    b = position(model, states, joints(cell) / 1.05, np.zeros(6))
-    np.testing.assert_allclose(a, b, rtol=0, atol=1e-12)
-
-
 def test_a_gain_that_no_sensor_has_is_said_in_words():
     cell = CELLS["ur10e"]
     states = some_states(cell)
@@ -160,24 +108,3 @@ def test_changes_of_the_load_add():
     plain = Model(other, (make("joint_compliance", other, states),))
     expected = position(plain, replace(states, wrench=states.wrench + sum(parts)), joints(cell))
     np.testing.assert_allclose(found.observation.position, expected, rtol=0, atol=1e-12)
-
-
-class ToolWeight(LinkMass):
-    """Another effect that changes first moments, as a user might add one."""
-
-    name = "tool_weight"
-
-
-def test_weights_that_two_effects_change_add():
-    cell = CELLS["odd"]
-    states = some_states(cell)
-    one = soft(cell, states, "link_mass")
-    two = one + ToolWeight(cell, states)
-    rng = np.random.default_rng(5)
-    a, b = rng.normal(size=(2, 21)) * 0.05
-    np.testing.assert_allclose(
-        position(two, states, joints(cell), a, b),
-        position(one, states, joints(cell), a + b),
-        rtol=0,
-        atol=1e-12,
-    )

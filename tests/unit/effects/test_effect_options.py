@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.model.model import Model
 from tests.support.effect_cases import (
@@ -19,14 +18,6 @@ from tests.support.effect_cases import (
     situation,
     some_states,
 )
-
-
-def test_an_unknown_effect_is_refused_with_the_valid_names():
-    with pytest.raises(InputError, match="unknown effect 'joint_complience'") as caught:
-        effect_class("joint_complience")
-    assert all(name in str(caught.value) for name in NAMES)
-    assert "joint_compliance" in str(caught.value).split("valid")[0]
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -94,20 +85,6 @@ def test_a_missing_column_is_named(name, column):
     assert not effect_class(name).computable(states)
     with pytest.raises(InputError, match=f"{name} needs {column}"):
         make(name, cell, states)
-
-
-def test_the_same_effect_twice_is_refused():
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    model = Model(cell, (make("hysteresis", cell, states),))
-    with pytest.raises(InputError, match="hysteresis is in the model already"):
-        model + make("hysteresis", cell, states)
-
-
-def test_the_catalogue_has_all_effects_of_the_vocabulary():
-    assert set(NAMES) <= set(installed().names)
-    for kind in installed().effects:
-        assert kind.summary
 
 
 # --- temperatures ---------------------------------------------------------------------------

@@ -1,26 +1,19 @@
-"""Every effect's derivatives, against differences of its law; and an effect of a user's own."""
+"""Derivatives of the slot wrenches by effects of the load, against differences of their law."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.identification.fit import fit
-from hilcal.model.model import Model
-from hilcal.readings.readings import Readings
+from hilcal.effects.protocol import Effect
 from hilcal.robot.statics import Load, slot_wrenches
 from tests.support.arm_cases import slope
-from tests.support.campaigns import campaign, plan
 from tests.support.effect_cases import (
     CELLS,
-    ELASTIC,
-    FIELDS,
     NAMES,
     VARIANTS,
     effect_class,
     make,
-    numeric_jacobian,
     options_of,
     random_theta,
     situation,
@@ -35,74 +28,6 @@ USUAL = tuple((name, options_of(name, 6)) for name in NAMES)
 def some(cases, chosen):
     """The cases of some effects, as pytest takes them."""
     return [pytest.param(n, o, id=f"{n}{o or ''}") for n, o in cases if n in chosen]
-
-
-@pytest.mark.parametrize("arm", CELLS)
-@pytest.mark.parametrize(("name", "options"), some(USUAL + VARIANTS, NAMES))
-def test_columns_are_the_derivative_of_the_deviation(name, options, arm):
-    cell = CELLS[arm]
-    s = situation(cell)
-    effect = make(name, cell, s.states, options)
-    theta = random_theta((effect,), np.random.default_rng(0))
-    derived = {field: 0.0 for field in FIELDS}
-    size = len(effect.parameters)
-    count, n = s.angle.shape
-    for c in effect.columns(s):
-        values = np.broadcast_to(c.values, (count, *c.values.shape[1:]))
-        for k, (parameter, element) in enumerate(zip(c.parameter, c.element, strict=True)):
-            if c.field in ("dq", "twist"):
-                shape = (count, n) if c.field == "dq" else (count, n + 1, 6)
-                block = np.zeros((size, *shape))
-                block[parameter, :, element] += values[:, k]
-            else:
-                block = np.zeros((size, *values[:, k].shape))
-                block[parameter] += values[:, k]
-            derived[c.field] = derived[c.field] + block
-    for p in range(size):
-        scale = effect.parameters[p].scale
-
-        def moved(h, p=p, scale=scale):
-            return effect.deviation(theta + h * scale * np.eye(size)[p], s)
-
-        for field in FIELDS:
-            if getattr(moved(0.0), field) is None:
-                assert np.ndim(derived[field]) == 0, field
-                continue
-            numeric = slope(lambda h, f=field, g=moved: getattr(g(h), f), 1.0)
-            # The deviation is linear, so only rounding of it is left.
-            size_of_it = np.abs(getattr(moved(0.0), field)).max() + np.abs(numeric).max()
-            np.testing.assert_allclose(
-                derived[field][p] * scale, numeric, rtol=0, atol=1e-14 * size_of_it + 1e-30
-            )
-
-
-@pytest.mark.parametrize("arm", CELLS)
-@pytest.mark.parametrize(("name", "options"), some(USUAL + VARIANTS, ELASTIC))
-def test_response_is_the_derivative_by_the_slot_wrenches(name, options, arm):
-    cell = CELLS[arm]
-    s = situation(cell)
-    effect = make(name, cell, s.states, options)
-    rng = np.random.default_rng(3)
-    theta = random_theta((effect,), rng)
-    change = rng.normal(size=(len(s.states), 4, *s.wrench.shape[1:]))
-    response = effect.response(theta, s, change)
-    for p in range(4):
-
-        def moved(h, p=p):
-            return effect.deviation(theta, replace(s, wrench=s.wrench + h * change[:, p]))
-
-        for field in ("dq", "twist"):
-            derived = getattr(response, field)
-            if getattr(moved(0.0), field) is None:
-                assert derived is None
-                continue
-            # Laws are polynomials of degree 3, so a difference of fourth order is exact; all but
-            # that of the backlash, which bends within its crossing of half a newton metre.
-            step = 1e-3 if name == "backlash" else 1.0
-            numeric = slope(lambda h, f=field, g=moved: getattr(g(h), f), step)
-            size = np.abs(getattr(moved(0.0), field)).max()
-            np.testing.assert_allclose(derived[:, p], numeric, rtol=0, atol=1e-13 * size / step)
-            assert np.abs(derived[:, p]).max() > 1e-9 * size
 
 
 CHANGERS = tuple(n for n in NAMES if effect_class(n).wrench_columns is not Effect.wrench_columns)
@@ -142,35 +67,3 @@ def test_wrench_columns_are_the_derivative_of_the_slot_wrenches(name, options, a
 
 
 # --- a user's own ---------------------------------------------------------------------------
-
-
-class ForearmGrowth(Effect):
-    """The forearm grows along its own axis in time: a twist of slot 2 along x, m/s."""
-
-    name = "forearm_growth"
-    summary = "the forearm grows in time"
-    needs = ("time",)
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter("rate", "m/s", 1e-8),)
-
-    def columns(self, s: Situation) -> tuple[Columns, ...]:
-        values = s.states.time[:, None, None] * np.eye(6)[:1]
-        return (Columns("twist", np.array([0]), np.array([2]), values),)
-
-
-def test_a_users_effect_takes_part_unchanged():
-    c = campaign(plan_seed=0, registration_known=True)
-    p = plan()
-    grown = make("joint_compliance", c.cell, p.states), ForearmGrowth(c.cell, p.states)
-    model = Model(c.cell, grown)
-    truth = np.append(c.world.physics.joint_compliance, 4e-7)
-    prediction = model.predict(p.states, truth)
-    numeric = numeric_jacobian(model, p.states, truth, np.array([1e-5] * 6 + [1e-7]), 3)[:, :, 6]
-    derived = 1e-7 * model.jacobian(prediction, truth, 3)[:, :, 6]
-    size = np.abs(numeric).max()
-    np.testing.assert_allclose(derived, numeric, rtol=0, atol=1e-6 * size + 1e-12)
-    clean: Readings = replace(c.readings, value=prediction.observation.position)
-    found = fit(model, clean, "absolute")
-    np.testing.assert_allclose(found.theta, truth, rtol=1e-8)

@@ -5,9 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import hilcal as hc
 from hilcal.config.joints import Conventions, Coupling
-from hilcal.effects.joint_coupling import JointCoupling
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
@@ -26,10 +24,6 @@ def coupled(arm, **factors):
         Coupling(joint=int(name[1]), follows=int(name[3]), factor=k) for name, k in factors.items()
     )
     return as_counted(arm, Conventions(joint_coupling=entries))
-
-
-def test_it_keeps_to_the_protocol():
-    hc.check_effect(JointCoupling)
 
 
 @pytest.mark.parametrize("given", [{}, {"j3q2": -1.0, "j7q6": 0.5}])

@@ -5,7 +5,7 @@ import pytest
 
 from hilcal.campaign.revisions import restore_model, to_record
 from hilcal.effects.per_joint import PerJoint, joint_groups
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response
+from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
@@ -153,17 +153,6 @@ def test_a_shared_parameter_is_the_same_number_at_each_of_its_joints(name, group
     assert np.all(np.abs(ja).max(axis=(0, 1)) > 0)
 
 
-@pytest.mark.parametrize("groups", ["common", "1+4/2-3"])
-@pytest.mark.parametrize("name", PER_JOINT)
-def test_derivatives_by_shared_parameters(name, groups):
-    cell = CELLS["odd"]
-    states = some_states(cell, 4)
-    joints = () if name == "joint_compliance" else (make("joint_compliance", cell, states),)
-    model = Model(cell, (*joints, make(name, cell, states, options(name, groups))))
-    theta = random_theta(model.effects, np.random.default_rng(6), 1e-2)
-    assert_slope(model, states, theta, 3)
-
-
 @pytest.mark.parametrize("creeps", CREEPS)
 @pytest.mark.parametrize("groups", ["common", "2/3/4-6", "1-3"])
 def test_a_shared_compliance_shows_more_where_the_joints_creep(groups, creeps):
@@ -237,41 +226,6 @@ def test_creep_takes_the_older_name_of_its_groups():
     assert [p.name for p in make("creep", cell, states).parameters] == ["k"]
     with pytest.raises(InputError, match="form and joints; valid: joints alone"):
         make("creep", cell, states, {"form": "each", "joints": "each"})
-
-
-class Builds(Effect):
-    """Builds on every joint's compliance, and knows of no groups."""
-
-    name = "builds"
-    summary = "twice the compliance"
-    elastic = True
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        return (Parameter("k", "1", 1.0),)
-
-    def columns(self, s):
-        joints = np.arange(s.angle.shape[1])
-        return (Columns("dq", 0 * joints, joints, s.compliance * s.torque),)
-
-    def response(self, theta, s, change):
-        return Response(dq=theta[0] * s.compliance * change[:, :, :-1, 5])
-
-    def compliance_columns(self, theta, s):
-        joints = np.arange(s.angle.shape[1])
-        return (Columns("dq", joints, joints, theta[0] * s.torque),)
-
-
-@pytest.mark.parametrize("joints", ["each", "common", "2/3/4-6"])
-@pytest.mark.parametrize("builder", ["creep", "a user's"])
-def test_what_builds_on_shared_compliances_has_the_right_derivative(joints, builder):
-    cell = CELLS["ur10e"]
-    states = some_states(cell)
-    shared = make("joint_compliance", cell, states, {"joints": joints})
-    other = make("creep", cell, states) if builder == "creep" else Builds(cell, states)
-    model = Model(cell, (shared, other))
-    theta = np.array([p.scale for p in shared.parameters] + [0.3])
-    assert_slope(model, states, theta, 3)
 
 
 # --- fits -----------------------------------------------------------------------------------

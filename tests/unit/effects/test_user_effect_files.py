@@ -12,10 +12,9 @@ from hilcal.effects.protocol import Effect
 from hilcal.model.model import Model
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.user_effect_cases import CLASS, COLUMNS, HEAD
 
-Capsys = pytest.CaptureFixture[str]
 NAME = "soft_side"
 
 # --- files that cannot be used --------------------------------------------------------------
@@ -172,13 +171,6 @@ def test_one_parameter_may_move_every_joint(tmp_path: Path) -> None:
     ends = [model.predict(p.states, np.array([a])).observation.position for a in (-1e-4, 1e-4)]
     derived = model.jacobian(model.predict(p.states, np.zeros(1)), np.zeros(1), 3)[:, :, 0]
     np.testing.assert_allclose(derived, (ends[1] - ends[0]) / 2e-4, rtol=0, atol=1e-7)
-
-
-def test_a_law_for_seven_joints_is_good(tmp_path: Path, capsys: Capsys) -> None:
-    path = tmp_path / "mine.py"
-    path.write_text(CLASS.replace("np.array([1])", "np.array([6])"), encoding="utf-8")
-    assert [e.name for e in read_effects(path).effects] == ["mine"]
-    ok(capsys, "effects", "--effects-from", path)
 
 
 @pytest.mark.parametrize("kind", BUILT_IN, ids=lambda kind: kind.name)

@@ -31,9 +31,8 @@ from tests.support.campaigns import (
     with_noise,
     world_of,
 )
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 
-Capsys = pytest.CaptureFixture[str]
 SPREAD = 0.15
 """Standard deviation of the arms' joint compliances, relative."""
 ARMS, ODD = 30, 4

@@ -1,7 +1,6 @@
 """A short run of `python -m tests.fuzz`, and what longer ones have found."""
 
 import json
-import signal
 from pathlib import Path
 from random import Random
 
@@ -51,47 +50,6 @@ def test_the_sample_programs_are_understood(tmp_path: Path) -> None:
     assert [bool(w.left) for w in program_points(path, leave=True)[1]] == [True, True, True, False]
     assert PARSERS["program"].parse(stored.PROGRAM.encode())
     assert PARSERS["program_left"].parse(stored.LEFT.encode())
-
-
-def test_an_interrupt_keeps_the_counts() -> None:
-    def parse(data: bytes) -> bool:
-        if len(given) == 7:
-            signal.raise_signal(signal.SIGINT)
-        given.append(data)
-        return True
-
-    given: list[bytes] = []
-    before = signal.getsignal(signal.SIGINT)
-    out = harness.fuzz(harness.Parser("interrupted", lambda by: by.randbytes(4), parse), 1000, 0)
-    assert (out.inputs, out.read, out.stopped) == (8, 8, True)
-    assert not out.findings
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_the_harness_sees_what_it_should(tmp_path: Path) -> None:
-    def parse(data: bytes) -> bool:
-        match data[0] % 5:
-            case 0:
-                raise KeyError("a bug")
-            case 1:
-                while True:
-                    pass
-            case 2:
-                return len(bytearray(1 << 40)) > 0
-            case 3:
-                raise harness.Accepted("damage")
-            case _:
-                raise InputError("as it should")
-
-    count = iter(range(10))
-    parser = harness.Parser("wrong", lambda by: bytes([next(count)]), parse, limit_s=0.05)
-    out = harness.fuzz(parser, 10, 0, tmp_path)
-    assert sorted(line.split(":")[0].split(" at ")[0] for line in out.findings) == [
-        "Accepted", "KeyError", "MemoryError", "more than 0.05 s",
-    ]  # fmt: skip
-    assert out.refused == {"InputError": 2}
-    assert sum(out.findings.values()) == 8
-    assert len(list(tmp_path.iterdir())) == 4
 
 
 DEEP = "[" * 100_000 + "]" * 100_000

@@ -15,7 +15,7 @@ from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.guard import Guard
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.arm_cases import ODD, arm_of
-from tests.support.cli_cases import refused, run
+from tests.support.cli_cases import Capsys, refused, run
 from tests.support.fake_bench import Bench
 from tests.support.space_cases import cell
 
@@ -82,9 +82,7 @@ def test_what_the_planner_refuses_is_refused_and_stops_the_arm(
     assert word in said
 
 
-def test_run_and_check_refuse_it_before_anything_moves(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_and_check_refuse_it_before_anything_moves(tmp_path: Path, capsys: Capsys) -> None:
     toml, plan = tmp_path / "cell.toml", tmp_path / "plan.json"
     arm, tracker = 'driver = "ur"\nhost = "127.0.0.1"', 'driver = "geocom"\nport = "/dev/null"'
     toml.write_text(f'[robot]\nmodel = "ur10e"\n{arm}\n[tracker]\n{tracker}\n', encoding="utf-8")
@@ -97,13 +95,6 @@ def test_run_and_check_refuse_it_before_anything_moves(
     assert "workspace_min_m" in line
     checked = run(capsys, "check", toml, "--plan", plan, "--json").document["plan"]
     assert any("pose low: wrist 3 is" in problem for problem in checked["problems"])
-
-
-def test_where_the_arm_may_go_below_its_mount_is_said_in_the_cell() -> None:
-    """On a pedestal: the same plan passes by one line of CELL.toml, and the arm is not stopped."""
-    config = cell(limits={"workspace_min_m": [-2.0, -2.0, -1.0]})
-    assert refused_lines(config, HOME, BELOW) == ()
-    assert stopped(config, BELOW) is None
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -87,12 +87,6 @@ def test_the_tool_is_identified_and_compared_with_the_configuration() -> None:
     assert any("[tool] says 0.8 kg" in note.text for note in b.notes.of(Remark))
 
 
-def test_a_tool_as_configured_is_not_remarked() -> None:
-    b = Bench()
-    measure(b)
-    assert not any("[tool]" in note.text for note in b.notes.of(Remark))
-
-
 def test_unloaded_poses_that_do_not_tell_the_tool_are_no_failure() -> None:
     """Turned about the vertical only: gravity never turns in the sensor."""
     b = Bench()

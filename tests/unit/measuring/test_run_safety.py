@@ -212,7 +212,7 @@ def test_readings_that_drift_are_waited_for_and_given_up() -> None:
 
 
 def test_drift_that_ends_is_waited_for() -> None:
-    b = Bench()
+    b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
     real = b.world.position
     arrived: dict[tuple[float, ...], float] = {}
 
@@ -222,11 +222,11 @@ def test_drift_that_ends_is_waited_for() -> None:
         return real() + 1e-3 * np.exp(-(b.world.time - since) / 0.5)
 
     b.world.position = position  # type: ignore[method-assign]
-    measure(b)
+    measure(b, few)
     taken = b.notes.of(ReadingStored)
     assert min(t.settling for t in taken) > 1.0
     quiet = Bench()
-    measure(quiet)
+    measure(quiet, few)
     assert max(t.settling for t in quiet.notes.of(ReadingStored)) < 1.0
     away = b.store.readings().value - quiet.store.readings().value  # type: ignore[union-attr]
     assert np.abs(away).max() < 6 * STD

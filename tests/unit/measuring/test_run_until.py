@@ -177,7 +177,6 @@ def test_a_goal_that_is_never_met() -> None:
 
 def short() -> tuple[Bench, Plan]:
     b = Bench(limits=Limits())
-    b.world.hurry = 20.0  # fewer calls in the same motions
     return b, plan_of(
         ("reference", "none", 0),
         ("p1", "none", 0),
@@ -199,7 +198,7 @@ def test_interrupted_on_the_way_home(fault: BaseException) -> None:
     assert steps(b) == wanted
     calls = b.world.calls
     third = [k for k, name in enumerate(calls) if name == "store.recorded"][2]
-    for k in np.linspace(third + 2, len(calls), 4).round().astype(int).tolist():
+    for k in np.linspace(third + 2, len(calls), 3).round().astype(int).tolist():
         b, plan = short()
         if isinstance(fault, Killed):
             b.world.kill_at = k

@@ -151,21 +151,16 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree() -> None:
 
 
 def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -> None:
-    b = Bench()
-    b.world.kill_after = ("store.recorded", 3)
-    with pytest.raises(Killed):
-        measure(b)
-    b.world.again()
-    measure(b)
-    assert confirmed(b) == []  # it stands where it was read last
-    b = Bench()
-    b.world.kill_after = ("store.recorded", 3)
-    with pytest.raises(Killed):
-        measure(b)
-    b.world.again()
-    b.world.q = FREE.copy()
-    measure(b)
-    assert len(confirmed(b)) == 1
+    for moved, questions in ((False, 0), (True, 1)):
+        b = Bench()
+        b.world.kill_after = ("store.recorded", 1)
+        with pytest.raises(Killed):
+            measure(b, SHORT)
+        b.world.again()
+        if moved:
+            b.world.q = FREE.copy()
+        measure(b, SHORT)
+        assert len(confirmed(b)) == questions
 
 
 @pytest.mark.parametrize(
@@ -201,12 +196,12 @@ def test_an_arm_that_is_moved_at_rest_is_named_at_the_next_look(
 
 def in_motion(b: Bench, change: Any, motion: int = 4) -> list[float]:
     """Change samples of the arm from the first look on of a motion; returns when that began."""
-    b.world.hurry = 1.0
     sample = b.rig.arm.sample
     begun: list[float] = []
 
     def changed() -> ArmSample:
         here = sample()
+        b.world.hurry = 20.0 if len(b.world.at_start) < motion - 1 else 1.0
         if len(b.world.at_start) < motion or not (begun or b.world.is_moving):
             return here
         begun.append(b.world.time)
@@ -263,10 +258,12 @@ def test_an_arm_that_leaves_its_straight_way_is_stopped() -> None:
 
 def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
     b = Bench()
+    near = np.array(POSES["reference"]) + 0.02
     b.world.hurry = 0.02
     sample = b.rig.arm.sample
     b.rig.arm.sample = lambda: replace(sample(), speed_scaling=0.02)  # type: ignore[method-assign]
-    measure(b, plan_of(("reference", "none", 0), ("p1", "none", 0)))
+    poses = {"reference": POSES["reference"], "p1": tuple(near)}
+    measure(b, plan_of(("reference", "none", 0), ("p1", "none", 0), poses=poses))
 
 
 # loads
@@ -274,11 +271,11 @@ def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
 
 def test_a_load_that_falls_off_in_motion_stops_the_arm_and_is_asked_for_again() -> None:
     b = Bench()
-    b.world.hurry = 1.0
     moving, fell, payloads = b.rig.arm.moving, [], []
     set_payload, motions = b.rig.arm.set_payload, carried(b)
 
     def falls() -> bool:
+        b.world.hurry = 1.0 if len(b.store.rows) in (6, 7) else 20.0
         if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
             b.world.load = "none"
             fell.append(b.world.time)
@@ -480,11 +477,11 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
 
 def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
     b = Bench()
-    b.world.hurry = 1.0
     latest = b.rig.force.latest  # type: ignore[union-attr]
 
     def swings() -> WrenchSample:
         one = latest()
+        b.world.hurry = 1.0 if b.world.load == "3kg" else 20.0
         if b.world.load == "3kg" and b.world.is_moving:
             one.wrench[:3] += 6.0 * np.sin(2 * np.pi * b.world.time / 0.8)
         return one
@@ -496,10 +493,10 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
 
 def test_a_load_that_stays_wrong_ends_the_run() -> None:
     b = Bench()
-    b.world.hurry = 1.0
     moving, fell = b.rig.arm.moving, []
 
     def falls() -> bool:
+        b.world.hurry = 1.0 if len(b.store.rows) in (6, 7) else 20.0
         if b.world.load == "3kg" and len(b.store.rows) == 7 and b.world.is_moving and not fell:
             b.world.load, b.world.wrong = "none", ["none"] * 3
             fell.append(b.world.time)

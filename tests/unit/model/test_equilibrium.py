@@ -21,7 +21,7 @@ from hilcal.effects.tracker_drift import TrackerDrift
 from hilcal.errors import CannotAnswerError
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
-from hilcal.robot import batch, chain, se3
+from hilcal.robot import batch
 from hilcal.robot.arm import Arm
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
@@ -103,20 +103,6 @@ def test_effects_at_the_equilibrium_give_its_deviation(name: str) -> None:
     assert largest > 1e-3  # the case is worth converging
 
 
-@pytest.mark.parametrize("name", ["ur10e", ODD])
-def test_more_steps_move_nothing(name: str) -> None:
-    model, states, theta = case(name)
-    p = model.predict(states, theta)
-    converged = p
-    for _ in range(10):
-        d = deviation_at(model, converged, states, theta)
-        moved = chain.evaluate(model.cell.arm, p.situation.angle, d)
-        converged = replace(converged, situation=replace(converged.situation, chain=moved))
-    np.testing.assert_allclose(
-        converged.situation.chain.position, p.situation.chain.position, rtol=0, atol=1e-12
-    )
-
-
 def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
     # One horizontal joint of compliance c carries m g at a lever l: dq = c m g l cos(q + dq).
     turned, lever = [0, 0, 0, -np.pi / 2, 0, 0], [0.8, 0, 0, 0, 0, 0]
@@ -149,18 +135,6 @@ def test_elastic_pendulum_hangs_where_its_torques_balance() -> None:
         assert abs(p.situation.chain.position[-1, i, 2] - height) < 1e-12
 
 
-def test_without_elastic_effects_the_arm_is_rigid() -> None:
-    arm = arm_of("ur10e")
-    states = states_of(arm)
-    model = model_of(cell_of(arm), states, RIGID)
-    theta = ordinary(model)
-    p = model.predict(states, theta)
-    again = deviation_at(model, p, states, theta)
-    np.testing.assert_array_equal(p.deviation.dq, again.dq)
-    placed = chain.evaluate(arm, states.q, again)
-    np.testing.assert_array_equal(p.situation.chain.position, placed.position)
-
-
 def test_laws_see_the_joints_that_the_encoders_report() -> None:
     model, states, theta = case()
     off = 1e-2 * np.random.default_rng(13).normal(size=states.q.shape)
@@ -176,58 +150,6 @@ def test_no_equilibrium_is_said_in_words() -> None:
 
 
 # the Jacobian
-
-
-def slope_of_model(model: Model, states: States, theta: Floats, p: int, m: int) -> Floats:
-    """Central difference (N, m) of the whole model by one parameter."""
-    scale = [s.scale for e in model.effects for s in e.parameters][p]
-    h = 0.05 * scale
-    ends = []
-    for t in (theta[p] + h, theta[p] - h):
-        moved = theta.copy()
-        moved[p] = t
-        ends.append(model.predict(states, moved).observation)
-    position = (ends[0].position - ends[1].position) / (2 * h)
-    turn = ends[0].rotation @ np.swapaxes(ends[1].rotation, 1, 2)
-    return np.hstack([position, se3.rotation_vector(turn) / (2 * h)])[:, :m]
-
-
-@pytest.mark.parametrize("soft", [0.0, 1.0, 5.0])
-def test_jacobian_is_the_models_slope(soft: float) -> None:
-    """Rigid and elastic effects together, from a stiff arm to a soft one."""
-    arm = arm_of("ur10e")
-    states = states_of(arm)
-    model = model_of(cell_of(arm), states)
-    elastic = np.array([e.elastic for e in model.effects for _ in e.parameters])
-    theta = ordinary(model) * np.where(elastic, soft, 1.0)
-    prediction = model.predict(states, theta)
-    positions, jacobian = (model.jacobian(prediction, theta, m) for m in (3, 6))
-    for p in range(model.size):
-        expected = slope_of_model(model, states, theta, p, 6)
-        scale = [s.scale for e in model.effects for s in e.parameters][p]
-        noise = 2e-12 / (0.05 * scale)  # the equilibrium's own tolerance
-        limit = 1e-6 * np.abs(expected).max() + noise
-        assert np.abs(jacobian[:, :, p] - expected).max() <= limit
-        limit = 1e-6 * np.abs(expected[:, :3]).max() + noise
-        assert np.abs(positions[:, :, p] - expected[:, :3]).max() <= limit
-
-
-def test_jacobian_of_an_effect_outside_the_model() -> None:
-    arm = arm_of("ur10e")
-    states = states_of(arm)
-    cell = cell_of(arm)
-    model = model_of(cell, states, (BaseFrame, JointCompliance))
-    theta = ordinary(model)
-    outside = EncoderOffset(cell, states)
-    more = model + outside
-    extended = np.append(theta, np.zeros(arm.n))
-    np.testing.assert_allclose(
-        model.jacobian_of((outside,), model.predict(states, theta), theta, 6),
-        more.jacobian(more.predict(states, extended), extended, 6)[:, :, -arm.n :],
-        rtol=0,
-        atol=1e-12,
-    )
-    assert model.jacobian_of((), model.predict(states, theta), theta, 3).shape == (COUNT, 3, 0)
 
 
 # batches
@@ -270,14 +192,6 @@ def test_chunks_give_the_same_numbers(size: int, monkeypatch: pytest.MonkeyPatch
     together = everything(model, states, theta)
     monkeypatch.setattr(batch, "CHUNK", size)
     assert_all_close(everything(model, states, theta), together)
-
-
-def test_order_of_the_states_does_not_matter() -> None:
-    model, states, theta = case()
-    order = np.random.default_rng(14).permutation(COUNT)
-    together = everything(model, states, theta)
-    shuffled = everything(model, states[order], theta)
-    assert_all_close(shuffled, {k: v[order] for k, v in together.items()})
 
 
 def test_no_states() -> None:

@@ -154,7 +154,9 @@ def test_another_validation_campaign_is_refused(done: tuple[Drawn, Improvement])
         files.validation.write_bytes(kept)
 
 
-def test_a_goal_below_the_repeatability_is_not_measured_for(tmp_path) -> None:
+def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is_decided(
+    tmp_path,
+) -> None:
     d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
     kinds = []
     while (step := d.procedure.next()).kind != "plan_validation":
@@ -163,6 +165,13 @@ def test_a_goal_below_the_repeatability_is_not_measured_for(tmp_path) -> None:
     assert kinds == ALL[:4]
     assert found.reason == "floor"
     assert found.error.floor_m > 5e-6
+    settings = replace(d.procedure.settings, goal_m=1.0)
+    d = replace(d, procedure=replace(d.procedure, settings=settings))
+    with CampaignFile.open(d.procedure.run) as run:
+        d.procedure.resume(run)
+    assert d.procedure.next().kind == "decide"
+    assert d.do(d.procedure.next()).reason == "goal_met"
+    assert d.procedure.next().kind == "plan_validation"
 
 
 def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path) -> None:
@@ -197,20 +206,6 @@ def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
         log = RunLog(run)
         assert len(log.plans) > 1
         assert len(log.plan.steps) == run.n_readings
-
-
-def test_another_goal_is_decided_anew_before_the_validation(tmp_path) -> None:
-    d = drawn(tmp_path / "run.hilcal", goal_m=5e-6)
-    for _ in range(4):
-        d.do(d.procedure.next())
-    assert d.procedure.next().kind == "plan_validation"
-    settings = replace(d.procedure.settings, goal_m=1.0)
-    d = replace(d, procedure=replace(d.procedure, settings=settings))
-    with CampaignFile.open(d.procedure.run) as run:
-        d.procedure.resume(run)
-    assert d.procedure.next().kind == "decide"
-    assert d.do(d.procedure.next()).reason == "goal_met"
-    assert d.procedure.next().kind == "plan_validation"
 
 
 def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> None:

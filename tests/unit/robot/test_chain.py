@@ -1,4 +1,4 @@
-"""The deviated chain and its Jacobians against Pinocchio, matrix products and differences."""
+"""The deviated chain, its bodies and Jacobians: Pinocchio, matrix products and differences."""
 
 import numpy as np
 import pinocchio as pin
@@ -6,11 +6,12 @@ import pytest
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import Chain, evaluate, joint_jacobian, slot_jacobian
+from hilcal.robot.body import body_poses
+from hilcal.robot.chain import evaluate, joint_jacobian, slot_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats
-from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, slots_of, twisted
+from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
 
 TOLERANCE = 1e-12
 COUNT = 12
@@ -85,27 +86,6 @@ def test_every_frame_is_its_matrix_product(name: str) -> None:
                 pose = pose @ links[k + 1]
 
 
-@pytest.mark.parametrize("name", ARMS)
-def test_joint_jacobian_is_pinocchios(name: str) -> None:
-    arm = arm_of(name)
-    q, d = angles(arm), random_deviation(arm, 0.02)
-    assert d.dq is not None
-    assert d.twist is not None
-    chain = evaluate(arm, q, d)
-    jacobian = joint_jacobian(chain, chain.position[-1])
-    for i in range(COUNT):
-        model = pinocchio_model(twisted(arm, d.twist[i]))
-        frame = model.getFrameId(FLANGE)
-        expected = pin.computeFrameJacobian(
-            model,
-            model.createData(),
-            q[i] + d.dq[i],
-            frame,
-            pin.ReferenceFrame.LOCAL_WORLD_ALIGNED,
-        )
-        np.testing.assert_allclose(jacobian[i], expected, rtol=0, atol=TOLERANCE)
-
-
 def motion_by(arm: Arm, q: Floats, d: Deviation, change: Deviation, offset: Floats) -> Floats:
     """Motion (N, 6) of a flange-fixed point per change along a deviation, by differences."""
     r0 = evaluate(arm, q, d).rotation[-1]
@@ -154,55 +134,24 @@ def assert_close_relative(found: Floats, expected: Floats) -> None:
     assert np.abs(found - expected).max() <= 1e-7 * np.abs(expected).max()
 
 
-def test_slot_jacobian_of_an_untwisted_arm_needs_no_twists() -> None:
-    arm = arm_of("ur5e")
-    q = angles(arm)
-    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
-    for k in range(arm.n + 1):
-        x = plain.position[-1]
-        np.testing.assert_array_equal(slot_jacobian(plain, k, x), slot_jacobian(zero, k, x))
-
-
-def test_nothing_deviates_exactly() -> None:
-    arm = arm_of("ur10e")
-    q = angles(arm)
-    plain, zero = evaluate(arm, q), evaluate(arm, q, random_deviation(arm, 0.0))
-    np.testing.assert_array_equal(plain.rotation, zero.rotation)
-    np.testing.assert_array_equal(plain.position, zero.position)
-    for i in range(COUNT):
-        slots = slots_of(arm, q[i])
-        np.testing.assert_allclose(plain.position[:, i], slots[:, :3, 3], rtol=0, atol=TOLERANCE)
-
-
-def test_a_point_may_differ_from_state_to_state() -> None:
-    arm = arm_of("ur10e")
-    chain = evaluate(arm, angles(arm))
-    offsets = np.random.default_rng(4).normal(size=(COUNT, 3))
-    for i in range(COUNT):
-        np.testing.assert_allclose(
-            chain.point(offsets)[i], chain.point(offsets[i])[i], rtol=0, atol=1e-15
-        )
-
-
-@pytest.mark.parametrize("order", ["C", "F"])
-def test_layout_of_the_input_does_not_matter(order: str) -> None:
-    arm = arm_of("ur10e")
-    q, d = angles(arm), random_deviation(arm, 1e-3)
-    assert d.dq is not None
-    assert d.twist is not None
-    laid = Deviation(
-        dq=np.array(d.dq, order=order),  # type: ignore[call-overload]
-        twist=np.array(d.twist, order=order),  # type: ignore[call-overload]
-    )
-    a: Chain = evaluate(arm, q, d)
-    b: Chain = evaluate(arm, np.array(q, order=order), laid)  # type: ignore[call-overload]
-    np.testing.assert_array_equal(a.position, b.position)
-    np.testing.assert_array_equal(a.rotation, b.rotation)
-
-
 def test_no_states() -> None:
     arm = arm_of("ur10e")
     chain = evaluate(arm, np.zeros((0, 6)), Deviation(twist=np.zeros((0, 7, 6))))
     assert chain.position.shape == (7, 0, 3)
     assert joint_jacobian(chain, chain.position[-1]).shape == (0, 6, 6)
     assert slot_jacobian(chain, 2, chain.position[-1]).shape == (0, 6, 6)
+
+
+@pytest.mark.parametrize("name", ARMS)
+def test_bodies_and_flange_are_where_pinocchio_has_them(name: str) -> None:
+    arm = arm_of(name)
+    q = np.random.default_rng(3).uniform(-np.pi, np.pi, (4, arm.n))
+    poses = body_poses(arm, q)
+    assert poses.shape == (4, arm.n + 2, 4, 4)
+    model = pinocchio_model(arm)
+    data = model.createData()
+    for angles, found in zip(q, poses, strict=True):
+        pin.framesForwardKinematics(model, data, angles)
+        placed = [np.eye(4), *(data.oMi[k].homogeneous for k in range(1, arm.n + 1))]
+        placed.append(data.oMf[model.getFrameId(FLANGE)].homogeneous)
+        np.testing.assert_allclose(found, placed, rtol=0, atol=1e-12)

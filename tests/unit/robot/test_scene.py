@@ -34,21 +34,6 @@ def test_distance_of_segments(a, b, c, d) -> None:
     assert nearest - coarse - 1e-9 <= found <= nearest + 1e-9
 
 
-@pytest.mark.parametrize(
-    ("c", "d", "known"),
-    [
-        ((0, 3, 0), (1, 3, 0), 3.0),  # parallel
-        ((0.5, 0, 2), (0.5, 1, 2), 2.0),  # crossing above
-        ((4, 4, 0), (9, 9, 0), 5.0),  # beyond an end
-        ((0.3, 0, 0), (0.3, 1, 0), 0.0),  # touching
-        ((0.5, 2, 0), (0.5, 2, 0), 2.0),  # a point
-    ],
-)
-def test_known_distances_of_segments(c, d, known: float) -> None:
-    a, b = np.zeros(3), np.array([1.0, 0.0, 0.0])
-    assert segment_distance(a, b, np.array(c, float), np.array(d, float)) == pytest.approx(known)
-
-
 @pytest.mark.parametrize("name", robot_names())
 def test_usual_poses_are_free_and_folded_ones_are_not(name: str) -> None:
     scene = Scene(load_arm(name), obstacles=(TABLE,))

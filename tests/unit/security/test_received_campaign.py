@@ -17,11 +17,10 @@ from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import rows
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.cli_cases import CELL, Capsys, ok, refused, rehearsal
 from tests.support.cli_cases import run as run_of
 from tests.unit.data.test_campaign import REVISION
 
-Capsys = pytest.CaptureFixture[str]
 FOREVER = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT"
 FOREIGN = {
     "swallows revisions": (

@@ -140,23 +140,6 @@ def test_effects_that_cancel_hardly_show_in_deflections(effect):
     assert left < 0.02 * np.abs(change).max()
 
 
-@pytest.mark.parametrize("effect", DEFLECTION_EFFECTS)
-def test_effects_that_do_not_cancel_show_in_deflections(effect):
-    """As strong in deflections as they are in absolute readings, within a few times."""
-    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
-    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
-    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
-    assert left > (0.01 if effect == "tracker_drift" else 0.1) * np.sqrt(np.mean(change**2))
-
-
-@pytest.mark.parametrize("effect", ["thermal_growth", "thermal_joint_drift"])
-def test_temperatures_change_too_little_within_a_pose_to_show_in_deflections(effect):
-    world = hide(effect, CELL, STATES, 3.0, "absolute", np.random.default_rng(1))
-    change = world.sight(STATES).position - without(world, effect).sight(STATES).position
-    left = np.sqrt(np.mean((change - change[FIRST])[LOAD > 0] ** 2))
-    assert left < 0.1 * np.sqrt(np.mean(change**2))
-
-
 def test_truth_is_named_in_si():
     world = hide("transmission_error", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
     assert len(world.truth) == 6 + 6 * 6 * 2
@@ -164,25 +147,6 @@ def test_truth_is_named_in_si():
     assert 4e-6 < world.truth["joint_compliance.j1"] < 8e-6
     world = hide("joint_stiffening", CELL, STATES, 1.0, "absolute", np.random.default_rng(1))
     assert world.truth["joint_stiffening.j2"] < 0.0
-
-
-def test_an_effect_can_be_hidden_beside_another():
-    rng = np.random.default_rng(6)
-    first = hide("hysteresis", CELL, STATES, 2.0, "absolute", rng)
-    both = hide("encoder_offset", CELL, STATES, 2.0, "absolute", rng, world=first)
-    assert both.physics.hysteresis is first.physics.hysteresis
-    assert np.all(both.physics.encoder_offset != 0.0)
-
-
-def test_the_same_seed_hides_the_same():
-    one, two = (
-        hide("link_geometry", CELL, STATES, 3.0, "absolute", np.random.default_rng(8))
-        for _ in range(2)
-    )
-    assert one.truth == two.truth
-    np.testing.assert_array_equal(one.registration, two.registration)
-    other = hide("link_geometry", CELL, STATES, 3.0, "absolute", np.random.default_rng(9))
-    assert one.truth != other.truth
 
 
 def test_unknown_registration_and_target_are_the_worlds_own():
@@ -235,15 +199,6 @@ def test_a_sensor_cannot_misread_what_is_not_there(effect):
     with pytest.raises(InputError, match="no state has a load; valid: ") as caught:
         hide(effect, CELL, unloaded, 3.0, "absolute", np.random.default_rng(0))
     assert "\n" not in str(caught.value)
-
-
-def test_joints_drift_from_the_first_temperature_of_the_states():
-    warm = replace(STATES, joint_temperature=STATES.joint_temperature + 6.0)
-    world = hide("thermal_joint_drift", CELL, warm, 3.0, "absolute", np.random.default_rng(0))
-    assert world.joint_reference == pytest.approx(warm.joint_temperature[0].mean())
-    later = hide("thermal_joint_drift", CELL, warm[np.arange(len(warm))[::-1]], 3.0, "absolute",
-                 np.random.default_rng(0))  # fmt: skip
-    assert later.joint_reference == world.joint_reference
 
 
 def test_a_pose_without_an_unloaded_reading_is_refused():

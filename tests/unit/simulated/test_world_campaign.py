@@ -1,15 +1,18 @@
-"""Rehearsals: feasible, spread, ordered in time; and the readings that come out."""
+"""Rehearsals: feasible, spread, ordered in time; and the readings and their noise that come out."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
+from scipy.spatial.transform import Rotation
 
 from drivers.simulated.injected_effects import hide, nothing_hidden
 from drivers.simulated.rehearsal import simulate
+from drivers.simulated.tracker import SimulatedNoise
 from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
-from studies.temperatures import air, joints
 from tests.support.example_cell import ur10e_cell
 
 CELL = ur10e_cell()
@@ -46,12 +49,6 @@ def test_loads_hang_for_seconds_or_minutes_and_never_since_before_the_last_readi
         assert mine.std() == pytest.approx(np.sqrt(1 / 12), rel=0.25)
 
 
-def test_where_nothing_is_ever_hung_the_time_under_load_goes_on():
-    states, _, load, _ = rehearsal_states(CELL, 5, [], np.random.default_rng(0))
-    assert not load.any()
-    np.testing.assert_allclose(np.diff(states.load_time), np.diff(states.time))
-
-
 def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
     states, _, _, _ = rehearse(n=40)
     warm, hall = states.joint_temperature, states.air_temperature
@@ -70,32 +67,6 @@ def test_joints_warm_up_each_by_its_own_and_the_air_drifts():
     assert np.abs(hall - 22.0).max() < 6.0
     # the quickest is the air conditioning, 0.25 °C in a period of 1200 s
     assert np.all(np.abs(np.diff(hall)) < lasted * 0.0022 + 6 * 0.03)
-
-
-def test_every_campaign_has_its_own_weather():
-    time = np.linspace(0.0, 8000.0, 30)
-    rng = np.random.default_rng(0)
-    rises = [np.ptp(joints(time, 6, rng), axis=0) for _ in range(50)]
-    drifts = [seen[-1] - seen[0] for seen in (air(time, rng) for _ in range(50))]
-    assert np.std(rises) > 2.0
-    assert np.min(rises) > 3.0
-    assert np.ptp(drifts) > 1.0
-    assert np.abs(drifts).max() < 6.0
-
-
-def test_temperatures_are_drawn_apart_from_all_else():
-    with_, without = (
-        (*rehearsal_states(CELL, 6, WEIGHTS, rng, temperatures=told), rng.random(4))
-        for told, rng in ((True, np.random.default_rng(5)), (False, np.random.default_rng(5)))
-    )
-    for name in ("q", "wrench", "time", "load_time", "approach"):
-        np.testing.assert_array_equal(getattr(with_[0], name), getattr(without[0], name))
-    np.testing.assert_array_equal(with_[-1], without[-1])
-    assert without[0].air_temperature is None
-    assert without[0].joint_temperature is None
-    again = rehearsal_states(CELL, 6, WEIGHTS, np.random.default_rng(5))[0]
-    np.testing.assert_array_equal(again.air_temperature, with_[0].air_temperature)
-    np.testing.assert_array_equal(again.joint_temperature, with_[0].joint_temperature)
 
 
 def test_poses_are_feasible_and_spread():
@@ -137,14 +108,6 @@ def test_readings_scatter_about_the_truth_within_their_covariance(m):
     assert np.mean(white**2) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / white.size))
 
 
-def test_deflections_have_the_size_of_a_real_arm():
-    states, pose, load, cycle = rehearse(n=20)
-    world = nothing_hidden(CELL, np.random.default_rng(1))
-    readings = simulate(world, states, pose, load, cycle, NAMES, np.random.default_rng(2))
-    heavy = np.linalg.norm(readings.value[load == 2] - readings.value[load == 0], axis=1)
-    assert 3e-4 < np.median(heavy) < 3e-3
-
-
 def test_the_same_seed_measures_the_same():
     def once(seed):
         rng = np.random.default_rng(seed)
@@ -169,3 +132,37 @@ def test_the_same_seed_measures_the_same():
 def test_impossible_rehearsals_are_refused(poses, wrenches, message):
     with pytest.raises(InputError, match=message):
         rehearsal_states(CELL, poses, wrenches, np.random.default_rng(0))
+
+
+DRAWS = 4000
+
+
+@pytest.mark.parametrize(("m", "known"), [(3, False), (6, False), (6, True)])
+def test_sample_covariance_is_the_reported_one(m, known):
+    world = nothing_hidden(ur10e_cell(registration_known=known), np.random.default_rng(4))
+    q = np.array([0.4, -1.2, 1.3, -0.4, 0.9, 0.3])
+    states = States(np.tile(q, (DRAWS, 1)), np.tile([0.0, 0, -90, 0, 0, 0], (DRAWS, 1)))
+    sight = world.sight(states[:1])
+    cov = world.covariance(sight, m)[0]
+    value = world.observe(states, np.random.default_rng(5), m)
+    off = value[:, :3] - sight.position
+    if m == 6:
+        seen = Rotation.from_rotvec(value[:, 3:]) * Rotation.from_matrix(sight.rotation[0]).inv()
+        off = np.hstack([off, seen.as_rotvec()])
+    white = np.linalg.solve(np.linalg.cholesky(cov), off.T)
+    low, high = stats.chi2.ppf([0.001, 0.999], DRAWS * m)
+    assert low < np.sum(white**2) < high
+    # each element of the whitened sample covariance has a deviation of 1 or √2 over √DRAWS
+    np.testing.assert_allclose(white @ white.T / DRAWS, np.eye(m), atol=4.5 * np.sqrt(2 / DRAWS))
+    np.testing.assert_allclose(white.mean(axis=1), 0.0, atol=4.5 / np.sqrt(DRAWS))
+
+
+@pytest.mark.parametrize("position", [[2.5, 1.0, -0.4], [0.0, 0.0, 2.0], [-1.0, 0.0, 0.3]])
+def test_covariance_is_an_ellipsoid_along_the_line_of_sight(position):
+    noise = SimulatedNoise(range_std=(1e-6, 1e-6), transverse_std=(2e-6, 5e-6))
+    point = np.array([position])
+    distance = np.linalg.norm(position)
+    value, vector = np.linalg.eigh(noise.covariance(point, 3)[0])
+    assert np.sqrt(value[0]) == pytest.approx(1e-6 + 1e-6 * distance)
+    assert np.sqrt(value[1:]) == pytest.approx(2e-6 + 5e-6 * distance)
+    assert abs(vector[:, 0] @ position) / distance == pytest.approx(1.0)

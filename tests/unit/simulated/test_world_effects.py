@@ -9,8 +9,6 @@ from scipy.spatial.transform import Rotation
 from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
-from hilcal.errors import InputError
-from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.world_cases import frames, moment_beyond
@@ -98,14 +96,6 @@ def test_play_is_crossed_with_the_sign_of_the_torque():
     np.testing.assert_allclose(seen[far], (b * np.sign(torque))[far], rtol=1e-7)
 
 
-@pytest.mark.parametrize("unknown", [np.inf, np.nan, 0.0])
-def test_play_of_a_drive_without_a_torque_limit_is_that_of_150(unknown):
-    b = np.full(6, 1e-4)
-    limits = np.full(6, 150.0)
-    told = world(cell_with(torque_max=limits), backlash=b)
-    close(told, world(cell_with(torque_max=np.full(6, unknown)), backlash=b))
-
-
 def test_creep_softens_the_drives_by_decades_of_the_time_under_load():
     k = 0.05
     for time, decades in ((0.0, 0.0), (9.0, 1.0), (99.0, 2.0)):
@@ -134,30 +124,6 @@ def test_links_grow_with_the_temperature_of_the_air():
     np.testing.assert_allclose(rigid[:, :3, :3], stiff[:, :3, :3], atol=1e-12)
 
 
-def test_without_air_it_is_the_mean_of_the_joints_and_at_20_degrees_nothing():
-    grown = world(**SOFT, thermal_growth=np.array([1e-4]))
-    bare = replace(STATES, air_temperature=None)
-    mean = replace(STATES, air_temperature=STATES.joint_temperature.mean(axis=1))
-    close(grown, grown, bare, 0.0)
-    np.testing.assert_array_equal(grown.sight(bare).position, grown.sight(mean).position)
-    at_20 = replace(STATES, air_temperature=np.full(len(STATES), 20.0))
-    close(grown, world(**SOFT), at_20)
-
-
-def test_long_links_that_bend_grow_as_well():
-    beams = np.array([[8.0, 12.0], [9.0, 10.0]]) * 1e-6
-    alpha = 1e-3
-    states = replace(STATES, air_temperature=np.full(len(STATES), 30.0))
-    grown = world(link_compliance=beams, thermal_growth=np.array([alpha])).sight(states).position
-    bent = world(link_compliance=beams).sight(states).position
-    rigid = world().sight(states).position
-    long = world(thermal_growth=np.array([alpha])).sight(states).position
-    bending = np.linalg.norm(bent - rigid, axis=1).max()
-    assert bending > 1e-4
-    # the rest is how a part in a hundred more length changes the bending: its lever, squared
-    assert np.linalg.norm(grown - bent - (long - rigid), axis=1).max() < 0.05 * bending
-
-
 def test_joints_drift_with_their_own_temperature_from_a_reference():
     kappa = 1e-5 * np.arange(1.0, 7.0)
     drifting = replace(world(thermal_joint_drift=kappa), joint_reference=25.0)
@@ -172,22 +138,6 @@ def test_first_moments_shift_the_centres_of_mass():
     moments = 0.3 * np.random.default_rng(7).normal(size=(6, 3))
     coms = ARM.coms + moments / ARM.masses[:, None]
     close(world(**SOFT, link_mass=moments), world(cell_with(coms=coms), **SOFT))
-
-
-def test_first_moments_pull_by_their_weight_also_where_a_link_has_no_mass():
-    moment = np.array([0.2, -0.3, 0.4])
-    for k in range(6):
-        masses = ARM.masses.copy()
-        masses[k] = 0.0
-        cell, moments = cell_with(masses=masses), np.zeros((6, 3))
-        moments[k] = moment
-        off, told = world(cell, link_mass=moments), world(cell)
-        change = off.drive_torque(STATES) - told.drive_torque(STATES)
-        for i in range(0, len(STATES), 5):
-            bodies, slots, _ = frames(ARM, STATES.q[i])
-            couple = np.cross(bodies[k][:3, :3] @ moment, CELL.gravity)
-            expected = [slots[j][:3, 2] @ couple if j <= k else 0.0 for j in range(6)]
-            np.testing.assert_allclose(change[i], expected, rtol=0, atol=1e-7)
 
 
 BIAS = np.array([3.0, -5.0, 8.0, 0.4, -0.7, 0.5])
@@ -233,22 +183,6 @@ def test_the_arm_rests_under_what_acts_where_the_sensor_misreads_it(hidden, told
     assert np.abs(torque).max() < 1e-9
 
 
-def test_a_gain_of_nothing_is_refused():
-    with pytest.raises(InputError, match=r"wrench_gain .*read nothing"):
-        world(wrench_gain=-np.ones(6)).sight(STATES)
-
-
-def test_a_scale_lengthens_what_is_read_and_turns_nothing():
-    s = 3e-4
-    soft = {**SOFT, "tracker_drift": 1e-7 * np.arange(1.0, 7.0)}
-    before, after = (world(**soft, **more).sight(STATES) for more in
-                     ({}, {"tracker_scale": np.array([s])}))  # fmt: skip
-    np.testing.assert_allclose(after.position, (1.0 + s) * before.position, rtol=1e-15)
-    np.testing.assert_array_equal(after.rotation, before.rotation)
-    np.testing.assert_allclose(after.jacobian[:, :3], (1.0 + s) * before.jacobian[:, :3])
-    np.testing.assert_array_equal(after.jacobian[:, 3:], before.jacobian[:, 3:])
-
-
 def test_parameters_are_named_in_the_order_of_their_arrays():
     rng = np.random.default_rng(1)
     rigid = Truth.rigid(ARM)
@@ -271,14 +205,3 @@ def test_parameters_are_named_in_the_order_of_their_arrays():
         named = rigid.with_effect(effect, value).named(ARM)
         assert list(named) == [f"{effect}.{label}" for label in labels.split()]
         assert list(named.values()) == value.ravel().tolist()
-
-
-def test_states_without_a_temperature_are_refused_by_what_they_lack():
-    bare = States(q=STATES.q, wrench=STATES.wrench)
-    for hidden, column in (
-        ({"thermal_growth": np.array([1e-5])}, "air_temperature"),
-        ({"thermal_joint_drift": np.full(6, 1e-5)}, "joint_temperature"),
-        ({"creep": np.array([0.1])}, "load_time"),
-    ):
-        with pytest.raises(InputError, match=f"^{column}: {next(iter(hidden))} is hidden"):
-            world(**SOFT, **hidden).sight(bare)

@@ -36,14 +36,6 @@ def test_world_comes_back_from_its_file_to_the_last_bit(tmp_path):
     assert same(back.sight(state).position, world.sight(state).position)
 
 
-def test_a_world_without_harmonics_keeps_the_shape_of_nothing(tmp_path):
-    made = config()
-    world = world_of(made)
-    write_world(tmp_path / "world.json", world, made)
-    shape = read_world(tmp_path / "world.json")[0].physics.transmission_error.shape
-    assert shape == world.physics.transmission_error.shape == (6, 0, 2)
-
-
 def test_a_configuration_of_another_cell_is_refused(tmp_path):
     world = world_of(config())
     other = config(tool={"mass_kg": 0.9, "load_point_m": [0.1, -0.03, 0.15]})

@@ -81,14 +81,6 @@ def test_a_drifting_tracker_moves_the_target_while_the_arm_rests(tmp_path):
     assert not same(second["target"], first["target"])
 
 
-def test_warm_up_is_slow_and_ends(tmp_path):
-    cell = life(tmp_path)
-    truth = cell.rest_at(Q)
-    assert truth["air_temperature"] == 22.0
-    assert np.all(truth["joint_temperature"] > 22.0)
-    assert np.all(truth["joint_temperature"] < 34.0)
-
-
 def slip_of(cell):
     return cell.living.slip(cell.arrivals)[None]
 
@@ -154,31 +146,6 @@ def test_the_sensor_feels_the_weight_of_tool_and_load_in_its_own_axes(tmp_path):
         tool, load = np.array([0.01, 0.02, 0.06]), np.array([0.104, -0.03, 0.147])
         centre = flange.apply((0.8 * tool + 5.0 * load) / 5.8 - MOUNT["origin_m"])
         np.testing.assert_allclose(moment, np.cross(centre, force), atol=1e-9)
-
-
-def test_the_sensor_feels_a_pull_and_its_moment(tmp_path):
-    cell = life(tmp_path, sections=SENSOR)
-    empty = cell.rest_at(Q)
-    cell.living.hang("pull")
-    pulled = cell.board.read("truth")
-    turns = [
-        Rotation.from_matrix(t["flange"][:3, :3]) * Rotation.from_rotvec(MOUNT["rotvec_rad"])
-        for t in (empty, pulled)
-    ]
-    change = turns[1].apply(pulled["sensor_wrench"].reshape(2, 3))[0]
-    change -= turns[0].apply(empty["sensor_wrench"].reshape(2, 3))[0]
-    np.testing.assert_allclose(change, PULL[:3], atol=1e-9)
-
-
-def test_a_sensor_at_the_flange_agrees_with_the_last_drive(tmp_path):
-    # the flange's z is the last axis, and the last body's centre of mass lies on it
-    cell = life(tmp_path)
-    assert np.all(arm_of("ur10e").coms[5][:2] == 0.0)
-    cell.living.hang("pull")
-    for q in (Q, Q - 0.9):
-        truth = cell.rest_at(q)
-        assert truth["sensor_wrench"][5] == pytest.approx(truth["drive_torque"][5], abs=1e-9)
-        assert abs(truth["drive_torque"][5]) > 0.5
 
 
 # what the people in the cell do

@@ -22,10 +22,9 @@ from hilcal.regression.triangle import Triangle, combined
 from hilcal.stream.fit import StreamFit, fit_stream
 from hilcal.tables.parquet_stream import ReadingStream, open_stream
 from hilcal.types import Floats
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.stream_cases import CELL, EFFECTS, NOISE, cell, write
 
-Capsys = pytest.CaptureFixture[str]
 COUNT, GROUP, GROSS = 2_400, 1_000, 4
 EFFECT = {name: {} for name in EFFECTS}
 

@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.errors import InputError
 from studies.records import Figure, keep, page
-from tests.support.cli_cases import ok
+from tests.support.cli_cases import Capsys, ok
 from tests.support.paths import ROOT
 
 MEASURED = ROOT / "docs" / "measured"
@@ -32,7 +32,7 @@ def test_a_record_has_its_command_and_comes_back_as_a_section(
     assert "| cost | 3 | 2 | **no** |" in text
 
 
-def test_a_study_keeps_its_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_study_keeps_its_figures(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "s.json"
     ok(capsys, "studies", "scaling", "--runs", "20", "--keep", path)
     figures = json.loads(path.read_text())["figures"]

@@ -1,4 +1,4 @@
-"""Campaigns of the study of the diagnosis: what is hidden in them, and how strongly."""
+"""Campaigns of the study of the diagnosis: what is hidden in them, and a further round."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ from drivers.simulated.injected_effects import EFFECTS
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
-from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
-from hilcal.readings.whitening import MODES, Mode
+from hilcal.readings.whitening import Mode, whitening
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.diagnosis import intervals
@@ -20,10 +20,10 @@ from studies.random_campaigns import dead_weights
 from studies.study_cases import (
     StudyCase,
     effects_shown,
-    laws_shown,
     study_case,
     with_study_loads,
 )
+from studies.study_more import measure_more, suspects
 from studies.unmodelled_laws import LAWS, law_named, shift
 from tests.support.effect_cases import make
 
@@ -85,19 +85,6 @@ def test_the_noise_is_as_large_as_stated_or_as_misjudged() -> None:
         assert np.std(np.concatenate(white)) == pytest.approx(1 / stated, rel=0.08)
 
 
-def test_repeats_are_the_same_states_twice() -> None:
-    r = case(cycles=2).readings
-    assert len(r) == 96
-    assert np.array_equal(r.states.q[:48], r.states.q[48:])
-    assert set(r.cycle) == {0, 1}
-
-
-def test_several_effects_are_hidden_at_once() -> None:
-    both = case("creep", "encoder_offset").world.truth
-    names = {name.split(".")[0] for name in both}
-    assert names == {"joint_compliance", "creep", "encoder_offset"}
-
-
 @pytest.mark.parametrize("law", LAWS, ids=lambda law: law.name)
 def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
     for mode in law.readings:
@@ -114,15 +101,6 @@ def test_a_law_outside_of_the_catalogue_acts_at_the_strength_asked(law) -> None:
             change, covariance = change[loaded], covariance[loaded]
         white = np.linalg.solve(np.linalg.cholesky(covariance), change[:, :, None])
         assert np.sqrt(np.mean(white**2)) == pytest.approx(3.0, rel=1e-6)
-
-
-def test_the_variables_of_a_law_are_those_that_a_diagnosis_knows() -> None:
-    for mode in MODES:
-        c = case(mode=mode)
-        f = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-        known = {w.variable for w in misfit_breakdown(linearise(f))}
-        for name in laws_shown(mode):
-            assert set(law_named(name).variables) <= known
 
 
 def test_laws_and_effects_that_do_not_fit_are_refused() -> None:
@@ -166,3 +144,36 @@ def test_intervals_hold_true_parameters_and_no_others() -> None:
     doubled = {name: 2 * value for name, value in c.world.truth.items()}
     assert intervals(f, doubled)[0].inside < told.inside
     assert intervals(f, {}) == ()
+
+
+def diagnosed(c) -> Diagnosis:
+    return diagnose(fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection"))
+
+
+def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
+    c = case("link_compliance", mode="deflection", strength=0.5, poses=10)
+    d = diagnosed(c)
+    assert len(suspects(d)) > 1
+    all_ = measure_more(config(), "ur10e", c, d, seed=1, poses=4)
+    assert all_ is not None
+    n = len(c.readings)
+    assert len(all_) > n + 10
+    np.testing.assert_array_equal(all_.value[:n], c.readings.value)
+    assert all_.pose[n:].min() > all_.pose[:n].max()
+    assert len(all_.pose_names) == all_.pose.max() + 1
+    assert np.all(np.diff(np.asarray(all_.states.time)) > 0)
+    # Every loaded reading has its unloaded one, and noise is what the covariance says.
+    loaded = whitening(all_, "deflection", "gc")
+    assert len(loaded.reading) == np.count_nonzero(~all_.unloaded)
+    clean = c.world.sight(all_.states).position
+    white = np.einsum(
+        "nij,nj->ni", np.linalg.inv(np.linalg.cholesky(all_.covariance)), all_.value - clean
+    )
+    assert abs(np.mean(white[n:] ** 2) - 1) < 4 * np.sqrt(2 / white[n:].size)
+
+
+def test_nothing_is_measured_where_one_effect_leads_alone():
+    c = case("hysteresis", mode="deflection", strength=3.0, poses=20)
+    d = diagnosed(c)
+    assert suspects(d) == ("hysteresis",)
+    assert measure_more(config(), "ur10e", c, d, seed=1) is None

@@ -2,7 +2,6 @@
 
 import io
 import json
-from collections import Counter
 
 import pytest
 from rich.console import Console
@@ -22,15 +21,12 @@ from studies.diagnosis_rates import (
     coverage_by_effect,
     followed,
     found,
-    named,
     unknown,
 )
 from studies.diagnosis_table import report
 from studies.study_cases import effects_shown, laws_shown
-from tests.support.cli_cases import ok, refused
+from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.study_diagnosis_cases import asked, outcome, quick, refined, said
-
-Capsys = pytest.CaptureFixture[str]
 
 
 def extent(*kinds: str, **given: object) -> Extent:
@@ -59,13 +55,6 @@ def test_found_is_first_or_in_a_set_of_at_most_three(
     lead: str, same_as: tuple[str, ...], right: bool
 ) -> None:
     assert found(outcome(lead, *same_as)) is right
-
-
-def test_named_takes_a_verdict_that_names_an_effect() -> None:
-    quiet = Outcome(asked(), said(verdict="adequate"))
-    assert found(quiet)
-    assert not named(quiet)
-    assert named(Outcome(asked(), said(verdict="ambiguous")))
 
 
 def test_what_came_first_instead_is_counted() -> None:
@@ -158,29 +147,6 @@ def test_everything_is_asked_of_every_arm() -> None:
     assert {(q.mode, q.hidden) for q in first} == {(q.mode, q.hidden) for q in every}
 
 
-def test_totals_are_shared_by_the_arms() -> None:
-    every = questions(extent("nothing", "noise", nothing=10, noise=4))
-    count = Counter((q.kind, q.mode, q.stated) for q in every)
-    assert count["nothing", "absolute", 1.0] == count["nothing", "deflection", 1.0] == 10
-    assert all(count["noise", m, stated] == 4 for m in MODES for stated in (0.5, 2.0))
-    assert Counter(q.robot for q in every if q.kind == "nothing") == {"ur3e": 10, "ur10e": 10}
-    assert all(q.cycles == 2 for q in every if q.kind == "noise")
-
-
-def test_pairs_are_random_and_the_same_every_time() -> None:
-    every = questions(extent("pairs", pairs=40))
-    assert every == questions(extent("pairs", pairs=40))
-    assert all(len(set(q.hidden)) == 2 for q in every)
-    assert len({q.hidden for q in every}) > 60
-    alone = {m: ("creep",) for m in MODES}
-    assert questions(extent("pairs", effects=alone)) == ()
-
-
-def test_a_further_round_is_asked_at_half_sigma() -> None:
-    every = questions(extent("hidden", seeds=1, again=True))
-    assert {q.strength for q in every if q.again} == {0.5}
-
-
 def test_a_case_that_fails_is_a_miss_that_says_why() -> None:
     def broken(question: object) -> Sample:
         raise ValueError("no\n such thing")
@@ -202,16 +168,6 @@ def test_a_campaign_that_cannot_be_does_not_count() -> None:
     (row,) = by_effect([outcome(), o])
     assert (row.found.hits, row.found.cases, row.instead) == (1, 1, ())
     assert "1 campaigns cannot be" in written([outcome(), o])
-
-
-@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_results_come_in_order_of_the_questions(jobs: int) -> None:
-    every = tuple(asked(seed=s) for s in range(30))
-    told: list[int] = []
-    outcomes, complete = run_all(every, quick, jobs, told.append)
-    assert complete
-    assert tuple(o.asked for o in outcomes) == every
-    assert sum(told) == 30
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
@@ -243,15 +199,6 @@ def written(outcomes: list[Outcome]) -> str:
         out.print(part)
     assert isinstance(out.file, io.StringIO)
     return out.file.getvalue()
-
-
-def test_tables_show_rates_and_what_came_first_instead() -> None:
-    cases = [outcome(), outcome("backlash"), outcome("backlash"), outcome(strength=0.5)]
-    row, other = (line for line in written(cases).splitlines() if line.startswith("creep"))
-    assert row.split() == [
-        *("creep", "3", "33", "%", "33", "%", "1.0", "100", "%", "100", "%", "1.0"),
-    ]
-    assert other.split() == ["creep", "backlash", "2"]
 
 
 def test_the_document_is_json_and_holds_every_case() -> None:
