@@ -25,7 +25,7 @@ from hilcal.measuring.connect import driver
 from hilcal.names import quoted
 from hilcal.present import text
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
-from hilcal.tables.quantities import LENGTHS
+from hilcal.tables.units import LENGTHS
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 

@@ -41,7 +41,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.new_campaign import may_write
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
-from hilcal.tables.quantities import parse_duration, parse_length
+from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""

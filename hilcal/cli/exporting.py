@@ -24,8 +24,7 @@ from hilcal.present.progress import Say, working
 from hilcal.present.text_registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.store.robot_file import ROBOT_FILE
-from hilcal.tables.revision_table import revision_table
-from hilcal.tables.tabular import check_suffix, write_columns
+from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
 MANY = 10.0

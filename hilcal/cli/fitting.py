@@ -37,7 +37,7 @@ from hilcal.present.text_registration import other_arm_line
 from hilcal.present.text_scalings import scalings_table
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
-from hilcal.tables.tabular import is_parquet
+from hilcal.tables.files import is_parquet
 
 Readings = Annotated[
     str | None,

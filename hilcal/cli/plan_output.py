@@ -13,7 +13,7 @@ from hilcal.design.checked_plan import CheckedPlan
 from hilcal.design.next import PairPower
 from hilcal.errors import InputError
 from hilcal.present.progress import working
-from hilcal.tables.plan_csv import plan_csv
+from hilcal.tables.write import plan_csv
 from hilcal.whole_file import replace_file
 
 POSES = 20

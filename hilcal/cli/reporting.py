@@ -10,7 +10,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.present.progress import working
-from hilcal.tables.quantities import parse_length
+from hilcal.tables.units import parse_length
 
 
 def report(

@@ -12,7 +12,7 @@ from hilcal.cli.terminal import Json, Revision, Run, terminal
 from hilcal.errors import CannotAnswerError, HilcalError, LimitError
 from hilcal.present import text, text_validate
 from hilcal.present.progress import working
-from hilcal.tables.quantities import parse_length
+from hilcal.tables.units import parse_length
 from hilcal.validation import validate as validate_campaign
 
 OVER = 5.0

@@ -10,7 +10,7 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.measuring.progress import GoalStatus
-from hilcal.tables.quantities import LENGTHS
+from hilcal.tables.units import LENGTHS
 
 JOINTS = JointCompliance.name
 """The effect that "joint" and "j3" are short for."""

@@ -19,10 +19,10 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
-from hilcal.tables.csvfile import CsvTable
-from hilcal.tables.stated_noise import floored, rounding_variance, with_rounding
+from hilcal.tables.files import is_plain, package
+from hilcal.tables.grid import Table
 from hilcal.tables.table import instrument_covariance, stated_covariance, states_of
-from hilcal.tables.tabular import is_plain, pyarrow_module
+from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
 from hilcal.types import Floats
 
 NAMES = ("pose", "load", "cycle")
@@ -78,7 +78,7 @@ class ReadingStream:
             name: _numbers(self.path, name, found.column(k), row)
             for k, name in enumerate(self.columns)
         }
-        table = CsvTable(str(self.path), self.columns, rows, {}, number)
+        table = Table(str(self.path), rows, {}, number)
         states = states_of(table, self.arm)
         value = table.matrix(columns.POSITION)
         checks.check_positions(table, value, states.q, self.arm)
@@ -145,7 +145,7 @@ def open_stream(
 
 
 def _opened(path: Path) -> Any:
-    parquet = pyarrow_module(path, "pyarrow.parquet")
+    parquet = package(path, "pyarrow.parquet", "Parquet")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:

@@ -30,7 +30,7 @@ from hilcal.store.rows import _reading_crc, text_crc
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import load_mapping
 from hilcal.tables.parquet_stream import open_stream
-from hilcal.tables.revision_table import revision_table
+from hilcal.tables.write import revision_table
 from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import (

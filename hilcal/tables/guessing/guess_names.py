@@ -10,7 +10,7 @@ from hilcal.readings.readings import SAME_POSE
 from hilcal.tables.guessing import column_names as words
 from hilcal.tables.guessing.guess_values import time_unit
 from hilcal.tables.guessing.guesser import REPORTED, SHOWN, Guesser
-from hilcal.tables.mapping_sections import UNLOADED
+from hilcal.tables.mapping import UNLOADED
 from hilcal.tables.units import ANGLES
 
 

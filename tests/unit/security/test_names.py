@@ -63,12 +63,12 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.rows import text_crc
-from hilcal.tables.grid import read_text
+from hilcal.tables.files import open_grid
 from hilcal.tables.guessing.proposal import Proposal
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.plan_csv import plan_csv
+from hilcal.tables.mapping import FileFormat
 from hilcal.tables.table import read_table, write_table
-from hilcal.tables.tabular import read_parquet, write_columns
+from hilcal.tables.text import read_text
+from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, simple
@@ -449,7 +449,7 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name: str) -> None:
     grid = as_csv(["a", "b"], [said, 1])
     refused_or(lambda: read_text("g.csv", grid, FileFormat()).text("a")[0], name, "grid")
     pq.write_table(pa.table({"pose": [name]}), folder / "p.parquet")
-    refused_or(lambda: read_parquet(folder / "p.parquet", lambda h: (h, [])).text["pose"][0], name)
+    refused_or(lambda: open_grid(folder / "p.parquet", FileFormat()).text("pose")[0], name)
     text = Plan((name,), np.zeros((1, 6)), (Step(name, "none"),)).to_json()
     refused_or(lambda: read_plan(text, "plan.json").pose_names[0].strip(), name, "plan")
 

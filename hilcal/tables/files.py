@@ -9,6 +9,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import date, datetime, time
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 from xml.parsers import expat
@@ -18,22 +19,21 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.tables import matfile
-from hilcal.tables.grid import Cell, Grid, content_of, joined, read_text, table, unique
-from hilcal.tables.mapping import Mapping
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.tabular import is_plain, limited_parquet
+from hilcal.tables.grid import Cell, Check, Grid, joined, unique
+from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.text import grid_of_rows, read_text
 from hilcal.toml import suggest
 
+READ = {b"PK\x03\x04": "XLSX", b"PAR1": "Parquet", b"MATLAB": "MAT"}
+"""First bytes of files that are no text, and their kind."""
+_PICKLE = "a Python pickle, which is never loaded; save it as CSV"
 REFUSED = {
     b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
     b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
     b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
     b"\x1f\x8b": "a gzip file; unpack it first",
     b"\x93NUMPY": "a NumPy file; save it as CSV",
-    b"\x80\x02": "a Python pickle, which is never loaded; save it as CSV",
-    b"\x80\x03": "a Python pickle, which is never loaded; save it as CSV",
-    b"\x80\x04": "a Python pickle, which is never loaded; save it as CSV",
-    b"\x80\x05": "a Python pickle, which is never loaded; save it as CSV",
+    **{b"\x80" + bytes([version]): _PICKLE for version in range(2, 6)},
     b"%PDF": "a PDF; save the table as CSV",
 }
 """First bytes of files that are not read, and what they are."""
@@ -68,30 +68,69 @@ def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) 
 
 
 @limits.bounded
-def open_grid(path: str | Path, how: FileFormat) -> Grid:
+def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> Grid:
     """Open one file as a table of cells.
+
+    Args:
+        path: the file.
+        how: it is written.
+        check: is given the names of its columns as it has them, with repeats and empty ones.
 
     Raises:
         InputError: no such file, a kind that is not read, no table in it, or the package that
             reads it is not installed.
     """
     name, content = str(path), content_of(path)
-    if not content.strip(b"\xef\xbb\xbf \t\r\n"):
-        raise InputError(f"{name}: the file is empty; expected a table of readings")
-    for magic, what in REFUSED.items():
-        if content.startswith(magic):
-            raise InputError(f"{name}: {what}; expected text, XLSX, MAT or Parquet")
+    kind = kind_of(name, content)
     with _undamaged(name, "what its first bytes say"):
-        if content.startswith(b"PK\x03\x04"):
-            return _xlsx(name, content, how)
-        if content.startswith(b"PAR1"):
-            return _parquet(name, content, how)
-        if content.startswith(b"MATLAB"):
-            return _mat(name, how)
+        match kind:
+            case "XLSX":
+                return _xlsx(name, content, how, check)
+            case "Parquet":
+                return _parquet(name, content, how, check)
+            case "MAT":
+                return _mat(name, how, check)
     if how.sheet or how.variable:
         key = "sheet" if how.sheet else "variable"
         raise InputError(f"{name}: text has no {key}; remove [file] {key}")
-    return read_text(name, content, how)
+    return read_text(name, content, how, check)
+
+
+def content_of(path: str | Path) -> bytes:
+    """Read a file.
+
+    Raises:
+        InputError: no such file, or it cannot be read.
+    """
+    try:
+        return limits.read_bytes(Path(path), limits.TABLE)
+    except FileNotFoundError as e:
+        raise InputError(f"{path}: no such file") from e
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+
+
+def kind_of(path: str, content: bytes) -> str:
+    """Return the kind of a file by its first bytes: one of `READ`, else "text".
+
+    Raises:
+        InputError: it is empty, or of a kind that is not read.
+    """
+    if not content.strip(b"\xef\xbb\xbf \t\r\n"):
+        raise InputError(f"{path}: the file is empty; expected a table of readings")
+    for magic, what in REFUSED.items():
+        if content.startswith(magic):
+            raise InputError(f"{path}: {what}; expected text, XLSX, MAT or Parquet")
+    return next((kind for magic, kind in READ.items() if content.startswith(magic)), "text")
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether a file begins as Parquet does."""
+    try:
+        with path.open("rb") as stream:
+            return READ.get(stream.read(4)) == "Parquet"
+    except OSError:
+        return False
 
 
 @contextmanager
@@ -110,9 +149,12 @@ def _short(error: Exception) -> str:
     return words if len(words) <= 80 else words[:77] + "..."
 
 
-def _package(path: str, name: str, what: str) -> Any:
-    from importlib import import_module
+def package(path: str | Path, name: str, what: str) -> Any:
+    """Import a package that a kind of file needs.
 
+    Raises:
+        InputError: it is not installed.
+    """
     try:
         return import_module(name)
     except ImportError as e:
@@ -121,7 +163,7 @@ def _package(path: str, name: str, what: str) -> Any:
         ) from e
 
 
-def _xlsx(path: str, content: bytes, how: FileFormat) -> Grid:
+def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
     sheets = sheet_names(path, content)
     if how.sheet is not None and how.sheet not in sheets:
         raise InputError(
@@ -132,7 +174,7 @@ def _xlsx(path: str, content: bytes, how: FileFormat) -> Grid:
     found = sheet_rows(path, content, sheet, how.comment)
     if not found:
         raise InputError(f"{path}: sheet '{sheet}' is empty; it has {', '.join(sheets)}")
-    return table(path, found, how)
+    return grid_of_rows(path, found, how, check)
 
 
 def _book(path: str, content: bytes) -> Any:
@@ -144,7 +186,7 @@ def _book(path: str, content: bytes) -> Any:
         for member in members:
             with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
                 _check_xml(path, member.filename, stream)
-    openpyxl = _package(path, "openpyxl", "XLSX")
+    openpyxl = package(path, "openpyxl", "XLSX")
     return openpyxl.load_workbook(
         io.BytesIO(content), read_only=True, data_only=True, keep_links=False
     )
@@ -249,31 +291,68 @@ def _cell(value: object) -> Cell:
     return text or None
 
 
-def _columns(path: str, named: list[tuple[str, list[Cell]]], how: FileFormat) -> Grid:
+def _columns(
+    path: str, named: list[tuple[str, list[Cell]]], how: FileFormat, check: Check | None
+) -> Grid:
     if not named or not named[0][1]:
         raise InputError(f"{path}: no readings; expected columns of equal length")
-    names = unique([name for name, _ in named])
+    titles = [name for name, _ in named]
+    if check is not None:
+        check(titles)
     rows = np.arange(1, len(named[0][1]) + 1)
-    grid = Grid(path, names, rows, tuple(cells for _, cells in named), (how,) * len(names))
+    columns = tuple(cells for _, cells in named)
+    grid = Grid(path, unique(titles), rows, columns, (how,) * len(named))
     return grid.rows_with(~np.isin(rows, how.skip_rows))
 
 
-def _parquet(path: str, content: bytes, how: FileFormat) -> Grid:
-    parquet = _package(path, "pyarrow.parquet", "Parquet")
-    _, found = limited_parquet(
-        path,
-        lambda **options: parquet.ParquetFile(io.BytesIO(content), **options),
-        lambda schema: [f.name for f in schema if is_plain(f.type)],
-    )
-    named = []
-    for name in found.column_names:
-        values = found[name].to_pylist()
-        if not any(isinstance(v, list | dict | bytes) for v in values):
-            named.append((name, [_cell(v) for v in values]))
-    return _columns(path, named, how)
+def _parquet(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
+    """Columns of numbers, texts and times of a Parquet file; rows count from 1.
+
+    The metadata tell how large they become. Texts stay as numbers of a dictionary until it is known
+    how long all of them are together: a file of 0.3 MB may hold one of 1 MB in each of 5,000 rows.
+    """
+    parquet = package(path, "pyarrow.parquet", "Parquet")
+    from pyarrow import compute
+
+    schema = parquet.ParquetFile(io.BytesIO(content)).schema_arrow
+    names = [f.name for f in schema if is_plain(f.type)]
+    texts = [f.name for f in schema if is_text(f.type)]
+    file = parquet.ParquetFile(io.BytesIO(content), read_dictionary=texts)
+    meta = file.metadata
+    limits.check_cells(path, meta.num_rows, max(len(names), 1))
+    # By row groups: pyarrow ends the process where the statistics of a column are damaged.
+    sizes = (meta.row_group(k).total_byte_size for k in range(meta.num_row_groups))
+    limits.check_size(f"{path}: unpacked", sum(sizes), limits.UNPACKED)
+    found = file.read(columns=names)
+    for name in texts:
+        lengths = (
+            compute.sum(compute.binary_length(part.dictionary).take(part.indices)).as_py() or 0
+            for part in found[name].chunks
+        )
+        limits.check_size(f"{path}: column '{name}'", max(lengths, default=0), limits.UNPACKED // 4)
+    named = [
+        (name, [_cell(v) for v in column.to_pylist()])
+        for name, column in zip(found.column_names, found.columns, strict=True)
+    ]
+    return _columns(path, named, how, check)
 
 
-def _mat(path: str, how: FileFormat) -> Grid:
+def is_text(kind: Any) -> bool:
+    """Whether a column of this type of pyarrow holds texts."""
+    from pyarrow import types
+
+    return bool(types.is_string(kind) or types.is_large_string(kind))
+
+
+def is_plain(kind: Any) -> bool:
+    """Whether a column of this type of pyarrow holds a number, a text or a time in each row."""
+    from pyarrow import types
+
+    numbers = types.is_primitive(kind) or types.is_decimal(kind) or types.is_null(kind)
+    return bool(numbers) or is_text(kind)
+
+
+def _mat(path: str, how: FileFormat, check: Check | None) -> Grid:
     """Columns of a MAT file: those of its matrices that have the same number of rows.
 
     A matrix A of k > 1 columns gives "A(1)" ... "A(k)", poses T of shape (4, 4, N) give
@@ -297,7 +376,7 @@ def _mat(path: str, how: FileFormat) -> Grid:
     named = [
         part for name, values in blocks if len(values) == rows for part in _split(name, values)
     ]
-    return _columns(path, named, how)
+    return _columns(path, named, how, check)
 
 
 def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
