@@ -56,21 +56,7 @@ def read_table(
     station: Floats | Sequence[float] | None = None,
     targets: Sequence[str] = (),
 ) -> Readings:
-    """Read an exchange table; every unit is SI, every complaint names row and column.
-
-    Args:
-        path: a CSV, Parquet or XLSX file with the columns of `columns.known_columns`.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the table has none.
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        targets: names of the cell's targets, see `Cell.target_names`.
-
-    Returns:
-        The readings in the table's order; poses and loads are numbered as they appear.
-
-    Raises:
-        InputError: anything that cannot be right.
-    """
+    """Return the readings of an exchange table; arguments and errors are `import_table`'s."""
     return import_table(path, arm, noise, station, targets).readings
 
 
@@ -81,7 +67,18 @@ def import_table(
     station: Floats | Sequence[float] | None = None,
     targets: Sequence[str] = (),
 ) -> ImportResult:
-    """Read an exchange table as `read_table` does, with notes on where its covariances come from.
+    """Read an exchange table; every unit is SI, every complaint names row and column.
+
+    Args:
+        path: a CSV, Parquet or XLSX file with the columns of `columns.known_columns`.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where the table has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        targets: names of the cell's targets, see `Cell.target_names`.
+
+    Returns:
+        The readings in the table's order, poses and loads numbered as they appear; and notes on
+        where its covariances come from.
 
     Raises:
         InputError: anything that cannot be right.

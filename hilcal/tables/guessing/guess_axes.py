@@ -5,7 +5,7 @@ import numpy as np
 from hilcal.tables.guessing import column_names as words
 from hilcal.tables.guessing.column_names import ColumnName, parse
 from hilcal.tables.guessing.guess_values import is_quaternion, sentinels
-from hilcal.tables.guessing.guesser import SHOWN, SIDE_BY_SIDE, Guesser, angle_unit, length_unit
+from hilcal.tables.guessing.proposal import SHOWN, SIDE_BY_SIDE, Guesser, angle_unit, length_unit
 
 
 def _kind(c: ColumnName) -> str:

@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.tables.grid import Grid
 from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.guesser import FAR, TURN, Guesser, angle_unit, length_unit
+from hilcal.tables.guessing.proposal import FAR, TURN, Guesser, angle_unit, length_unit
 from hilcal.tables.mapped import nines
 from hilcal.types import Floats
 
