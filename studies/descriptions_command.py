@@ -7,8 +7,8 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.present import text
 from hilcal.present.progress import counting

@@ -10,8 +10,8 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.engine.engine import open_engine
 from hilcal.present import text

@@ -9,8 +9,8 @@ import numpy as np
 import typer
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.write_effect import effect_class

@@ -9,11 +9,10 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from hilcal.cell import cell_from_config
 from hilcal.cli.asking import agreed, somebody_there
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.options import Json, argument, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
 from hilcal.config.template import cell_text
@@ -323,47 +322,43 @@ def items() -> tuple[Item, ...]:
 
 
 def init(
-    cell: Annotated[Path, typer.Argument(metavar="CELL.toml", help="The file to write.")] = Path(
-        "CELL.toml"
-    ),
-    robot: Annotated[str | None, typer.Option(help="The arm, e.g. ur10e, or a .urdf.")] = None,
-    host: Annotated[str | None, typer.Option(help="Address of its controller.")] = None,
+    cell: Annotated[Path, argument("CELL.toml", "The file to write.")] = Path("CELL.toml"),
+    robot: Annotated[str | None, option("--robot", "The arm, e.g. ur10e, or a .urdf.")] = None,
+    host: Annotated[str | None, option("--host", "Address of its controller.")] = None,
     repeatability: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help='As the maker states it (ISO 9283), e.g. "0.05 mm".'),
+        option("--repeatability LENGTH", 'As the maker states it (ISO 9283), e.g. "0.05 mm".'),
     ] = None,
-    tracker: Annotated[str | None, typer.Option(help="The tracker's driver.")] = None,
-    tracker_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
+    tracker: Annotated[str | None, option("--tracker", "The tracker's driver.")] = None,
+    tracker_port: Annotated[str | None, option("--tracker-port", "Its serial port.")] = None,
     tracker_accuracy: Annotated[
         str | None,
-        typer.Option(metavar="LENGTH", help='Standard deviation of a point, e.g. "8 um + 3 um/m".'),
+        option("--tracker-accuracy LENGTH", 'Standard deviation of a point, e.g. "8 um + 3 um/m".'),
     ] = None,
-    force_sensor: Annotated[str | None, typer.Option(help="The force sensor's driver.")] = None,
-    force_port: Annotated[str | None, typer.Option(help="Its serial port.")] = None,
-    target: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="The target in flange axes, m.")
+    force_sensor: Annotated[
+        str | None, option("--force-sensor", "The force sensor's driver.")
     ] = None,
+    force_port: Annotated[str | None, option("--force-port", "Its serial port.")] = None,
+    target: Annotated[str | None, option("--target X,Y,Z", "The target in flange axes, m.")] = None,
     load_point: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Where loads act, flange axes, m.")
+        str | None, option("--load-point X,Y,Z", "Where loads act, flange axes, m.")
     ] = None,
-    tool_mass: Annotated[str | None, typer.Option(metavar="KG", help="Of the tool.")] = None,
+    tool_mass: Annotated[str | None, option("--tool-mass KG", "Of the tool.")] = None,
     tool_com: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="The tool's centre of mass, m.")
+        str | None, option("--tool-com X,Y,Z", "The tool's centre of mass, m.")
     ] = None,
     load: Annotated[
-        list[str] | None, typer.Option(metavar="LOAD", help=f"A load, {LOADS}; repeatable.")
+        list[str] | None, option("--load LOAD", f"A load, {LOADS}; repeatable.")
     ] = None,
     readings: Annotated[
         str | None,
-        typer.Option(metavar="KIND", help="absolute (unless given) or deflection: what is fitted."),
+        option("--readings KIND", "absolute (unless given) or deflection: what is fitted."),
     ] = None,
-    floor: Annotated[
-        str | None, typer.Option(metavar="Z", help="Height that the arm stays above, m.")
-    ] = None,
+    floor: Annotated[str | None, option("--floor Z", "Height that the arm stays above, m.")] = None,
     tracker_place: Annotated[
-        str | None, typer.Option(metavar="X,Y,Z", help="Of the tracker in base axes, m.")
+        str | None, option("--tracker-place X,Y,Z", "Of the tracker in base axes, m.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""

@@ -2,13 +2,19 @@
 
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import fit_of
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Revision,
+    Run,
+    Scheduler,
+    Workers,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.bootstrap import DRAWS, check_draws
@@ -20,8 +26,8 @@ from hilcal.present.text_bootstrap import bootstrap_report, to_json
 def bootstrap(
     run: Run,
     revision: Revision = None,
-    draws: Annotated[int, typer.Option("--draws", metavar="N", help="Campaigns drawn.")] = DRAWS,
-    seed: Annotated[int, typer.Option("--seed", help="Of the draws.")] = 0,
+    draws: Annotated[int, option("--draws N", "Campaigns drawn.")] = DRAWS,
+    seed: Annotated[int, option("--seed", "Of the draws.")] = 0,
     workers: Workers = None,
     scheduler: Scheduler = None,
     effects_from: EffectsFrom = None,

@@ -7,18 +7,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.asking import somebody_there
 from hilcal.cli.calibrating_steps import Operator
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.plan_output import POSES
-from hilcal.cli.planning import CellFile, read_cell
-from hilcal.cli.prior import Prior, PriorOptions
-from hilcal.cli.terminal import Json, Terminal, terminal
-from hilcal.cli.viewing import View, followed
+from hilcal.cli.options import (
+    POSES,
+    CellFile,
+    EffectsFrom,
+    Json,
+    Prior,
+    View,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.planning import read_cell
+from hilcal.cli.prior import PriorOptions
+from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.viewing import followed
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
 from hilcal.effects.catalogue import Catalogue
@@ -55,58 +61,51 @@ def calibrate(
     cell: CellFile,
     output: Annotated[
         Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RUN.hilcal",
-            help="The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
+        option(
+            "-o --output RUN.hilcal",
+            "The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
         ),
     ],
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what RUN.hilcal holds, after any stop.")
+        bool, option("--resume", "Go on with what RUN.hilcal holds, after any stop.")
     ] = False,
     goal: Annotated[
         str | None,
-        typer.Option(
-            "--goal",
-            metavar="LENGTH",
-            help='The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: '
-            "it is measured on until 95 % of points are predicted to be within it after "
+        option(
+            "--goal LENGTH",
+            'The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: it '
+            "is measured on until 95 % of points are predicted to be within it after "
             "compensation, as far as that can be had.",
         ),
     ] = None,
     limit: Annotated[
         str | None,
-        typer.Option(
-            "--limit",
-            metavar="LENGTH",
-            help="The largest error allowed at the corrected targets, as measured; exit 5 where it "
+        option(
+            "--limit LENGTH",
+            "The largest error allowed at the corrected targets, as measured; exit 5 where it "
             "is not kept.",
         ),
     ] = None,
     max_time: Annotated[
         str | None,
-        typer.Option(
-            "--max-time",
-            metavar="TIME",
-            help=f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
+        option(
+            "--max-time TIME",
+            f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
         ),
     ] = None,
     poses: Annotated[
-        int | None, typer.Option("--poses", help=f"Size of the plan, {POSES} unless given.")
+        int | None, option("--poses", f"Size of the plan, {POSES} unless given.")
     ] = None,
     validation: Annotated[
         int | None,
-        typer.Option(
-            "--validation", help=f"Poses of the validation campaign, {VALIDATION} unless given."
-        ),
+        option("--validation", f"Poses of the validation campaign, {VALIDATION} unless given."),
     ] = None,
     prior: Prior = None,
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="In one simulated cell, from the first to the last.")
+        bool, option("--rehearse", "In one simulated cell, from the first to the last.")
     ] = False,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before the arm moves; for scripts.")
+        bool, option("--yes -y", "Do not ask before the arm moves; for scripts.")
     ] = False,
     view: View = False,
     effects_from: EffectsFrom = None,

@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.options import Json, Run, argument, option
+from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
@@ -35,10 +34,10 @@ def info(run: Run, as_json: Json = False) -> None:
 def accept(
     run: Run,
     number: Annotated[
-        int | None, typer.Argument(metavar="N", help="The revision; the latest one if left out.")
+        int | None, argument("N", "The revision; the latest one if left out.")
     ] = None,
     release: Annotated[
-        bool, typer.Option("--release", help="Accept none: the latest one is used again.")
+        bool, option("--release", "Accept none: the latest one is used again.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -73,10 +72,8 @@ def repair(
     run: Run,
     robot: Annotated[
         Path | None,
-        typer.Option(
-            "--robot",
-            metavar="FILE",
-            help="URDF or DH table of its robot, for a campaign that does not hold it.",
+        option(
+            "--robot FILE", "URDF or DH table of its robot, for a campaign that does not hold it."
         ),
     ] = None,
     as_json: Json = False,

@@ -4,12 +4,10 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import called, finish, fit_of, titles
-from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
@@ -25,16 +23,16 @@ def compare(
     run: Run,
     later: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[LATER.hilcal]",
-            help="A later campaign of the same arm, of 15 readings or more: what has changed?",
+        argument(
+            "[LATER.hilcal]",
+            "A later campaign of the same arm, of 15 readings or more: what has changed?",
         ),
     ] = None,
     same_setup: Annotated[
         bool,
-        typer.Option(
+        option(
             "--same-setup",
-            help="With LATER: tracker and base stand as they did; else the tracker's place is "
+            "With LATER: tracker and base stand as they did; else the tracker's place is "
             "estimated from the later readings.",
         ),
     ] = False,

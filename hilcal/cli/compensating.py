@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
@@ -22,8 +21,8 @@ from hilcal.calibration.urscript import (
     with_joints,
 )
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Revision, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, argument, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
@@ -61,66 +60,46 @@ class _Task:
 
 def compensate(
     model: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN.hilcal", help="A campaign with a revision, or a calibration (JSON)."
-        ),
+        Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
     ],
     points: Annotated[
-        Path,
-        typer.Argument(
-            metavar="POINTS", help="Where to go: a table (CSV) or a UR program (.script)."
-        ),
+        Path, argument("POINTS", "Where to go: a table (CSV) or a UR program (.script).")
     ],
     output: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "-o", "--output", metavar="F", help="Write CSV, JSON or a UR program; repeatable."
-        ),
+        list[Path] | None, option("-o --output F", "Write CSV, JSON or a UR program; repeatable.")
     ] = None,
     load: Annotated[
-        str | None,
-        typer.Option("--load", metavar="NAME", help="The load at every point, of [[loads]]."),
+        str | None, option("--load NAME", "The load at every point, of [[loads]].")
     ] = None,
     wrench: Annotated[
         str | None,
-        typer.Option(
-            "--wrench",
-            metavar='"FX FY FZ MX MY MZ"',
-            help="Force and moment at the load point, base axes, N and N·m.",
+        option(
+            '--wrench "FX FY FZ MX MY MZ"',
+            "Force and moment at the load point, base axes, N and N·m.",
         ),
     ] = None,
     tool: Annotated[
         str | None,
-        typer.Option(
-            "--tool",
-            metavar='"X Y Z RX RY RZ"',
-            help="The tool on the flange, m and rad; the tracked target unless given.",
+        option(
+            '--tool "X Y Z RX RY RZ"',
+            "The tool on the flange, m and rad; the tracked target unless given.",
         ),
     ] = None,
     near: Annotated[
-        str | None,
-        typer.Option(
-            "--near", metavar='"Q1 Q2 .. QN"', help="Joint values near the first pose, degrees."
-        ),
+        str | None, option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees.")
     ] = None,
     outside: Annotated[
-        bool,
-        typer.Option("--allow-outside", help="Also points outside of what was measured."),
+        bool, option("--allow-outside", "Also points outside of what was measured.")
     ] = False,
     leave: Annotated[
-        bool,
-        typer.Option(
-            "--leave", help="Keep waypoints of a program that cannot be corrected as they are."
-        ),
+        bool, option("--leave", "Keep waypoints of a program that cannot be corrected as they are.")
     ] = False,
     revision: Revision = None,
     effects_from: EffectsFrom = None,
     kind: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="table, or a mapping, as for import."),
+        str, option("--format FORMAT", "table, or a mapping, as for import.")
     ] = "table",
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
     as_json: Json = False,
 ) -> None:
     """Find the joint values that put the tool where it was asked to be, under a load."""

@@ -2,11 +2,10 @@
 
 from typing import Annotated
 
-import typer
-
 from drivers.geocom import Options as GeoComOptions
 from drivers.ur_link.options import UrOptions
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, argument
+from hilcal.cli.terminal import terminal
 from hilcal.config import reference
 from hilcal.present import text_config
 from hilcal.toml import Section
@@ -20,9 +19,7 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 
 
 def config(
-    section: Annotated[
-        str | None, typer.Argument(metavar="SECTION", help="One of them, e.g. tracker.")
-    ] = None,
+    section: Annotated[str | None, argument("SECTION", "One of them, e.g. tracker.")] = None,
     as_json: Json = False,
 ) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""

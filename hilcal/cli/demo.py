@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from drivers.simulated.rehearsal import (
     INVENTED,
@@ -24,8 +23,8 @@ from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
 from hilcal.cli.doubting import CAMPAIGNS, Doubted, doubted, doubtful_case
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, finish, record_story
+from hilcal.cli.options import EffectsFrom, Json, Record, catalogue_with, option
 from hilcal.cli.refining import Row, revisions_json
 from hilcal.cli.rehearsing import (
     Measured,
@@ -34,7 +33,7 @@ from hilcal.cli.rehearsing import (
     in_process,
     on_devices,
 )
-from hilcal.cli.terminal import Json, Record, Terminal, terminal
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
 from hilcal.discovery.agreement import agreement
 from hilcal.discovery.proposal import LawSearch
@@ -65,30 +64,27 @@ VALIDATION = 10
 def demo(
     hide: Annotated[
         str | None,
-        typer.Option(
-            "--hide",
-            metavar="EFFECT",
-            help="An effect, random, nothing, or invented: a law that the catalogue lacks.",
+        option(
+            "--hide EFFECT",
+            "An effect, random, nothing, or invented: a law that the catalogue lacks.",
         ),
     ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file to make."),
-    ] = Path("demo.hilcal"),
-    poses: Annotated[int, typer.Option("--poses", help="See hilcal plan.")] = POSES,
+    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
+    output: Annotated[Path, option("-o --output RUN.hilcal", "The campaign file to make.")] = Path(
+        "demo.hilcal"
+    ),
+    poses: Annotated[int, option("--poses", "See hilcal plan.")] = POSES,
     validation: Annotated[
-        int, typer.Option("--validation", help="Poses at which the corrected arm is measured.")
+        int, option("--validation", "Poses at which the corrected arm is measured.")
     ] = VALIDATION,
     without_devices: Annotated[
-        bool,
-        typer.Option("--without-devices", help="Draw the readings at once, through no wire."),
+        bool, option("--without-devices", "Draw the readings at once, through no wire.")
     ] = False,
     ambiguous: Annotated[
         bool,
-        typer.Option(
+        option(
             "--ambiguous",
-            help="Measure little at first, so that the effect is in doubt; then what settles it.",
+            "Measure little at first, so that the effect is in doubt; then what settles it.",
         ),
     ] = False,
     record: Record = None,

@@ -3,13 +3,11 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_options, fit_of, wanted_effects
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, option
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.discovery import discover as search
 from hilcal.discovery.discovery import rival_sources
@@ -28,23 +26,20 @@ from hilcal.whole_file import replace_file
 
 def discover(
     run: Run,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="F.py", help="The effect, to be edited.")
-    ],
+    output: Annotated[Path, option("-o --output F.py", "The effect, to be edited.")],
     against: Annotated[
         str | None,
-        typer.Option(
-            "--against",
-            metavar="MODEL",
-            help="Beside this model instead of the revision in use: effects A,B; baseline; or the "
+        option(
+            "--against MODEL",
+            "Beside this model instead of the revision in use: effects A,B; baseline; or the "
             "file of an exported calibration, whose effects are fitted to this run.",
         ),
     ] = None,
     alternatives: Annotated[
         bool,
-        typer.Option(
+        option(
             "--alternatives",
-            help="Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
+            "Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
             "plans what separates them.",
         ),
     ] = False,

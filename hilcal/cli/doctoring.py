@@ -4,12 +4,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 import hilcal
 from drivers.ur_link.services import SERVICES
+from hilcal.cli.options import Json, argument, option
 from hilcal.cli.planning import read_cell
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.doctor.computer import computer
 from hilcal.doctor.finding import Finding
@@ -26,12 +25,9 @@ SIMULATED = "simulated"
 
 def doctor(
     cell: Annotated[
-        Path | None,
-        typer.Argument(metavar="CELL.toml", help="Also look at this cell's ports and addresses."),
+        Path | None, argument("CELL.toml", "Also look at this cell's ports and addresses.")
     ] = None,
-    folder: Annotated[
-        Path, typer.Option("--folder", metavar="DIR", help="Where campaigns are stored.")
-    ] = Path("."),
+    folder: Annotated[Path, option("--folder DIR", "Where campaigns are stored.")] = Path("."),
     as_json: Json = False,
 ) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""

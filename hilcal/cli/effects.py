@@ -10,8 +10,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import EffectsFrom, Json, argument, catalogue_with, option
+from hilcal.cli.terminal import terminal
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME
@@ -69,12 +69,12 @@ def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -
     out = text.table("effect", "option", "what it chooses", left=(0, 1, 2))
     explained: dict[tuple[str, str], str] = {}
     for e in made:
-        for option, meaning in e.option_help.items():
-            first = explained.setdefault((option, meaning), e.name)
+        for name, meaning in e.option_help.items():
+            first = explained.setdefault((name, meaning), e.name)
             words = meaning if first == e.name else f"as for {first}"
-            default = written(defaults[e.name][option])
+            default = written(defaults[e.name][name])
             given = ("\ndefault: " + default, "dim") if default else ("", "")
-            out.add_row(e.name, option, Text.assemble(words, given))
+            out.add_row(e.name, name, Text.assemble(words, given))
     return out
 
 
@@ -104,10 +104,9 @@ def _source(kind: type[Effect], catalogue: Catalogue) -> str:
 
 
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Lower case, digits and _.")],
+    name: Annotated[str, argument("NAME", "Lower case, digits and _.")],
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="FILE.py", help="The file; NAME.py by default."),
+        Path | None, option("-o --output FILE.py", "The file; NAME.py by default.")
     ] = None,
     as_json: Json = False,
 ) -> None:

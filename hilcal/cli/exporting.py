@@ -14,8 +14,8 @@ from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected, corrected
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.identification.residual_table import residual_table
@@ -65,7 +65,7 @@ def export(
     urdf: Annotated[Path | None, _file("F.urdf", "The arm with its corrected geometry.")] = None,
     dh: Annotated[Path | None, _file("F.toml|F.csv", "The same as a DH table.")] = None,
     modified: Annotated[
-        bool, typer.Option("--dh-modified", help="Rows of --dh as Craig writes them.")
+        bool, option("--dh-modified", "Rows of --dh as Craig writes them.")
     ] = False,
     ur_kinematics: Annotated[
         Path | None, _file("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
@@ -80,7 +80,7 @@ def export(
         Path | None, _file("F.json", "Tool and base as fitted, and as a controller takes them.")
     ] = None,
     revision: Revision = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -144,18 +144,18 @@ def _check(
     for path in tables:
         if path is not None:
             check_suffix(path)
-    for given, option, valid in (
+    for given, name, valid in (
         (parameters, "--parameters", (".json", ".csv")),
         (geometry.dh, "--dh", (".toml", ".csv")),
     ):
         if given is not None and given.suffix.lower() not in valid:
-            raise InputError(f"{option} {given}: unknown kind of file; valid: {' or '.join(valid)}")
-    for what, option, needs in (
+            raise InputError(f"{name} {given}: unknown kind of file; valid: {' or '.join(valid)}")
+    for what, name, needs in (
         (geometry.modified and geometry.dh is None, "--dh-modified", "--dh"),
         (geometry.ur_hash and geometry.ur_kinematics is None, "--ur-hash", "--ur-kinematics"),
     ):
         if what:
-            raise InputError(f"{option} is about {needs}; give it, too")
+            raise InputError(f"{name} is about {needs}; give it, too")
     twice = [path for path in wanted if wanted.count(path) > 1]
     if twice:
         raise InputError(f"{twice[0]}: two things cannot be written to one file")

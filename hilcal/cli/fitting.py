@@ -3,12 +3,8 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import (
     check_options,
     chosen,
@@ -18,9 +14,23 @@ from hilcal.cli.files import (
     titles,
     wanted_effects,
 )
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
+from hilcal.cli.options import (
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Prior,
+    PriorOf,
+    Readings,
+    Run,
+    Scheduler,
+    Workers,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.prior import PriorOptions
 from hilcal.cli.streaming import identify_stream
-from hilcal.cli.terminal import Details, Json, Run, terminal
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.written import write_effect
 from hilcal.errors import InputError
@@ -39,31 +49,23 @@ from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
 from hilcal.tables.files import is_parquet
 
-Readings = Annotated[
-    str | None,
-    typer.Option("--readings", metavar="KIND", help="deflection or absolute."),
-]
-
 
 def identify(
     run: Run,
     effects: Annotated[
         str | None,
-        typer.Option(
-            "--effects",
-            metavar="A,B",
-            help="Effects to fit, besides unknown frames; with options: creep(joints=each).",
+        option(
+            "--effects A,B",
+            "Effects to fit, besides unknown frames; with options: creep(joints=each).",
         ),
     ] = None,
-    scaling: Annotated[
-        str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
-    ] = "gc",
+    scaling: Annotated[str, option("--scaling S", "none, gu, gc or all, side by side.")] = "gc",
     readings: Readings = None,
     fit_validation: Annotated[
         bool,
-        typer.Option(
+        option(
             "--fit-validation",
-            help="Release a validation campaign for fitting; its file says so for good.",
+            "Release a validation campaign for fitting; its file says so for good.",
         ),
     ] = False,
     prior: Prior = None,
@@ -71,15 +73,9 @@ def identify(
     drift: Drift = None,
     effects_from: EffectsFrom = None,
     cell: Annotated[
-        Path | None,
-        typer.Option(
-            "--cell", metavar="CELL.toml", help="The cell of a stream, READINGS.parquet as RUN."
-        ),
+        Path | None, option("--cell CELL.toml", "The cell of a stream, READINGS.parquet as RUN.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", metavar="F.json", help="Of a stream: write its calibration."),
-    ] = None,
+    out: Annotated[Path | None, option("-o F.json", "Of a stream: write its calibration.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     details: Details = False,

@@ -4,11 +4,9 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from hilcal.cli.engine import Scheduler, Workers
 from hilcal.cli.files import check_record
-from hilcal.cli.terminal import Json, Record, terminal
+from hilcal.cli.options import Json, Record, Scheduler, Workers, argument, option
+from hilcal.cli.terminal import terminal
 from hilcal.cli.viewing import opening
 from hilcal.engine.engine import open_engine
 from hilcal.identification.posterior_document import write
@@ -22,15 +20,9 @@ from hilcal.write_report import write_fleet_report
 
 
 def fleet(
-    directory: Annotated[
-        Path, typer.Argument(metavar="DIR", help="With campaign files, in folders below as well.")
-    ],
-    out: Annotated[
-        Path, typer.Option("-o", metavar="PRIOR.json", help="What to expect of another arm.")
-    ],
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="F.html", help="Write it as one HTML page.")
-    ] = None,
+    directory: Annotated[Path, argument("DIR", "With campaign files, in folders below as well.")],
+    out: Annotated[Path, option("-o PRIOR.json", "What to expect of another arm.")],
+    report: Annotated[Path | None, option("--report F.html", "Write it as one HTML page.")] = None,
     record: Record = None,
     workers: Workers = None,
     scheduler: Scheduler = None,

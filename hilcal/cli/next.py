@@ -3,16 +3,30 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, effect_names, fit_of
-from hilcal.cli.plan_output import Csv, Output, Quick, Seed, generator, write
+from hilcal.cli.options import (
+    Csv,
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Output,
+    Prior,
+    PriorOf,
+    Quick,
+    Record,
+    Revision,
+    Run,
+    Seed,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.plan_output import generator, write
 from hilcal.cli.planning import read_cell
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions, fitted_with
-from hilcal.cli.terminal import Details, Json, Record, Revision, Run, Terminal, terminal
+from hilcal.cli.prior import PriorOptions, fitted_with
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.design.next import Next
 from hilcal.diagnosis.doubt import MOST
 from hilcal.diagnosis.verdict import diagnose
@@ -32,19 +46,17 @@ def next_(
     output: Output,
     poses: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--poses",
-            help="As many readings as so many poses take under every load, 20 unless given; new "
+            "As many readings as so many poses take under every load, 20 unless given; new "
             "poses, where a misfit depends on the pose alone.",
         ),
     ] = None,
     suspects: Annotated[
-        str | None,
-        typer.Option("--suspects", metavar="A,B", help="Separate these, whatever is diagnosed."),
+        str | None, option("--suspects A,B", "Separate these, whatever is diagnosed.")
     ] = None,
     cell: Annotated[
-        Path | None,
-        typer.Option("--cell", metavar="CELL.toml", help="The cell, where it has other loads now."),
+        Path | None, option("--cell CELL.toml", "The cell, where it has other loads now.")
     ] = None,
     seed: Seed = 0,
     quick: Quick = False,

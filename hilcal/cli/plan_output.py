@@ -1,10 +1,8 @@
 """Options of `plan` and `next`, and the files that they write."""
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import typer
 
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Terminal
@@ -15,26 +13,6 @@ from hilcal.errors import InputError
 from hilcal.present.progress import working
 from hilcal.tables.write import plan_csv
 from hilcal.whole_file import replace_file
-
-POSES = 20
-
-Output = Annotated[
-    Path, typer.Option("-o", "--output", metavar="PLAN", help="The plan file to make.")
-]
-Poses = Annotated[
-    int,
-    typer.Option(
-        "--poses",
-        help="So many poses, each read unloaded and under every load that it bears.",
-    ),
-]
-Seed = Annotated[int, typer.Option("--seed", help="Of the random candidates.")]
-Quick = Annotated[
-    bool, typer.Option("--quick", help="Without comparing criteria and numbers of poses.")
-]
-Csv = Annotated[
-    Path | None, typer.Option("--csv", metavar="F.csv", help="The plan as a table, too.")
-]
 
 
 def generator(seed: int) -> np.random.Generator:

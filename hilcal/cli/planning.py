@@ -4,15 +4,32 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import check_record, fit_of
-from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Details, Json, Record, Revision, Terminal, terminal
+from hilcal.cli.options import (
+    POSES,
+    CellFile,
+    Csv,
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Output,
+    PlanFile,
+    Poses,
+    Prior,
+    PriorOf,
+    Quick,
+    Record,
+    Revision,
+    Seed,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.plan_output import generator, write
+from hilcal.cli.prior import PriorOptions
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.checked_plan import CheckedPlan, checked, refusal
 from hilcal.design.choice import CRITERIA, canonical
@@ -30,11 +47,6 @@ from hilcal.present.progress import Say, working
 from hilcal.present.text_plan import plan_report, plan_screen
 from hilcal.store.plan import Plan, load_plan
 
-CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
-PlanFile = Annotated[
-    Path | None, typer.Option("--plan", metavar="PLAN", help="The plan, see hilcal plan.")
-]
-
 
 def plan(
     cell: CellFile,
@@ -42,19 +54,17 @@ def plan(
     poses: Poses = POSES,
     readings: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--readings",
-            help="Or so many readings, repeats not counted, at as many poses and under those loads "
+            "Or so many readings, repeats not counted, at as many poses and under those loads "
             "that tell most.",
         ),
     ] = None,
     criterion: Annotated[
-        str | None,
-        typer.Option("--criterion", metavar="|".join(CRITERIA), help="The optimality criterion."),
+        str | None, option(f"--criterion {'|'.join(CRITERIA)}", "The optimality criterion.")
     ] = None,
     after: Annotated[
-        Path | None,
-        typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
+        Path | None, option("--after RUN.hilcal", "Plan on from what it knows already.")
     ] = None,
     revision: Revision = None,
     prior: Prior = None,
@@ -63,9 +73,9 @@ def plan(
     seed: Seed = 0,
     unloaded_first: Annotated[
         bool,
-        typer.Option(
+        option(
             "--unloaded-first",
-            help="All unloaded readings before the loads: for run --until; a drift costs more.",
+            "All unloaded readings before the loads: for run --until; a drift costs more.",
         ),
     ] = False,
     quick: Quick = False,

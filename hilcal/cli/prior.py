@@ -2,9 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.files import chosen
@@ -15,31 +12,6 @@ from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import Fit, fit
-
-Prior = Annotated[
-    Path | None,
-    typer.Option(
-        "--prior",
-        metavar="OTHER.hilcal",
-        help="What another campaign taught of this arm: its file, or the JSON of a posterior.",
-    ),
-]
-PriorOf = Annotated[
-    str,
-    typer.Option(
-        "--prior-of",
-        metavar="KIND",
-        help="Whose campaign that was: arm (the same) or type (another arm of the type).",
-    ),
-]
-Drift = Annotated[
-    str | None,
-    typer.Option(
-        "--drift",
-        metavar="A=X,B=X",
-        help="By how much effects have changed since then, in ordinary magnitudes.",
-    ),
-]
 
 
 @dataclass(frozen=True, slots=True)

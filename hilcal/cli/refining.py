@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import (
     check_options,
     check_record,
@@ -22,10 +19,26 @@ from hilcal.cli.files import (
     stored_fit,
     wanted_effects,
 )
-from hilcal.cli.fitting import Readings, options_json, options_line
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Details, Json, Record, Revision, Run, terminal
-from hilcal.cli.viewing import View, followed
+from hilcal.cli.fitting import options_json, options_line
+from hilcal.cli.options import (
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Prior,
+    PriorOf,
+    Readings,
+    Record,
+    Revision,
+    Run,
+    View,
+    argument,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.prior import PriorOptions
+from hilcal.cli.terminal import terminal
+from hilcal.cli.viewing import followed
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
 from hilcal.discovery.proposal import LawSearch
@@ -94,10 +107,7 @@ def diagnose(
 def add(
     run: Run,
     effect: Annotated[
-        str,
-        typer.Argument(
-            metavar="EFFECT", help='See hilcal effects; with options: "creep(joints=each)".'
-        ),
+        str, argument("EFFECT", 'See hilcal effects; with options: "creep(joints=each)".')
     ],
     revision: Revision = None,
     record: Record = None,
@@ -116,7 +126,7 @@ def add(
 
 def remove(
     run: Run,
-    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the model.")],
+    effect: Annotated[str, argument("EFFECT", "One of the model.")],
     revision: Revision = None,
     record: Record = None,
     view: View = False,
@@ -188,32 +198,29 @@ def _change(
 def refine(
     run: Run,
     effects: Annotated[
-        str | None,
-        typer.Option("--effects", metavar="A,B", help="Effects to start from, as for identify."),
+        str | None, option("--effects A,B", "Effects to start from, as for identify.")
     ] = None,
     readings: Readings = None,
     from_latest: Annotated[
-        bool, typer.Option("--from-latest", help="Start from the latest revision.")
+        bool, option("--from-latest", "Start from the latest revision.")
     ] = False,
-    revision: Annotated[
-        int | None, typer.Option("--revision", metavar="N", help="Start from this revision.")
-    ] = None,
+    revision: Annotated[int | None, option("--revision N", "Start from this revision.")] = None,
     prior: Prior = None,
     prior_of: PriorOf = "arm",
     drift: Drift = None,
     discover: Annotated[
         bool,
-        typer.Option(
+        option(
             "--discover",
-            help="Where no effect explains the misfit, search a law and add it; its effect is "
+            "Where no effect explains the misfit, search a law and add it; its effect is "
             "written beside the campaign: found.py.",
         ),
     ] = False,
     background: Annotated[
         bool,
-        typer.Option(
+        option(
             "--background/--no-background",
-            help="Where named effects leave more than noise, also fit all others of the catalogue, "
+            "Where named effects leave more than noise, also fit all others of the catalogue, "
             "as a background that predicts.",
         ),
     ] = True,

@@ -4,11 +4,9 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
+from hilcal.cli.terminal import terminal
 from hilcal.present.progress import working
 from hilcal.tables.units import parse_length
 
@@ -17,40 +15,33 @@ def report(
     run: Run,
     later: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[LATER.hilcal]", help="A later campaign of the same arm: compare the two."
-        ),
+        argument("[LATER.hilcal]", "A later campaign of the same arm: compare the two."),
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="F.html", help="The page; RUN.html unless given."),
+        Path | None, option("-o --output F.html", "The page; RUN.html unless given.")
     ] = None,
     limit: Annotated[
         str | None,
-        typer.Option(
-            "--limit",
-            metavar="LENGTH",
-            help='The largest 3-D position error allowed, e.g. "0.1 mm": the page says passed '
-            "or failed.",
+        option(
+            "--limit LENGTH",
+            'The largest 3-D position error allowed, e.g. "0.1 mm": the page says passed or '
+            "failed.",
         ),
     ] = None,
     validation: Annotated[
         Path | None,
-        typer.Option(
-            "--validation",
-            metavar="OTHER.hilcal",
-            help="A campaign that was never fitted: how well is it predicted?",
+        option(
+            "--validation OTHER.hilcal",
+            "A campaign that was never fitted: how well is it predicted?",
         ),
     ] = None,
-    operator: Annotated[
-        str, typer.Option("--operator", metavar="NAME", help="Who answers for the measurement.")
-    ] = "",
+    operator: Annotated[str, option("--operator NAME", "Who answers for the measurement.")] = "",
     revision: Revision = None,
     appendix: Annotated[
         bool,
-        typer.Option(
+        option(
             "--appendix",
-            help="Also what only another expert asks for: rejected suspects, each joint, "
+            "Also what only another expert asks for: rejected suspects, each joint, "
             "correlations, scalings, commands, hashes of revisions.",
         ),
     ] = False,

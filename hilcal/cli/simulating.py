@@ -6,14 +6,11 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
 from drivers.simulated.rehearsal import NOTHING, RANDOM, as_told
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
-from hilcal.cli.plan_output import POSES
-from hilcal.cli.planning import CellFile, PlanFile, make_plan, read_cell
+from hilcal.cli.options import POSES, CellFile, EffectsFrom, PlanFile, catalogue_with, option
+from hilcal.cli.planning import make_plan, read_cell
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.config.write import to_toml
@@ -28,30 +25,21 @@ FASTEST = 200.0
 
 def simulate(
     cell: CellFile,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", metavar="DIR", help="Where the devices meet; gets a cell.toml."
-        ),
-    ],
+    output: Annotated[Path, option("-o --output DIR", "Where the devices meet; gets a cell.toml.")],
     plan: PlanFile = None,
-    hide: Annotated[
-        str | None, typer.Option("--hide", metavar="EFFECT", help="An effect, random or nothing.")
-    ] = None,
-    seed: Annotated[int | None, typer.Option("--seed", help="Of everything random.")] = None,
+    hide: Annotated[str | None, option("--hide EFFECT", "An effect, random or nothing.")] = None,
+    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
     person: Annotated[
         bool,
-        typer.Option(
+        option(
             "--person",
-            help="`run` asks you for each load, as in a real cell; without it nobody is asked.",
+            "`run` asks you for each load, as in a real cell; without it nobody is asked.",
         ),
     ] = False,
     clock: Annotated[
         float | None,
-        typer.Option(
-            "--clock",
-            metavar="N",
-            help="The simulated world goes so many times faster than real time, e.g. 20.",
+        option(
+            "--clock N", "The simulated world goes so many times faster than real time, e.g. 20."
         ),
     ] = None,
     effects_from: EffectsFrom = None,

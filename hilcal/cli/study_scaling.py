@@ -3,18 +3,17 @@
 from typing import Annotated
 
 import numpy as np
-import typer
 
-from hilcal.cli.engine import OneWorker, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneWorker, Scheduler, one_by_default, option
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.present.progress import counting
 
 
 def scaling(
-    runs: Annotated[int, typer.Option("--runs", help="Monte-Carlo runs.")] = 2000,
-    seed: Annotated[int, typer.Option("--seed", help="Of the random numbers.")] = 1,
+    runs: Annotated[int, option("--runs", "Monte-Carlo runs.")] = 2000,
+    seed: Annotated[int, option("--seed", "Of the random numbers.")] = 1,
     workers: OneWorker = None,
     scheduler: Scheduler = None,
     as_json: Json = False,

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 from rich.padding import Padding
 
 from hilcal.cell import Cell
+from hilcal.cli.options import Json, argument, option
 from hilcal.cli.previewing import show_preview
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.terminal import terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import description_words, frames_document
 from hilcal.identification.gate import examine
@@ -25,37 +25,30 @@ from hilcal.readings.readings import Readings
 
 
 def import_(
-    table: Annotated[Path, typer.Argument(metavar="TABLE", help="What was measured.")],
+    table: Annotated[Path, argument("TABLE", "What was measured.")],
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in."),
+        Path | None, option("--config CELL.toml", "The cell it was measured in.")
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RUN.hilcal",
-            help="The campaign file to make; with --preview, the mapping file.",
+        option(
+            "-o --output RUN.hilcal", "The campaign file to make; with --preview, the mapping file."
         ),
     ] = None,
     kind: Annotated[
         str,
-        typer.Option(
-            "--format",
-            metavar="FORMAT",
-            help="table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
+        option(
+            "--format FORMAT",
+            "table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
         ),
     ] = "table",
     second: Annotated[
-        Path | None,
-        typer.Option("--second", metavar="TABLE", help="The second file, e.g. of the joints."),
+        Path | None, option("--second TABLE", "The second file, e.g. of the joints.")
     ] = None,
     preview: Annotated[
-        bool,
-        typer.Option("--preview", help="Show how the table could be read; make no campaign."),
+        bool, option("--preview", "Show how the table could be read; make no campaign.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Make a campaign file from a table of readings."""

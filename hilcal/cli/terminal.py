@@ -4,10 +4,8 @@ import json
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, TextIO
+from typing import TextIO
 
-import typer
 from rich.console import Console, RenderableType
 
 from hilcal.cli.failing import error_document
@@ -16,21 +14,6 @@ from hilcal.identification.fit_document import plain
 from hilcal.present.progress import SafeConsole
 
 WIDTH = 100
-
-Json = Annotated[
-    bool, typer.Option("--json", help="One JSON document on stdout; words and progress on stderr.")
-]
-Run = Annotated[Path, typer.Argument(metavar="RUN.hilcal", help="The campaign file.")]
-Revision = Annotated[
-    int | None,
-    typer.Option(
-        "--revision", metavar="N", help="This revision, not the accepted or the latest one."
-    ),
-]
-Details = Annotated[bool, typer.Option("--details", help="Print everything, not one screen of it.")]
-Record = Annotated[
-    Path | None, typer.Option("--record", metavar="F.rrd", help="Write a recording for rerun.")
-]
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,12 +3,10 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.files import called, record_of, titles
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
+from hilcal.cli.terminal import terminal
 from hilcal.errors import CannotAnswerError, HilcalError, LimitError
 from hilcal.present import text, text_validate
 from hilcal.present.progress import working
@@ -21,19 +19,15 @@ OVER = 5.0
 
 def validate(
     run: Run,
-    other: Annotated[
-        Path, typer.Argument(metavar="OTHER.hilcal", help="A campaign that was never fitted.")
-    ],
+    other: Annotated[Path, argument("OTHER.hilcal", "A campaign that was never fitted.")],
     register: Annotated[
-        bool, typer.Option("--register", help="The tracker was set up anew: fit its place first.")
+        bool, option("--register", "The tracker was set up anew: fit its place first.")
     ] = False,
     limit: Annotated[
         str | None,
-        typer.Option(
-            "--limit",
-            metavar="LENGTH",
-            help='The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it is not '
-            "kept.",
+        option(
+            "--limit LENGTH",
+            'The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it is not kept.',
         ),
     ] = None,
     revision: Revision = None,

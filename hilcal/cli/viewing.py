@@ -11,34 +11,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
 from hilcal.cli.ending import told_to_end
 from hilcal.cli.files import check_record, record_story
-from hilcal.cli.terminal import Json, Record, Revision, Run, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, Record, Revision, Run, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.present.build_story import build_story
 from hilcal.present.live_viewer import PORT, LiveViewer
 from hilcal.present.progress import working
 
 ENDING = 5.0
 
-View = Annotated[
-    bool,
-    typer.Option(
-        "--view",
-        help="Serve a live rerun viewer on this machine, and record to RUN.live.rrd beside the "
-        "campaign. It never delays the command.",
-    ),
-]
-
 
 def view(
     run: Run,
     revision: Revision = None,
     record: Record = None,
-    port: Annotated[int, typer.Option("--port", help="Port to serve viewers on.")] = PORT,
+    port: Annotated[int, option("--port", "Port to serve viewers on.")] = PORT,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:

@@ -6,10 +6,8 @@ import threading
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, argument, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
@@ -26,34 +24,22 @@ ENDING = 8.0
 
 
 def workbench(
-    run: Annotated[
-        Path, typer.Argument(metavar="RUN.hilcal|TABLE", help="The campaign file, or a table.")
-    ],
+    run: Annotated[Path, argument("RUN.hilcal|TABLE", "The campaign file, or a table.")],
     config: Annotated[
-        Path | None,
-        typer.Option(
-            "--config", metavar="CELL.toml", help="Begin with a table, measured in this cell."
-        ),
+        Path | None, option("--config CELL.toml", "Begin with a table, measured in this cell.")
     ] = None,
     kind: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="Of the table, as hilcal import takes it."),
+        str, option("--format FORMAT", "Of the table, as hilcal import takes it.")
     ] = "table",
-    second: Annotated[
-        Path | None, typer.Option("--second", metavar="TABLE", help="The second file of a table.")
-    ] = None,
+    second: Annotated[Path | None, option("--second TABLE", "The second file of a table.")] = None,
     output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--output", metavar="RUN.hilcal", help="Of a table; TABLE.hilcal beside it else."
-        ),
+        Path | None, option("-o --output RUN.hilcal", "Of a table; TABLE.hilcal beside it else.")
     ] = None,
     port: Annotated[
-        int | None,
-        typer.Option("--port", help="Port on this machine; 8787, or a free one, unless given."),
+        int | None, option("--port", "Port on this machine; 8787, or a free one, unless given.")
     ] = None,
     no_browser: Annotated[
-        bool, typer.Option("--no-browser", help="Do not open the page, only print its address.")
+        bool, option("--no-browser", "Do not open the page, only print its address.")
     ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
