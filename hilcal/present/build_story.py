@@ -21,6 +21,7 @@ from hilcal.identification.fit_document import finite
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
+from hilcal.present.discovery import coefficient
 from hilcal.present.story import (
     Regressor,
     Story,
@@ -32,9 +33,7 @@ from hilcal.present.story import (
     StoryRival,
     StorySuspect,
 )
-from hilcal.present.text_discover import coefficient
-from hilcal.present.text_seen import own_units
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.whitening import Mode
 from hilcal.store.revision import change
 from hilcal.types import Floats, Ints
@@ -283,7 +282,7 @@ def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
         (s.least.displacement_m if s.shown else math.inf, s) for s in d.suspects if not s.passes
     ]
     return tuple(
-        StoryLimit(s.effect, least, own_units(s.least) if s.shown else "")
+        StoryLimit(s.effect, least, numbers.sizes(s.least.parameters) if s.shown else "")
         for least, s in sorted(rest, key=lambda of: of[0])
     )
 

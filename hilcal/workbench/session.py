@@ -26,7 +26,7 @@ from hilcal.errors import InputError
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.present.build_story import Chapter, build_story, regressor
-from hilcal.present.covariance_words import covariance_words
+from hilcal.present.registration import covariance_words
 from hilcal.present.story import Regressor
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.purpose import refuse_fitting

@@ -8,7 +8,7 @@ from hilcal.diagnosis.comparison import Comparison
 from hilcal.present.charts import style
 from hilcal.present.charts.misfit import bars
 from hilcal.present.charts.readings_drawn import escaped
-from hilcal.present.text_change import words_of
+from hilcal.present.comparison import words_of
 from hilcal.store.plan import UNLOADED
 
 

@@ -7,9 +7,9 @@ import plotly.graph_objects as go
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
-from hilcal.present import text
 from hilcal.present.charts import style
 from hilcal.present.charts.readings_drawn import escaped
+from hilcal.present.fit import CERTAIN, follows
 from hilcal.present.story import StoryCurve
 
 MOST = 12
@@ -26,8 +26,8 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
         f"{n}: {s:.0f} %, {numbers.p_equals(v.p_value)}"
         for n, s, v in zip(names, shares, rows, strict=True)
     ]
-    colors = [style.MEASURED if v.p_value < text.CERTAIN else style.GREY for v in rows]
-    says = f"{text.follows(d.misfit_breakdown)} Grey bars are within chance."
+    colors = [style.MEASURED if v.p_value < CERTAIN else style.GREY for v in rows]
+    says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 

@@ -5,10 +5,17 @@ from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
 from hilcal.present.charts.change import changes_chart, error_by_pose
+from hilcal.present.comparison import comparison_report, next_step, sentence
+from hilcal.present.document import (
+    Block,
+    Chart,
+    Section,
+    Words,
+    heading,
+    table,
+)
 from hilcal.present.html.first_screen import Card, FirstScreen
 from hilcal.present.html.page import render
-from hilcal.present.html.parts import Part, Section, Words, chart, from_terminal, table
-from hilcal.present.text_change import comparison_report, next_step, sentence
 
 Named = tuple[str, str]
 
@@ -25,28 +32,28 @@ def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, ve
     """
     (earlier, _), (later, _) = files
     arm = c.fit.model.cell.arm.name
-    told: list[Part] = list(from_terminal(comparison_report(c, earlier, later)))
-    charts: list[Part] = [chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
+    told = tuple(comparison_report(c, earlier, later))
+    charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
     if c.changes.found:
-        charts.append(chart("What each change moves", changes_chart(c), wide=True, height=0))
+        charts.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
     rows = [(which, name, sha) for which, (name, sha) in zip(("earlier", "later"), files,
                                                              strict=True)]  # fmt: skip
     provenance = (
-        table("Files", ("campaign", "name", "SHA-256"), rows),
+        table("campaign", "name", "SHA-256", rows=rows, caption="Files"),
         table(
-            "Identity of this report",
-            ("", ""),
-            (
+            *("", ""),
+            caption="Identity of this report",
+            rows=(
                 ("Robot", arm),
                 ("Operator", operator or "not stated"),
                 ("Report made", f"{made[:19].replace('T', ' ')} UTC by hilcal {version}"),
             ),
         ),
-        Words("Commands that show the same", "heading"),
+        heading("Commands that show the same"),
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
     )
     sections = (
-        Section("changes", "What has changed", tuple(told)),
+        Section("changes", "What has changed", told),
         Section("today", "The earlier calibration today", tuple(charts)),
         Section("provenance", "Provenance", provenance),
     )

@@ -10,9 +10,9 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import names
-from hilcal.present import text
+from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
-from hilcal.present.verdict_words import UNCALIBRATED, message
+from hilcal.present.verdict import UNCALIBRATED, message
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -91,7 +91,7 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
 def how_good(m: ReportContent) -> str:
     """Say in a sentence how well the model predicts."""
     d, prior = m.diagnosis, m.fit.model.prior
-    told = text.misses(m.fit)
+    told = misses(m.fit)
     if prior is not None:
         told += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
     if d is None:
@@ -112,7 +112,7 @@ def where_wrong(m: ReportContent) -> str:
     pose, load = names(fit.readings[~fit.outlier], furthest)
     at = "unloaded" if load == UNLOADED else f"under {load}"
     said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
-    return said if d is None else f"{said} {text.follows(d.misfit_breakdown)}"
+    return said if d is None else f"{said} {follows(d.misfit_breakdown)}"
 
 
 def missing(d: Diagnosis | None) -> str:

@@ -4,10 +4,16 @@ from typing import TYPE_CHECKING
 
 from hilcal import numbers
 from hilcal.present.charts.fleet import arms_chart
+from hilcal.present.document import (
+    Block,
+    Chart,
+    Section,
+    captioned,
+    table,
+)
+from hilcal.present.fleet import closing, type_report, unlike_words
 from hilcal.present.html.first_screen import Card, FirstScreen
 from hilcal.present.html.page import render
-from hilcal.present.html.parts import Part, Section, chart, from_terminal, table
-from hilcal.present.text_fleet import closing, type_report, unlike_words
 
 if TYPE_CHECKING:  # above this layer
     from hilcal.transfer.fleet import Fleet
@@ -24,8 +30,8 @@ def page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     """
     sections = []
     for k, t in enumerate(fleet.types):
-        drawn: tuple[Part, ...] = (chart("Arms of the type", arms_chart(t), wide=True, height=0),)
-        told = from_terminal(list(type_report(t))[1:], f"Parameters of the {t.type}")
+        drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
+        told = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
         sections.append(Section(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
@@ -33,7 +39,7 @@ def page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
         Section(
             "campaigns",
             "Campaigns",
-            (table("Campaigns", heads, rows), *from_terminal(closing(fleet))),
+            (table(*heads, rows=rows, caption="Campaigns"), *closing(fleet)),
         )
     )
     about = f"{directory}, {made[:10]}, hilcal {version}"

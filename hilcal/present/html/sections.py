@@ -10,7 +10,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.fit import Fit
-from hilcal.present import text
 from hilcal.present.build_story import curve, regressor
 from hilcal.present.charts.added_variable import added_variable
 from hilcal.present.charts.error_per_revision import error_per_revision
@@ -20,20 +19,20 @@ from hilcal.present.charts.misfit import misfit_curve
 from hilcal.present.charts.noise_check import noise_check
 from hilcal.present.charts.residuals import residual_by_load, residual_by_pose, residual_by_time
 from hilcal.present.charts.workspace import workspace
-from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import missing
-from hilcal.present.html.parts import (
+from hilcal.present.diagnosis import doubtful, redundant_line
+from hilcal.present.document import (
+    Block,
     Chart,
-    Part,
     Section,
     Table,
-    Words,
-    chart,
-    from_terminal,
+    captioned,
+    note,
     table,
 )
-from hilcal.present.text_seen import doubtful, redundant_line
-from hilcal.present.verdict_words import message
+from hilcal.present.fit import background_line, model_name, parameters, where_table
+from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import missing
+from hilcal.present.verdict import message
 
 MOST_CURVES = 2
 MOST_LISTED = 6
@@ -50,42 +49,40 @@ def sections(m: ReportContent) -> tuple[Section, ...]:
 
 def _where(m: ReportContent) -> Section:
     story, last, d = m.story, m.left_out, m.diagnosis
-    parts: list[Part] = [
-        Words(
-            "Errors are those of poses left out: each is predicted by a fit to the others."
-            + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any()))
-        ),
-        chart("By pose", residual_by_pose(story, last), wide=True),
-        chart("Measured against predicted", measured_predicted(story, last)),
+    parts: list[Block] = [
+        "Errors are those of poses left out: each is predicted by a fit to the others."
+        + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
+        Chart("By pose", residual_by_pose(story, last), wide=True),
+        Chart("Measured against predicted", measured_predicted(story, last)),
     ]
     if len(set(story.load_names)) > 1:
-        parts.append(chart("By load", residual_by_load(story, last)))
+        parts.append(Chart("By load", residual_by_load(story, last)))
     if story.time_s is not None:
-        parts.append(chart("Over time", residual_by_time(story, last)))
+        parts.append(Chart("Over time", residual_by_time(story, last)))
     parts += [
-        chart("From above", workspace(story, last, "xy")),
-        chart("From the side", workspace(story, last, "xz")),
-        chart("Noise check: fitted poses", noise_check(m.fit)),
+        Chart("From above", workspace(story, last, "xy")),
+        Chart("From the side", workspace(story, last, "xz")),
+        Chart("Noise check: fitted poses", noise_check(m.fit)),
     ]
     if d is not None:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
-            parts += [chart(c.variable, misfit_curve(c)) for c in curves]
-        told = from_terminal(text.where_table(d.misfit_breakdown), "What the error follows")
+            parts += [Chart(c.variable, misfit_curve(c)) for c in curves]
+        told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
-    parts.append(Words(_noise(m)))
+    parts.append(_noise(m))
     return Section("where", "Where it fails", tuple(parts))
 
 
 def _evidence(m: ReportContent) -> Section:
     d, title = m.diagnosis, "What is missing, with its evidence"
     if d is None:
-        words = Words("Not diagnosed: only a model fitted with scaling gc can be.")
-        return Section("evidence", title, (words,))
+        said = "Not diagnosed: only a model fitted with scaling gc can be."
+        return Section("evidence", title, (said,))
     said = numbers.sentence(message(d), d.significant)
-    parts: list[Part] = [] if said == missing(d) else [Words(said)]
+    parts: list[Block] = [] if said == missing(d) else [said]
     parts.append(suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
-    parts += from_terminal([*doubtful(d), *redundant_line(d)])
+    parts += [*doubtful(d), *redundant_line(d)]
     parts += added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
     return Section("evidence", title, tuple(parts))
 
@@ -95,14 +92,14 @@ def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
     for s in of:
         found = regressor(d.fit, s)
         if found is not None:
-            yield chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
+            yield Chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
 
 
 def _laws(m: ReportContent) -> Section | None:
     found = m.story.revisions[-1].laws
     if not found:
         return None
-    parts: list[Part] = []
+    parts: list[Block] = []
     for name in dict.fromkeys(one.name for one in found):
         first = next(one for one in found if one.name == name)
         rows = (
@@ -110,13 +107,12 @@ def _laws(m: ReportContent) -> Section | None:
             ("acts on", first.acts_on),
             ("coefficients", first.coefficients),
         )
-        parts.append(table(f"{name}, an effect of a file", ("", ""), rows))
-    parts += [chart(f"{one.name}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
+        parts.append(table("", "", rows=rows, caption=f"{name}, an effect of a file"))
+    parts += [Chart(f"{one.name}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
     parts.append(
-        Words(
+        note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
             "Nothing is known outside of the range that is drawn, nor within its gaps.",
-            "note",
         )
     )
     return Section("laws", "Laws beyond the catalogue", tuple(parts))
@@ -126,9 +122,9 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
     """Return a table of suspects."""
     heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
     return table(
-        caption,
-        (*heads, "not separable from"),
-        (
+        *(*heads, "not separable from"),
+        caption=caption,
+        rows=(
             (
                 s.effect,
                 numbers.percent(s.share),
@@ -144,16 +140,16 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
 
 
 def _revisions(m: ReportContent) -> Section:
-    parts: list[Part] = [
-        chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
+    parts: list[Block] = [
+        Chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
         table(
-            "Revisions",
-            ("revision", "change", "fitted, rms", "left out, rms", "left out, σ",
-             "variance factor", "verdict"),
-            (
+            *("revision", "change", "fitted, rms", "left out, rms", "left out, σ"),
+            *("variance factor", "verdict"),
+            caption="Revisions",
+            rows=(
                 (
                     str(r.revision),
-                    r.change or text.model_name(r.model),
+                    r.change or model_name(r.model),
                     numbers.length(r.error_fit["rms_m"]),
                     numbers.length(r.error_holdout["rms_m"]),
                     f"{r.error_holdout['rms_sigma']:.2f}",
@@ -166,24 +162,22 @@ def _revisions(m: ReportContent) -> Section:
     ]  # fmt: skip
     if not m.stored:
         parts.append(
-            Words(
-                "No revision is stored in the campaign: the baseline was fitted for this report "
-                "and is not kept. hilcal refine finds the effects that are missing."
-            )
+            "No revision is stored in the campaign: the baseline was fitted for this report "
+            "and is not kept. hilcal refine finds the effects that are missing."
         )
     return Section("revisions", "How the error fell", tuple(parts))
 
 
 def _parameters(m: ReportContent) -> Section:
     fit = m.fit
-    parts: list[Part] = []
+    parts: list[Block] = []
     for name in fit.model.named:
         if name in fit.model.catalogue.names:
-            parts.append(Words(f"{name}: {fit.model.catalogue[name].summary}.", "note"))
+            parts.append(note(f"{name}: {fit.model.catalogue[name].summary}."))
     more = "hilcal report --appendix"
-    for part in from_terminal(text.parameters(fit, MOST_PARAMETERS, more), "Parameters"):
+    for part in captioned(parameters(fit, MOST_PARAMETERS, more), "Parameters"):
         parts += _halves(part) if isinstance(part, Table) else (part,)
-    parts += [Words(line) for line in text.background_line(fit)]
+    parts += background_line(fit)
     return Section("parameters", "Parameters", tuple(parts))
 
 
@@ -192,10 +186,9 @@ def _halves(t: Table) -> Iterator[Table]:
     middle = -(-len(t.rows) // 2)
     for rows, more in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
         if rows:
-            cut = tuple(row[:-1] for row in rows)
-            yield replace(
-                t, caption=f"{t.caption}{more}", heads=t.heads[:-1], rows=cut, narrow=True
-            )
+            cut = [row[:-1] for row in rows]
+            caption = f"{t.caption}{more}"
+            yield replace(t, caption=caption, heads=t.heads[:-1], rows=cut, narrow=True)
 
 
 def _noise(m: ReportContent) -> str:

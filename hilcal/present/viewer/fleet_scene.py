@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from hilcal.present.text_fleet import unlike_words
+from hilcal.present.fleet import unlike_words
 from hilcal.present.viewer import arm_shapes, style
 from hilcal.present.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, ticks, write
 from hilcal.present.viewer.fleet_digest import FAR, TypeDigest

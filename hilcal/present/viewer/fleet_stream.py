@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
-from hilcal.present.text_fleet import type_lines
+from hilcal.present.fleet import type_lines
 from hilcal.present.viewer import flat, fleet_scene, layout, style
 from hilcal.present.viewer.fleet_digest import TypeDigest, type_digest
 from hilcal.present.viewer.stream import flush, opened, require_folder, write

@@ -7,9 +7,8 @@ import numpy as np
 import rerun as rr
 
 from hilcal.measuring.progress import ArmAt, GoalMet, Phase, ReadingStored, Remark
-from hilcal.present.goal_words import met_words
 from hilcal.present.live_messages import Measuring, Revised
-from hilcal.present.live_run import figures
+from hilcal.present.running import figures, met_words
 from hilcal.present.story import Story, check
 from hilcal.present.viewer import errors, layout, live_layout, live_words, scene, stream, style
 from hilcal.present.viewer.arm_shapes import MovingArm

@@ -1,8 +1,7 @@
 """A campaign while it is measured, in words: is the model good so far, and where is it wrong?"""
 
 from hilcal import numbers
-from hilcal.present.goal_words import status_words
-from hilcal.present.text_run import spoken
+from hilcal.present.running import spoken, status_words
 from hilcal.present.viewer import style
 from hilcal.present.viewer.live_digest import Judged, LiveDigest
 from hilcal.present.viewer.style import escaped

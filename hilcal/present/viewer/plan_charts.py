@@ -5,7 +5,7 @@ import rerun as rr
 
 from hilcal import numbers
 from hilcal.design.summary import PlanSummary
-from hilcal.present.text_plan import load_name
+from hilcal.present.plan import load_name
 from hilcal.present.viewer import plan_style, style
 from hilcal.present.viewer.plan_digest import PlanDigest
 from hilcal.types import Ints

@@ -3,7 +3,7 @@
 import numpy as np
 import rerun as rr
 
-from hilcal.present.text_plan import load_name
+from hilcal.present.plan import load_name
 from hilcal.present.viewer import arm_shapes, plan_cell, plan_style, style
 from hilcal.present.viewer.digest import quaternions_of
 from hilcal.present.viewer.plan_digest import SEEN, PlanDigest

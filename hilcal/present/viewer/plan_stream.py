@@ -10,7 +10,9 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.next import PairPower
 from hilcal.design.summary import PlanSummary
+from hilcal.present import plan as plan_blocks
 from hilcal.present.viewer import plan_cell, plan_charts, plan_layout, plan_scene, plan_words, style
+from hilcal.present.viewer.markdown import markdown
 from hilcal.present.viewer.plan_digest import PlanDigest, plan_digest
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
 from hilcal.store.plan import Plan
@@ -56,8 +58,8 @@ def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
         ("plan", plan_words.overview(d)),
         ("notes", plan_words.notes(d)),
         ("guide", plan_words.GUIDE),
-        ("parameters", plan_words.parameters(d.summary)),
-        ("criteria", plan_words.criteria(d.summary)),
+        ("parameters", markdown(plan_blocks.parameters_table(d.summary))),
+        ("criteria", markdown(plan_blocks.criteria_table(d.summary))),
     ):
         document = rr.TextDocument(text, media_type="text/markdown")
         rec.log(f"words/{name}", document, static=True)

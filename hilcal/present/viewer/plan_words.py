@@ -1,14 +1,16 @@
 """A plan in words: markdown that the viewer shows beside the pictures."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 
 from hilcal import numbers
 from hilcal.design.summary import PlanSummary
 from hilcal.measuring.sight import UNKNOWN as NO_TRACKER
-from hilcal.present import text_next, text_plan
-from hilcal.present.text_run import spoken
+from hilcal.present import plan
+from hilcal.present.document import Block, heading, pairs
+from hilcal.present.running import spoken
+from hilcal.present.viewer.markdown import markdown
 from hilcal.present.viewer.plan_digest import SEEN, PlanDigest
 from hilcal.present.viewer.style import escaped
 from hilcal.store.plan import UNLOADED
@@ -20,60 +22,41 @@ _DETECTABLE = 6
 def overview(d: PlanDigest) -> str:
     """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
     s = d.summary
-    title = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
-    lines = [*_question(d), "", f"**{title}**"] if d.powers else [f"### {title}"]
-    rows = [row for row in text_plan.cost_rows(s) if row[0] not in ("", "takes about")]
-    lines += [f"- **{name}** {escaped(value)}" for name, value in rows]
-    return "\n".join([*lines, f"- **tracker** {sight(d)}"])
+    title: Block = heading(
+        f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    )
+    rows = [row for row in plan.cost_rows(s) if row[0] not in ("", "takes about")]
+    asked: list[Block] = []
+    if d.powers:
+        names = list(dict.fromkeys(t.effect for t in d.powers))
+        asked = [heading(f"Which is it: {numbers.names(names, 'or')}?"), plan.power_table(d.powers)]
+    return markdown([*asked, title, pairs([*rows, ("tracker", sight(d))])])
 
 
 def notes(d: PlanDigest) -> str:
     """Return cost, remarks, what more poses would give, detectable effects and order of a plan."""
-    s = d.summary
-    lines = ["### Notes"]
-    for name, value in text_plan.cost_rows(s):
-        lines += [f"- **{name}** {escaped(value)}"] if name else [f"  ({escaped(value)})"]
-    lines += [line for remark in s.remarks for line in ("", escaped(numbers.sentence(remark)))]
+    return markdown(_notes(d.summary))
+
+
+def _notes(s: PlanSummary) -> Iterator[Block]:
+    yield from (heading("Notes"), pairs(plan.cost_rows(s)))
+    yield from map(numbers.sentence, s.remarks)
     if s.curve:
-        lines += ["", escaped(text_plan.enough(s.curve))]
-    if s.detectable:
-        lines += ["", _effects(s)]
-    if s.confounding is not None:
-        lines += ["", escaped(text_plan.order_remark(s))]
-    return "\n".join(lines)
-
-
-def _question(d: PlanDigest) -> list[str]:
-    """Return the suspects that the plan separates, and with which power."""
-    names = list(dict.fromkeys(t.effect for t in d.powers))
-    return [
-        f"### Which is it: {escaped(numbers.names(names, 'or'))}?",
-        _table(text_next.POWER_COLUMNS, text_next.power_rows(d.powers)),
-    ]
-
-
-def _table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a markdown table."""
-    cells = [columns, ["---"] * len(columns), *([escaped(c) for c in row] for row in rows)]
-    return "\n".join(f"| {' | '.join(c or ' ' for c in row)} |" for row in cells)
+        yield plan.enough(s.curve)
+    if found := plan.detectable(s):
+        named = [f"{effect} from {least}" for effect, least in found]
+        yield f"Detectable outside of the model: {numbers.few(named, _DETECTABLE)}."
+    yield from (plan.undetectable(s), plan.order_remark(s))
 
 
 def sight(d: PlanDigest) -> str:
     """Return how many of the readings the tracker sees."""
     if d.tracker is None:
-        return escaped(NO_TRACKER)
+        return NO_TRACKER
     lost = int(d.unseen.sum())
     if not lost:
         return f"✓ sees the target in all {len(d)} readings"
-    return f"✗ **does not see the target in {lost} of {len(d)} readings**"
-
-
-def _effects(s: PlanSummary) -> str:
-    found = text_plan.detectable(s)
-    words = [f"{escaped(effect)} from {least}" for effect, least in found[:_DETECTABLE]]
-    more = f" and {len(found) - _DETECTABLE} more" if len(found) > _DETECTABLE else ""
-    out = f"Detectable outside of the model: {', '.join(words)}{more}. " if words else ""
-    return f"{out}{escaped(text_plan.undetectable(s))}".strip()
+    return f"✗ does not see the target in {lost} of {len(d)} readings"
 
 
 def step_card(d: PlanDigest, k: int) -> str:
@@ -113,18 +96,6 @@ def _sight(d: PlanDigest, k: int) -> str:
     if d.sight[k] == SEEN:
         return f"✓ The tracker sees the target {way}."
     return f"✗ **The tracker does not see the target** {way}: {escaped(d.why[k])}."
-
-
-def parameters(s: PlanSummary) -> str:
-    """Return the table of predicted standard uncertainties."""
-    rows = text_plan.parameter_rows(s.parameters)
-    return f"{text_plan.PARAMETER_NOTE}\n\n{_table(text_plan.PARAMETER_COLUMNS, rows)}"
-
-
-def criteria(s: PlanSummary) -> str:
-    """Return the table of the criterion comparison."""
-    rows = text_plan.criteria_rows(s)
-    return f"{_table(text_plan.CRITERIA_COLUMNS, rows)}\n\n{text_plan.CRITERIA_NOTE}"
 
 
 GUIDE = """### How to read this

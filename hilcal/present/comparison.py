@@ -3,8 +3,6 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 
-from rich.console import RenderableType
-
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER
 from hilcal.diagnosis.change_candidates import Candidate
@@ -12,7 +10,7 @@ from hilcal.diagnosis.change_found import Change, Limit, Size
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.parameter_differences import Differences
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present.document import Block, Table, heading, table
 
 MOST_PARAMETERS = 6
 """Parameters of a change that are listed."""
@@ -31,7 +29,7 @@ def words_of(c: Candidate) -> str:
     return c.change.words or c.effect
 
 
-def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[RenderableType]:
+def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block]:
     """Yield everything that is said.
 
     Args:
@@ -82,13 +80,13 @@ def _kind(mode: str | None) -> str:
     return "deflections" if mode == "deflection" else "absolute readings"
 
 
-def _today(c: Comparison, earlier: str) -> Iterator[RenderableType]:
+def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     t, error = c.today, c.today.prediction.error
-    out = text.table("3-D position error", "rms", "mean", "largest", "expected", "as drawn")
     drawing = "-" if t.drawing_m is None else numbers.length(t.drawing_m)
     sizes = (error.rms_m, error.mean_m, error.max_m, t.stated_m)
-    out.add_row(f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
-    yield out
+    row = (f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
+    heads = ("3-D position error", "rms", "mean", "largest", "expected", "as drawn")
+    yield table(*heads, rows=[row])
     chance = numbers.p_equals(t.p_value)
     share = f"{numbers.digits(t.z, 2)} times what it states, all correlations counted ({chance})"
     if t.p_value < LEVEL:
@@ -105,24 +103,24 @@ def _today(c: Comparison, earlier: str) -> Iterator[RenderableType]:
         )
 
 
-def _changes(c: Comparison) -> Iterator[RenderableType]:
+def _changes(c: Comparison) -> Iterator[Block]:
     found = c.changes
     if not found.found and found.explained:
-        yield text.heading("Nothing has changed beyond the uncertainty.")
+        yield heading("Nothing has changed beyond the uncertainty.")
         yield from _limits(c)
         return
     if c.another_arm:
-        yield text.heading("This looks like another arm of the same type.")
+        yield heading("This looks like another arm of the same type.")
         yield (
             "The calibration predicts these readings no better than the arm as drawn, and no few "
             "changes explain them."
         )
         return
     if not found.found:
-        yield text.heading("Something has changed, and no single candidate explains it.")
+        yield heading("Something has changed, and no single candidate explains it.")
         yield _left(c)
         return
-    yield text.heading("What has changed")
+    yield heading("What has changed")
     for change in found.found:
         yield sentence(change)
         if change.same_as:
@@ -157,8 +155,8 @@ def sentence(change: Change) -> str:
     return f"{words}: {why}" if why else f"{words}."
 
 
-def _table(found: Sequence[Change]) -> RenderableType:
-    out = text.table("change", "by", "±", "unit", "σ", "p", "at target", left=(0, 3))
+def _table(found: Sequence[Change]) -> Table:
+    out = table("change", "by", "±", "unit", "σ", "p", "at target", left=(0, 3))
     for change in found:
         first = True
         shown = [s for s in change.sizes if len(change.sizes) == 1 or abs(s.z) >= CLEAR]
@@ -166,13 +164,13 @@ def _table(found: Sequence[Change]) -> RenderableType:
             value, std, unit = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
             name = change.candidate.name if len(change.sizes) == 1 else _name(change, s)
             more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
-            out.add_row(name, value, std, unit, f"{abs(s.z):.1f}", *(more if first else ("", "")))
+            out.add(name, value, std, unit, f"{abs(s.z):.1f}", *(more if first else ("", "")))
             first = False
         if first:
             row = ("", "", "", "", numbers.chance(change.p_value), numbers.length(change.moved_m))
-            out.add_row(change.candidate.name, *row)
+            out.add(change.candidate.name, *row)
         elif len(shown) > MOST_PARAMETERS:
-            out.add_row(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
+            out.add(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
     return out
 
 
@@ -196,17 +194,15 @@ def _left(c: Comparison) -> str:
     )
 
 
-def _limits(c: Comparison) -> Iterator[RenderableType]:
+def _limits(c: Comparison) -> Iterator[Block]:
     found = c.changes
     by_joint: dict[str, dict[str, Limit]] = {}
     for limit in found.limits:
         if limit.change.listed:
             by_joint.setdefault(limit.part, {})[limit.change.words] = limit
     shown = list(dict.fromkeys(words for of in by_joint.values() for words in of))
-    out = text.table("would have been seen", *shown)
-    for part, of in by_joint.items():
-        out.add_row(part, *(_least(of.get(words)) for words in shown))
-    yield out
+    rows = ((part, *(_least(of.get(words)) for words in shown)) for part, of in by_joint.items())
+    yield table("would have been seen", *shown, rows=rows)
     yield (
         f"The smallest change that these readings would have shown in {POWER * 10:.0f} cases of "
         f"10; where nothing has changed, a change is claimed once in {1 / LEVEL:.0f}."
@@ -219,22 +215,22 @@ def _limits(c: Comparison) -> Iterator[RenderableType]:
         yield f"Not to be seen: the zero of {numbers.names(zeros)}; {frames} absorbs it."
 
 
-def _parameters(d: Differences | None) -> Iterator[RenderableType]:
+def _parameters(d: Differences | None) -> Iterator[Block]:
     """Yield the parameters of both fits, those that differ most first."""
     if d is None:
         return
     yield ""
-    yield text.heading("Both campaigns' own fits, as far as they can be compared")
+    yield heading("Both campaigns' own fits, as far as they can be compared")
     told = sorted((r for r in d.rows if r.z is not None), key=lambda r: -abs(r.z or 0.0))
     if told:
-        out = text.table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
+        out = table("parameter", "before", "after", "by", "±", "unit", "σ", left=(0, 5))
         for r in told[:MOST_ROWS]:
             std = r.std or 0.0
             unit, factor = numbers.unit_for(r.unit, [r.before, r.after, r.difference])
             by, error = numbers.with_std(factor * r.difference, factor * std)
             places = len(error.partition(".")[2])
             sizes = (f"{factor * v:.{places}f}" for v in (r.before, r.after))
-            out.add_row(r.name, *sizes, by, error, unit, f"{abs(r.z or 0.0):.1f}")
+            out.add(r.name, *sizes, by, error, unit, f"{abs(r.z or 0.0):.1f}")
         yield out
         if len(told) > MOST_ROWS:
             yield f"{len(told) - MOST_ROWS} more differ less."
@@ -281,7 +277,7 @@ def next_command(c: Comparison, earlier: str, later: str) -> str | None:
     return f"hilcal refine {quoted(later)} --prior {quoted(earlier)}" if changed else None
 
 
-def to_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
+def comparison_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
     """Return the comparison as JSON; SI."""
     t, found = c.today, c.changes
     return {

@@ -1,19 +1,60 @@
-"""A table that breaks no word, however narrow the terminal is."""
+"""Blocks of a document on a terminal; a table breaks no word, however narrow the terminal is."""
 
 from collections.abc import Sequence
 
 from rich import box
 from rich.cells import cell_len
-from rich.console import Console, ConsoleOptions, RenderResult
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.padding import Padding
-from rich.table import Column, Table
+from rich.table import Column
+from rich.table import Table as RichTable
 from rich.text import Text
+
+from hilcal.present.document import Chart, Items, Printable, Table, Words
 
 GAPS = (3, 2)
 """Blanks between two columns: the wider where there is room."""
+STYLES = {
+    "text": "",
+    "heading": "bold",
+    "note": "dim",
+    "strong": "bold",
+    "code": "",
+    "good": "bold green",
+    "doubt": "bold yellow",
+}
 
 
-class WordTable(Table):
+def rendered(block: Printable) -> RenderableType:
+    """Return what rich prints of a block; of a chart that is the sentence that it shows."""
+    if isinstance(block, Words):
+        text = Text(block.text)
+        text.stylize(STYLES[block.tone], *_stressed(block))
+        return Padding(text, (0, 0, 0, block.indent)) if block.indent else text
+    if isinstance(block, Table):
+        return WordTable(block) if any(block.heads) else _pairs(block)
+    if isinstance(block, Items):
+        return "\n".join(f"- {row}" for row in block.rows)
+    if isinstance(block, Chart):
+        return str((block.figure.layout.meta or {}).get("says", ""))
+    raise TypeError(type(block))
+
+
+def _stressed(words: Words) -> tuple[int, int]:
+    start = words.text.find(words.stressed)
+    return start, start + (len(words.stressed) or len(words.text))
+
+
+def _pairs(of: Table) -> RichTable:
+    out = RichTable.grid(padding=(0, 2), pad_edge=False)
+    out.add_column(no_wrap=True)
+    out.add_column(overflow="fold")
+    for what, said in of.rows:
+        out.add_row(Text(f"  {what}"), Text(said))
+    return out
+
+
+class WordTable(RichTable):
     """Columns as wide as they want to be; where there is less room, lines break between words.
 
     Columns of words (to the left) are narrowed down to their longest word, columns of numbers down
@@ -21,12 +62,16 @@ class WordTable(Table):
     headed by the first one.
     """
 
-    def __init__(self, *columns: str, left: Sequence[int] = (0,)) -> None:
-        """Make an empty table; numbers stand to the right, the columns of `left` to the left."""
+    def __init__(self, of: Table) -> None:
+        """Take a table over."""
         super().__init__(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-        self._left = frozenset(left)
-        for k, name in enumerate(columns):
-            self.add_column(name, justify="left" if k in left else "right", overflow="fold")
+        self._left = frozenset(of.left)
+        for k, name in enumerate(of.heads):
+            self.add_column(name, justify="left" if k in of.left else "right", overflow="fold")
+        for k, row in enumerate(of.rows):
+            if k in of.ruled and k:
+                self.add_section()
+            self.add_row(*row, style=STYLES[of.tones.get(k, "text")])
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Choose the widths for the room that there is."""

@@ -1,18 +1,16 @@
-"""What `validate` says: errors of readings that were never fitted, by load, by pose, by a limit."""
+"""Readings that were never fitted: their errors by load, by pose, by a limit."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 
 import numpy as np
-from rich.console import RenderableType
-from rich.text import Text
 
 from hilcal import numbers
 from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
 from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.extrapolation import Beyond, Extrapolation
 from hilcal.identification.validation import Validation
-from hilcal.present import text
+from hilcal.present.document import Block, Table, note, table
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -45,11 +43,9 @@ def opening(judged: Judged, found: Validation) -> Iterator[str]:
     yield f"{count} that were never fitted are predicted to {error}; {noise}"
 
 
-def validation_report(
-    judged: Judged, found: Validation, beyond: Extrapolation
-) -> Iterator[RenderableType]:
+def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) -> Iterator[Block]:
     """Yield the errors, inside and outside of what was measured, and where outside is."""
-    out = text.table("3-D position error", "rms", "mean", "largest", "rms in σ", "stated", "z")
+    out = table("3-D position error", "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     everything = np.ones(len(beyond.z), dtype=np.bool_)
     rows = [("never fitted" if judged.unseen else "fitted", found.error, everything)]
@@ -59,21 +55,14 @@ def validation_report(
             ("outside", outside, beyond.outside),
         ]
     for name, e, mine in rows:
-        out.add_row(
-            name,
-            numbers.length(e.rms_m),
-            numbers.length(e.mean_m),
-            numbers.length(e.max_m),
-            f"{e.rms_sigma:.2f}",
-            numbers.length(_rms(beyond.stated_m[mine])),
-            f"{_rms(beyond.z[mine]):.2f}",
-        )
-    out.add_row("noise alone", numbers.length(found.noise_floor), "", "", "1.00", "", "")
+        lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
+        stated = numbers.length(_rms(beyond.stated_m[mine]))
+        out.add(name, *lengths, f"{e.rms_sigma:.2f}", stated, f"{_rms(beyond.z[mine]):.2f}")
+    out.add("noise alone", numbers.length(found.noise_floor), "", "", "1.00", "", "")
     yield out
-    yield Text(
+    yield note(
         "stated: standard deviation that the fit states for these readings, what it does not know "
-        "where nothing was measured included; z: error over it.\n",
-        style="dim",
+        "where nothing was measured included; z: error over it.\n"
     )
     yield from _where(beyond)
     if (z := _rms(beyond.z)) > DOUBTED:
@@ -105,37 +94,33 @@ def _beyond(v: Beyond) -> str:
     return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
 
 
-def shares_report(found: Acceptance) -> Iterator[RenderableType]:
+def shares_report(found: Acceptance) -> Iterator[Block]:
     """Yield errors by load, the worst poses, and whether a limit is kept."""
     yield from loads_report(found)
-    yield from worst_report(found)
+    yield worst_table(found)
     yield ""
     if found.limit_m is not None:
         yield _limit_words(found, found.limit_m)
 
 
-def loads_report(found: Acceptance) -> Iterator[RenderableType]:
+def loads_report(found: Acceptance) -> Iterator[Block]:
     """Yield errors by load."""
-    limit = found.limit_m
-    heads = ("n", "rms", "largest", "at", "stated", "z", "in 95 %")
-    out = text.table("load", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
-    for s in (*found.loads, *(() if len(found.loads) == 1 else (found.everything,))):
-        out.add_row(*_cells(s), *_verdict(s, limit))
-    yield out
-    yield Text(
-        f"in 95 %: share of the readings inside of their stated {100 * BAND:.0f} % region.\n",
-        style="dim",
+    every = () if len(found.loads) == 1 else (found.everything,)
+    yield _shares_table("load", "at", (*found.loads, *every), found.limit_m)
+    yield note(
+        f"in 95 %: share of the readings inside of their stated {100 * BAND:.0f} % region.\n"
     )
 
 
-def worst_report(found: Acceptance) -> Iterator[RenderableType]:
-    """Yield the worst poses."""
-    limit = found.limit_m
-    heads = ("n", "rms", "largest", "load", "stated", "z", "in 95 %")
-    out = text.table("worst poses", *heads, *(() if limit is None else ("limit",)), left=(0, 4))
-    for s in found.poses[:WORST]:
-        out.add_row(*_cells(s), *_verdict(s, limit))
-    yield out
+def worst_table(found: Acceptance) -> Table:
+    """Return the errors of the worst poses."""
+    return _shares_table("worst poses", "load", found.poses[:WORST], found.limit_m)
+
+
+def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
+    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %", "limit")
+    rows = ((*_cells(s), *_verdict(s, limit)) for s in shares)
+    return table(*heads[: None if limit is not None else -1], rows=rows, left=(0, 4))
 
 
 def _cells(s: Share) -> tuple[str, ...]:
@@ -166,7 +151,7 @@ def _place(worst: Share) -> str:
     return f"{worst.name} " + ("unloaded" if worst.worst == UNLOADED else f"under {worst.worst}")
 
 
-def failure(found: Acceptance, judged: Judged) -> str:
+def validation_failure(found: Acceptance, judged: Judged) -> str:
     """Return the one line on a limit that is not kept."""
     limit, worst = found.limit_m or 0.0, found.poses[0]
     head = (
@@ -205,7 +190,7 @@ def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
-def to_json(beyond: Extrapolation) -> dict[str, object]:
+def extrapolation_json(beyond: Extrapolation) -> dict[str, object]:
     """Return the keys of `validate --json` on extrapolation and stated standard deviations."""
 
     def block(e: ErrorBlock | None) -> dict[str, float] | None:

@@ -1,9 +1,11 @@
-"""A campaign while it is measured: a bar on a terminal, one line per reading elsewhere."""
+"""A campaign while it is measured: who answers, each reading, the goal."""
 
+import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from math import isfinite
 from typing import Any
 
 from rich.console import Console, RenderableType
@@ -18,9 +20,125 @@ from rich.progress import (
 from rich.text import Text
 
 from hilcal import numbers
-from hilcal.measuring.progress import Answered, GoalMet, Phase, Question, ReadingStored, Remark
-from hilcal.present.goal_words import met_words, status_words
-from hilcal.present.text_run import spoken
+from hilcal.design.goal import parse_goal
+from hilcal.measuring.connect import ConnectionResult
+from hilcal.measuring.dry_run import DryRun
+from hilcal.measuring.progress import (
+    Answered,
+    GoalMet,
+    GoalStatus,
+    Phase,
+    Question,
+    ReadingStored,
+    Remark,
+)
+from hilcal.present.document import Block, table
+
+
+def spoken(seconds: float) -> str:
+    """Return a duration for people: "45 s", "12 min", "3 h 05 min"."""
+    if seconds < 99.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+def check_report(answers: tuple[ConnectionResult, ...], dry: DryRun | None) -> Iterator[Block]:
+    """Yield who answered, in which state, and every problem."""
+    out = table("device", "driver", "", "who answers, and what it says", left=(0, 1, 2, 3))
+    for a in answers:
+        name = "no answer" if a.report is None else a.report.name
+        out.add(a.device, a.driver, "✗" if a.problems else "✓", name)
+        for what, value in () if a.report is None else a.report.facts:
+            out.add("", "", "", f"{what}: {value}")
+        for problem in a.problems:
+            out.add("", "", "!", problem)
+    yield from ("", out, "")
+    count = sum(len(a.problems) for a in answers)
+    if count:
+        yield f"{count} problem{'s' if count > 1 else ''}. Nothing was moved."
+    else:
+        yield "All devices are ready. Nothing was moved."
+    if dry is not None:
+        yield from _dry_report(dry)
+
+
+def _dry_report(dry: DryRun) -> Iterator[Block]:
+    if dry.problems:
+        yield f"The plan cannot be run ({len(dry.problems)}):"
+        for problem in dry.problems:
+            yield f"  {problem}"
+    else:
+        yield (
+            f"The plan keeps every limit: {dry.motions} motions, {dry.load_changes} load changes, "
+            f"about {spoken(dry.duration)}."
+        )
+    for remark in dry.remarks:
+        yield f"note: {remark}"
+
+
+def status_words(status: GoalStatus) -> str:
+    """Return the present value, e.g. "joint std 4.1 % (j6)"; empty while it is not known."""
+    if status.worst is None or status.std is None or status.unit is None:
+        return ""
+    goal = parse_goal(status.text)
+    if goal.of_position:
+        what = f"predicted {_kind(status)}"
+        return f"{what} not determined yet" if _open(status) else f"{what} ± {_value(status)}"
+    match = re.match(r"[\w.]+", status.text.strip())
+    what = "" if match is None else match[0]
+    same = status.worst in (what, goal.what)
+    which = "" if same else f" ({status.worst.split('.')[-1]})"
+    if _open(status):
+        return f"{what} std not determined yet{which}"
+    return f"{what} std {_value(status)}{which}"
+
+
+def full_words(status: GoalStatus) -> str:
+    """Return in full what is judged and its value, e.g. "standard uncertainty of X: 4.1 µm"."""
+    if not status.quantity:
+        return status_words(status)
+    if _open(status):
+        return f"{status.quantity}: not determined by these readings"
+    return f"{status.quantity}: {_value(status)}{' of its value' * (status.unit == '%')}"
+
+
+def _open(status: GoalStatus) -> bool:
+    """Whether the readings do not determine the quantity."""
+    return status.std is None or not isfinite(status.std)
+
+
+def _kind(status: GoalStatus) -> str:
+    """Return whether deflections or positions are predicted."""
+    return "deflection" if "predicted deflection" in status.quantity else "position"
+
+
+def _value(status: GoalStatus) -> str:
+    if status.std is None or status.unit is None:
+        return ""
+    if status.unit == "%":
+        return f"{numbers.digits(status.std, 2)} %"
+    unit, factor = numbers.unit_for(status.unit, (status.std,))
+    return f"{numbers.digits(factor * status.std, 2)} {unit}"
+
+
+def met_words(event: GoalMet) -> str:
+    """Return in one line that the goal is met."""
+    count = f"after {event.readings} of {event.planned} readings"
+    return f"goal met {count}: {full_words(event.status)}"
+
+
+def missed_words(status: GoalStatus, count: int) -> str:
+    """Return in one line by how much the goal was missed after so many readings."""
+    head = f'goal "{status.text}" is not met after all {count} readings'
+    if not status.quantity:
+        return f"{head}: the model cannot be fitted to them"
+    words = f"{head}: {full_words(status)}"
+    if status.ratio is None or not isfinite(status.ratio):
+        return words
+    if status.ratio <= 1.0:
+        return f"{words}, but the fit did not converge"
+    return f"{words}, {status.ratio:.2g} times what is asked for"
 
 
 @dataclass(slots=True)

@@ -1,15 +1,14 @@
-"""What `bootstrap` prints, and its JSON document."""
+"""What `bootstrap` says, and its JSON document."""
 
 from collections.abc import Iterator
 
 import numpy as np
-from rich.console import RenderableType
-from rich.text import Text
 
 from hilcal import numbers
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.priors import names_of
-from hilcal.present.text import heading, kind, model_name, table
+from hilcal.present.document import Block, Table, heading, note, table
+from hilcal.present.fit import kind, model_name
 
 LEVEL = 0.95
 WIDER = 1.5
@@ -20,7 +19,7 @@ CROWDED = 0.5
 """Degrees of freedom that a fit spends, per pose, from which on draws are too wide; a choice."""
 
 
-def bootstrap_report(found: Bootstrap) -> Iterator[RenderableType]:
+def bootstrap_report(found: Bootstrap) -> Iterator[Block]:
     """Yield all that people want to know of a bootstrap."""
     fit = found.fit
     yield heading(f"Model: {model_name(fit.model.named)}")
@@ -30,15 +29,14 @@ def bootstrap_report(found: Bootstrap) -> Iterator[RenderableType]:
     )
     if found.compared.any():
         yield _table(found)
-        yield Text(
+        yield note(
             "± stated: standard uncertainty of the fit. ± drawn: standard deviation over the draws."
-            "\n",
-            style="dim",
+            "\n"
         )
-    yield from remarks(found)
+    yield from bootstrap_remarks(found)
 
 
-def _table(found: Bootstrap) -> RenderableType:
+def _table(found: Bootstrap) -> Table:
     rows = table(
         "parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit",
         left=(0, 6),
@@ -55,11 +53,11 @@ def _table(found: Bootstrap) -> RenderableType:
         drawn = numbers.with_std(0.0, factor * float(found.std[k]))[1]
         places = len(stated.partition(".")[2])
         between = f"{factor * float(low[k]):.{places}f} to {factor * float(high[k]):.{places}f}"
-        rows.add_row(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
+        rows.add(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
     return rows
 
 
-def remarks(found: Bootstrap) -> Iterator[str]:
+def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
     """Yield what the draws say of the stated standard uncertainties."""
     known = found.ratio[found.compared]
     if len(known):
@@ -104,7 +102,7 @@ def remarks(found: Bootstrap) -> Iterator[str]:
         )
 
 
-def to_json(found: Bootstrap) -> dict[str, object]:
+def bootstrap_json(found: Bootstrap) -> dict[str, object]:
     """Return the bootstrap as a JSON document says it, SI."""
     fit, ends = found.fit, found.interval(LEVEL)
     units = [p.unit for e in fit.model.effects for p in e.parameters]
@@ -127,5 +125,5 @@ def to_json(found: Bootstrap) -> dict[str, object]:
         "poses": found.poses,
         "level": LEVEL,
         "parameters": rows,
-        "remarks": list(remarks(found)),
+        "remarks": list(bootstrap_remarks(found)),
     }

@@ -1,15 +1,12 @@
-"""What `fleet` prints."""
+"""Many arms: what is known of a type, which arms are unlike it, what wears."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from rich.console import RenderableType
-from rich.text import Text
-
 from hilcal import numbers
-from hilcal.present.text import heading, table
+from hilcal.present.document import Block, heading, note, table
 
-if TYPE_CHECKING:  # above this layer
+if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
     from hilcal.transfer.pooled import Odd, Pooled, Seen, Spread
 
@@ -22,14 +19,14 @@ KNOWN = {
 KINDS = {"trait": "a trait of the type", "defect": "of single arms: a defect", "some": ""}
 
 
-def fleet_report(fleet: "Fleet") -> Iterator[RenderableType]:
+def fleet_report(fleet: "Fleet") -> Iterator[Block]:
     """Yield all that people want to know of a fleet."""
     for t in fleet.types:
         yield from type_report(t)
     yield from closing(fleet)
 
 
-def closing(fleet: "Fleet") -> Iterator[RenderableType]:
+def closing(fleet: "Fleet") -> Iterator[Block]:
     """Yield how arms are known, and what was not used."""
     known = {m.known for m in fleet.members}
     yield f"Which arm a campaign is of: by {'; '.join(KNOWN[k] for k in KNOWN if k in known)}."
@@ -40,7 +37,7 @@ def closing(fleet: "Fleet") -> Iterator[RenderableType]:
             yield f"  {f.name}: {f.reason}"
 
 
-def type_report(t: "Pooled") -> Iterator[RenderableType]:
+def type_report(t: "Pooled") -> Iterator[Block]:
     """Yield what is known of one type."""
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
     columns = ["parameter", "mean", "±", "between arms", "±", "between campaigns", "unit"]
@@ -49,11 +46,10 @@ def type_report(t: "Pooled") -> Iterator[RenderableType]:
         columns.remove("between campaigns")
     rows = table(*columns, left=(0, len(columns) - 1))
     for p in t.parameters:
-        rows.add_row(*_row(p, repeated))
+        rows.add(*_row(p, repeated))
     yield rows
-    yield Text(
-        "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n",
-        style="dim",
+    yield note(
+        "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n"
     )
     yield from type_lines(t)
     yield ""

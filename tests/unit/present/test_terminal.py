@@ -6,16 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from hilcal.present.word_table import WordTable, shared
+from hilcal.present.document import Table, table
+from hilcal.present.terminal import shared
 
 WORD = st.text("abcdefghij_", min_size=1, max_size=26)
 WORDS = st.lists(WORD, min_size=1, max_size=6).map(" ".join)
 NUMBER = st.floats(-1e4, 1e4).map(lambda x: f"{x:.3g} µm")
 
 
-def rendered(table: WordTable, width: int) -> list[str]:
+def rendered(made: Table, width: int) -> list[str]:
     stream = io.StringIO()
-    Console(file=stream, width=width).print(table)
+    Console(file=stream, width=width).print(made)
     return stream.getvalue().splitlines()
 
 
@@ -24,10 +25,10 @@ def rendered(table: WordTable, width: int) -> list[str]:
     width=st.integers(30, 120),
 )
 def test_no_word_is_broken_and_no_line_is_too_long(rows: list[tuple[str, ...]], width: int) -> None:
-    table = WordTable("effect", "what it is", "poses\nfitted", "σ", "verdict", left=(0, 1, 4))
+    made = table("effect", "what it is", "poses\nfitted", "σ", "verdict", left=(0, 1, 4))
     for row in rows:
-        table.add_row(*row)
-    lines = rendered(table, width)
+        made.add(*row)
+    lines = rendered(made, width)
     assert max(map(len, lines)) <= width
     cells = {word for row in rows for cell in row for word in cell.split()}
     heads = {"effect", "what", "it", "is", "poses", "fitted", "σ", "verdict"}
@@ -40,9 +41,9 @@ def test_no_word_is_broken_and_no_line_is_too_long(rows: list[tuple[str, ...]], 
 
 
 def test_a_table_that_has_room_is_as_it_was() -> None:
-    table = WordTable("effect", "share", left=(0,))
-    table.add_row("creep", "10 %")
-    assert rendered(table, 40) == [
+    made = table("effect", "share", left=(0,))
+    made.add("creep", "10 %")
+    assert rendered(made, 40) == [
         "effect   share",
         "──────────────",
         "creep     10 %",
@@ -50,10 +51,10 @@ def test_a_table_that_has_room_is_as_it_was() -> None:
 
 
 def test_a_narrow_terminal_gets_lists() -> None:
-    table = WordTable("rev.", "poses\nfitted", "verdict", left=(0, 2))
-    table.add_row("1", "16.7 µm", "missing effect")
-    table.add_row("", "18.9 µm", "")
-    assert [line.rstrip() for line in rendered(table, 18)] == [
+    made = table("rev.", "poses\nfitted", "verdict", left=(0, 2))
+    made.add("1", "16.7 µm", "missing effect")
+    made.add("", "18.9 µm", "")
+    assert [line.rstrip() for line in rendered(made, 18)] == [
         "rev. 1",
         "  poses fitted:",
         "  16.7 µm",

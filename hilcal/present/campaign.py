@@ -1,17 +1,17 @@
-"""What `info` says of a campaign."""
+"""What a campaign holds, and two of its revisions side by side."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from rich.console import RenderableType
-from rich.table import Table
-from rich.text import Text
 
 from hilcal import numbers
+from hilcal.config.changes import Changes, write_value
+from hilcal.identification.fit import Fit
 from hilcal.measuring.repeatability import RepeatabilityEstimate
-from hilcal.present import text
-from hilcal.present.two_revisions import cell_words
+from hilcal.present.document import Block, Table, heading, note, pairs, table
+from hilcal.present.fit import model_name
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
 
@@ -20,7 +20,7 @@ SHOWN = ("start", "load", "doubted", "goal", "interrupted", "failed", "finished"
 MOST_EVENTS = 30
 
 
-def info_report(o: Overview, name: str, covariance: str) -> Iterator[RenderableType]:
+def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
     """Yield what a campaign holds, for people.
 
     Args:
@@ -29,28 +29,27 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[RenderableT
         covariance: what the covariances consist of, in words.
     """
     count = 0 if o.readings is None else len(o.readings)
-    yield text.heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
-    yield _pairs(_head(o, covariance))
+    yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
+    yield pairs(_head(o, covariance))
     yield ""
     if o.planned is not None:
-        yield text.heading("Instruments")
-        yield _pairs([(i.part, _instrument(i.name, i.serial)) for i in o.instruments])
+        yield heading("Instruments")
+        yield pairs([(i.part, _instrument(i.name, i.serial)) for i in o.instruments])
         yield ""
-        yield text.heading("Checks on the way")
-        yield _pairs([*_checks(o)])
+        yield heading("Checks on the way")
+        yield pairs([*_checks(o)])
         yield ""
-        yield text.heading("Events (UTC)")
+        yield heading("Events (UTC)")
         yield from _events(o)
         yield ""
-    yield text.heading("Revisions")
+    yield heading("Revisions")
     if not o.revisions:
         yield "None yet: hilcal identify or refine makes one."
         return
     yield from revisions_tables(o)
-    yield Text(
+    yield note(
         "fit, left out: rms of the 3-D position error, of the fitted poses and of poses left out, "
-        "there in σ of the noise as well; v.f.: variance factor.",
-        style="dim",
+        "there in σ of the noise as well; v.f.: variance factor."
     )
     yield _used(o)
 
@@ -125,14 +124,14 @@ def _drift(o: Overview) -> str:
     )
 
 
-def _events(o: Overview) -> Iterator[RenderableType]:
+def _events(o: Overview) -> Iterator[Block]:
     told = [e for e in o.events if e["kind"] in SHOWN or (e["kind"] == "drift" and e["over"])]
     if not told:
         yield "None yet."
         return
     if len(told) > MOST_EVENTS:
         yield f"{len(told) - MOST_EVENTS} earlier ones, see --json"
-    yield _pairs([(_time(e["utc"]), event_words(e)) for e in told[-MOST_EVENTS:]])
+    yield pairs([(_time(e["utc"]), event_words(e)) for e in told[-MOST_EVENTS:]])
 
 
 def event_words(e: Mapping[str, Any]) -> str:
@@ -159,7 +158,7 @@ def event_words(e: Mapping[str, Any]) -> str:
     return kind if reason in ("", kind) else f"{kind}: {reason}"
 
 
-def revisions_tables(o: Overview) -> Iterator[RenderableType]:
+def revisions_tables(o: Overview) -> Iterator[Block]:
     """Yield the revisions of each kind of readings, whose errors do not compare, as a table."""
     kinds = dict.fromkeys(str(r.options["readings"]) for r in o.revisions)
     for kind in kinds:
@@ -168,23 +167,20 @@ def revisions_tables(o: Overview) -> Iterator[RenderableType]:
         yield _revisions_table(o, [r for r in o.revisions if r.options["readings"] == kind])
 
 
-def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> RenderableType:
+def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> Table:
     """Return a table of revisions; an arrow marks the one in use."""
     branched = any(r.made_from not in (None, r.number - 1) for r in o.revisions)
     heads = ("fit", "left out", "σ", "v.f.", "verdict")
     first = ("rev.", "from", "model") if branched else ("rev.", "model")
-    out = text.table(*first, *heads, left=(len(first) - 1, len(first) + 4))
-    words = [model_words(r) for r in revisions]
-    longest = max(len(word) for model in words for word in model.split())
-    out.columns[len(first) - 1].min_width = longest
-    for r, model in zip(revisions, words, strict=True):
+    out = table(*first, *heads, left=(len(first) - 1, len(first) + 4))
+    for r in revisions:
         fit = r.result_json["identify"]
         left_out = fit["error"]["holdout"]
         verdict = r.result_json.get("diagnose", {}).get("verdict", "")
-        out.add_row(
+        out.add(
             f"→ {r.number}" if r.number == o.in_use else str(r.number),
             *(("" if r.made_from is None else str(r.made_from),) if branched else ()),
-            model,
+            model_words(r),
             numbers.length(float(fit["error"]["fit"]["rms_m"])),
             numbers.length(float(left_out["rms_m"])),
             f"{float(left_out['rms_sigma']):.2f}",
@@ -197,7 +193,7 @@ def _revisions_table(o: Overview, revisions: Sequence[RevisionRecord]) -> Render
 def model_words(r: RevisionRecord) -> str:
     """Return what a revision changed, or its whole model where it is a first one; and its cell."""
     scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
-    found = change(r.added, r.removed, scatter) or text.model_name(r.effects)
+    found = change(r.added, r.removed, scatter) or model_name(r.effects)
     return f"{found}; {cell_words(r.cell)}" if r.cell else found
 
 
@@ -207,21 +203,12 @@ def _used(o: Overview) -> str:
     return "→ used by every command: the latest one; hilcal accept RUN N chooses another."
 
 
-def _pairs(rows: Any) -> RenderableType:
-    out = Table.grid(padding=(0, 2), pad_edge=False)
-    out.add_column(no_wrap=True)
-    out.add_column(overflow="fold")
-    for what, words in rows:
-        out.add_row(Text(f"  {what}"), Text(words))
-    return out
-
-
 def _time(utc: str) -> str:
     """Return a time without what every time here has: T, seconds' zone."""
     return utc[:19].replace("T", " ")
 
 
-def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
+def info_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     """Return the document of `info --json`."""
     return {
         "campaign": path,
@@ -286,3 +273,114 @@ def _revision_json(r: RevisionRecord, o: Overview) -> dict[str, object]:
         "accepted": r.number == o.accepted,
         "in_use": r.number == o.in_use,
     }
+
+
+NONE = "–"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What two revisions say of one thing.
+
+    Attributes:
+        what: it is about, with its unit.
+        first: what the one says.
+        second: what the other says.
+        difference: second minus first; empty where they agree.
+    """
+
+    what: str
+    first: str
+    second: str
+    difference: str
+
+
+def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[Row, ...]:
+    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored."""
+    added = [f"+ {name}" for name in b.effects if name not in a.effects]
+    removed = [f"− {name}" for name in a.effects if name not in b.effects]
+    rows = [_row("model", model_name(a.effects), model_name(b.effects))]
+    if added or removed:
+        rows = [Row("model", rows[0].first, rows[0].second, " ".join([*added, *removed]))]
+    if a.cell or b.cell:
+        cells = [cell_words(r.cell) or "as told at first" for r in (a, b)]
+        rows.append(_row("cell", *cells))
+    rows.append(_row("verdict", verdict_of(a), verdict_of(b)))
+    for what, of in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
+        errors = [float(r.result_json["identify"]["error"][of]["rms_m"]) for r in (a, b)]
+        by = errors[1] - errors[0]
+        share = f" ({100 * by / errors[0]:+.0f} %)" if errors[0] else ""
+        sign = "+" if by > 0 else ""
+        first, second = (numbers.length(x) for x in errors)
+        differs = f"{sign}{numbers.length(by)}{share}".replace("-", "−")
+        rows.append(Row(what, first, second, differs if first != second else ""))
+    factors = [float(r.result_json["identify"]["variance_factor"]) for r in (a, b)]
+    rows.append(_row("variance factor", *(numbers.digits(x) for x in factors)))
+    count = [str(r.result_json["identify"]["n_readings"]) for r in (a, b)]
+    rows.append(_row("readings", *count))
+    return (*rows, *_parameters(a, b))
+
+
+def verdict_of(record: RevisionRecord) -> str:
+    """Return the verdict as words; a line for none."""
+    found = record.result_json.get("diagnose", {}).get("verdict")
+    return NONE if found is None else str(found).replace("_", " ")
+
+
+def left_out_m(record: RevisionRecord) -> float:
+    """Return the rms 3-D position error on poses left out, m."""
+    return float(record.result_json["identify"]["error"]["holdout"]["rms_m"])
+
+
+def cell_words(changes: Changes) -> str:
+    """Return changes of a cell in a line, as CELL.toml would have them."""
+    return "; ".join(
+        f"[{section}] " + ", ".join(f"{key} = {write_value(value)}" for key, value in keys.items())
+        for section, keys in changes.items()
+    )
+
+
+def refitted(before: Fit, after: Fit) -> str:
+    """Return what a fit in a changed cell did to error and variance factor."""
+    errors = (numbers.length(f.holdout.rms_m) for f in (before, after))
+    factors = (f"{f.variance_factor:.2f}" for f in (before, after))
+    return (
+        f"The error on poses left out goes {' → '.join(errors)}, the variance factor "
+        f"{' → '.join(factors)}."
+    )
+
+
+def _row(what: str, first: str, second: str) -> Row:
+    return Row(what, first, second, "differs" if first != second else "")
+
+
+def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[Row]:
+    known: list[dict[str, Mapping[str, Any]]] = [
+        {p["name"]: p for p in r.result_json["identify"]["parameters"]} for r in (a, b)
+    ]
+    for name in dict.fromkeys([*known[0], *known[1]]):
+        found = [of.get(name) for of in known]
+        values = [0.0 if p is None or p["value"] is None else float(p["value"]) for p in found]
+        given = next(p for p in found if p is not None)
+        unit, factor = numbers.unit_for(str(given["unit"]), values)
+        first, second = (_value(p, factor) for p in found)
+        if {first, second} <= {NONE, UNSEEN}:
+            continue
+        difference = ""
+        if first != second and not {first, second} & {NONE, UNSEEN}:
+            by = factor * (values[1] - values[0])
+            difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
+        yield Row(f"{name} [{unit}]" if unit else name, first, second, difference)
+
+
+UNSEEN = "not determined"
+
+
+def _value(p: Mapping[str, Any] | None, factor: float) -> str:
+    if p is None:
+        return NONE
+    if p["value"] is None or not p["identifiable"]:
+        return UNSEEN
+    std = float("nan") if p["std"] is None else factor * float(p["std"])
+    value, error = numbers.with_std(factor * float(p["value"]), std)
+    return f"{value} ± {error}" if error else value

@@ -1,11 +1,9 @@
-"""A fit in words and tables, for people."""
+"""A fit in words and tables: parameters, errors, what cannot be seen; scalings, streams, priors."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rich.console import RenderableType
-from rich.text import Text
 
 from hilcal import numbers
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
@@ -13,18 +11,26 @@ from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
 from hilcal.identification.before import error_before
+from hilcal.identification.carried import Group as CarriedGroup
+from hilcal.identification.drift import Conflict
+from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.gross_errors import gross_errors
-from hilcal.present.scatter_words import correlated, sigmas
-from hilcal.present.text_registration import fitted_lines
-from hilcal.present.word_table import WordTable
+from hilcal.identification.learnt import of_arm
+from hilcal.numbers import names
+from hilcal.present.document import Block, Table, heading, note, table
+from hilcal.present.registration import fitted_lines
+from hilcal.present.verdict import correlated, sigmas
+from hilcal.readings.whitening import Scaling
+from hilcal.stream.fit import StreamFit
 from hilcal.types import Ints
 
 ALL_ROWS = 60
 SCREEN = 6
 """Parameters on the first screen."""
+PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
 STRONGEST = 5
 DIRECTIONS = 8
 GROSS = 8
@@ -40,16 +46,6 @@ GROUPS: dict[Group, str] = {
 CERTAIN = 0.005
 
 
-def heading(words: str) -> Text:
-    """Return a heading."""
-    return Text(words, style="bold")
-
-
-def table(*columns: str, left: Sequence[int] = (0,)) -> WordTable:
-    """Return an empty table; numbers stand to the right, the columns of `left` to the left."""
-    return WordTable(*columns, left=left)
-
-
 def model_name(names: Sequence[str]) -> str:
     """Write a model as the sum of its effects."""
     return " + ".join(names) or "the rigid nominal arm"
@@ -62,7 +58,7 @@ def kind(fit: Fit) -> str:
     return f"{len(fit.raw)} deflections (loaded minus unloaded) of {len(fit.readings)} readings"
 
 
-def fit_report(fit: Fit, details: bool = True) -> Iterator[RenderableType]:
+def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
     """Yield all that people want to know of a fit, or one screen of it."""
     yield heading(f"Model: {model_name(fit.model.named)}")
     yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
@@ -99,9 +95,7 @@ def set_aside(fit: Fit, details: bool) -> Iterator[str]:
         yield f"  ... and {len(gross) - GROSS} more; --json lists all"
 
 
-def parameters(
-    fit: Fit, most: int = ALL_ROWS, where: str = "--details"
-) -> Iterator[RenderableType]:
+def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
     """Yield a table of parameters, and a summary of each large family.
 
     Args:
@@ -127,12 +121,10 @@ def parameters(
                 unseen.append(f"{effect.name} {_which(left, len(index))}")
     rest = len(frames) + len(rows) - most
     if frames or rows:
-        out = table("parameter", "value", "±", "unit", "meaning", left=(0, 3, 4))
-        for row in [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]:
-            out.add_row(*row)
-        yield out
+        shown = [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]
+        yield table(*PARAMETER_COLUMNS, rows=shown, left=(0, 3, 4))
         more = f"{rest} more parameters: {where}. " if rest > 0 else ""
-        yield Text(f"{more}±: standard uncertainty.\n", style="dim")
+        yield note(f"{more}±: standard uncertainty.\n")
     yield from families
     if unseen:
         yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
@@ -157,7 +149,7 @@ def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str
         yield f"{effect.name}.{p.name}", value, std, unit, p.meaning
 
 
-def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
+def family(fit: Fit, effect: Effect, index: Ints) -> str:
     """Summarise a family of hundreds of parameters."""
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
@@ -180,23 +172,22 @@ def family(fit: Fit, effect: Effect, index: Ints) -> RenderableType:
     return "\n".join(lines)
 
 
-def errors(fit: Fit) -> RenderableType:
+def errors(fit: Fit) -> Table:
     """Return the table of errors: before, fitted, left out, and what noise alone leaves."""
+    rows = {
+        "before: rigid nominal arm": error_before(fit),
+        "poses fitted": fit.error,
+        "poses left out": fit.holdout,
+    }
+    return _errors(rows, full_prediction(fit).noise_floor)
+
+
+def _errors(of: Mapping[str, ErrorBlock], floor_m: float) -> Table:
     out = table("3-D position error", "rms", "mean", "largest", "rms in σ")
-    rows = (
-        ("before: rigid nominal arm", error_before(fit)),
-        ("poses fitted", fit.error),
-        ("poses left out", fit.holdout),
-    )
-    for name, e in rows:
-        out.add_row(
-            name,
-            numbers.length(e.rms_m),
-            numbers.length(e.mean_m),
-            numbers.length(e.max_m),
-            f"{e.rms_sigma:.2f}",
-        )
-    out.add_row("noise alone", numbers.length(full_prediction(fit).noise_floor), "", "", "1.00")
+    for name, e in of.items():
+        lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
+        out.add(name, *lengths, f"{e.rms_sigma:.2f}")
+    out.add("noise alone", numbers.length(floor_m), "", "", "1.00")
     return out
 
 
@@ -215,7 +206,7 @@ def before_and_after(fit: Fit) -> str:
     return f"{was}; {left} (noise alone: {floor})."
 
 
-def remarks(fit: Fit) -> Iterator[RenderableType]:
+def remarks(fit: Fit) -> Iterator[Block]:
     """Yield a sentence for each thing that the numbers alone do not say."""
     yield _variance_factor(fit)
     yield from background_line(fit)
@@ -234,8 +225,8 @@ def remarks(fit: Fit) -> Iterator[RenderableType]:
         if len(null) > DIRECTIONS:
             yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
     yield from fitted_lines(fit)
-    for note in notes(fit):
-        yield note[0].upper() + note[1:] + "."
+    for remark in notes(fit):
+        yield remark[0].upper() + remark[1:] + "."
     yield from set_aside(fit, details=True)
 
 
@@ -249,7 +240,7 @@ def background_line(fit: Fit) -> Iterator[str]:
         )
 
 
-def _variance_factor(fit: Fit) -> str:
+def _variance_factor(fit: Fit | StreamFit) -> str:
     low, high = fit.variance_factor_interval
     return (
         f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
@@ -308,27 +299,25 @@ def follows(places: Sequence[MisfitShare]) -> str:
     return f"{told}."
 
 
-def where_table(places: Sequence[MisfitShare]) -> Iterator[RenderableType]:
+def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
     """Yield the table of variables that the misfit follows, by groups, and what a share is."""
     out = table("where the model fails", "share", "p-value")
     shown = [p for p in places if p.share >= LEAST_SHARE]
     for group, words in GROUPS.items():
         mine = [p for p in shown if p.group == group]
-        if mine and out.row_count:
-            out.add_section()
+        out.rule()
         for p in mine:
             name = p.variable.removeprefix("direction ")
-            out.add_row(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
+            out.add(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
     least = numbers.percent(LEAST_SHARE)
     rest = len([p for p in places if p.share < LEAST_SHARE])
     more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
-    yield Text(
+    yield note(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
         "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}",
-        style="dim",
+        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}"
     )
 
 
@@ -369,10 +358,139 @@ def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
     return list(found.values())
 
 
-def worst_table(worst: Sequence[Worst], left_out: bool = False) -> RenderableType:
+def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
     """Return the table of the worst poses, as fitted or as predicted without themselves."""
     title = "worst poses, each left out" if left_out else "worst poses"
-    out = table(title, "load", "error", "in σ", left=(0, 1))
-    for w in worst:
-        out.add_row(w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}")
-    return out
+    rows = ((w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}") for w in worst)
+    return table(title, "load", "error", "in σ", rows=rows, left=(0, 1))
+
+
+def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
+    """Yield a table: parameters with standard uncertainties, errors, condition numbers."""
+    yield heading("The same readings with every scaling")
+    out = table("", *fits, "unit", left=(0, len(fits) + 1))
+    first = next(iter(fits.values()))
+    for effect, s in zip(first.model.effects, first.model.slices(), strict=True):
+        if effect.groups() is not None or s.stop - s.start > ALL_ROWS:
+            continue
+        for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
+            values = [float(f.theta[k]) for f in fits.values() if f.uncertainty.identifiable[k]]
+            if values:
+                unit, factor = numbers.unit_for(p.unit, values)
+                out.add(
+                    f"{effect.name}.{p.name}",
+                    *(_entry(f, k, factor) for f in fits.values()),
+                    unit,
+                )
+    out.rule()
+    for name, entries in _summary(tuple(fits.values())):
+        out.add(name, *entries, "")
+    yield out
+    yield note(
+        "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
+        "covariance, pose by pose. The revision that is kept is that of gc."
+    )
+
+
+def _summary(fits: Sequence[Fit]) -> Iterator[tuple[str, list[str]]]:
+    bases = [f.solution.equations.basis for f in fits]
+    yield "rms error, poses fitted", [numbers.length(f.error.rms_m) for f in fits]
+    yield "rms error, poses left out", [numbers.length(f.holdout.rms_m) for f in fits]
+    yield "variance factor (of gc)", [numbers.digits(f.variance_factor) for f in fits]
+    yield "condition, physical units", [numbers.condition(b.condition_unscaled) for b in bases]
+    yield "condition, parameters scaled", [numbers.condition(b.condition_scaled) for b in bases]
+
+
+def _entry(fit: Fit, k: int, factor: float) -> str:
+    if not fit.uncertainty.identifiable[k]:
+        return "-"
+    value, std = numbers.with_std(
+        factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
+    )
+    return f"{value} ± {std}" if std else value
+
+
+def stream_report(fit: StreamFit) -> Iterator[Block]:
+    """Yield all that people want to know of a fit to a stream."""
+    yield heading(f"Model: {model_name(fit.model.names)}")
+    yield f"Fitted to {fit.readings} absolute readings of a stream, in {fit.passes} passes.\n"
+    meaning = {f"{e.name}.{p.name}": p.meaning for e in fit.model.effects for p in e.parameters}
+    rows, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
+    for p in fit.parameters:
+        if p.value is None or p.std is None:
+            unseen.append(p.name)
+        else:
+            rows.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
+    yield rows
+    yield note("±: standard uncertainty.\n")
+    if unseen:
+        yield f"Not determined by these readings: {', '.join(unseen)}.\n"
+    named = {"readings fitted": fit.error, "tenths of the stream left out": fit.holdout}
+    yield _errors(named, fit.noise_floor)
+    yield ""
+    yield _variance_factor(fit)
+    if fit.inflated:
+        yield (
+            "The residuals are larger than the noise: the standard uncertainties were widened to "
+            "what leaving out tenths of the stream shows."
+        )
+    if fit.outliers:
+        many = f"; the worst: {_rows(fit)}" if fit.named else ""
+        yield f"{fit.outliers} readings were set aside as gross errors{many}."
+    if not fit.converged:
+        yield "Not converged: do not trust the parameters."
+
+
+def _rows(fit: StreamFit) -> str:
+    return ", ".join(f"row {row} ({sigma:.3g} σ)" for row, sigma in fit.named)
+
+
+TELL_P = 1e-3
+"""p-value, times the number of groups that are looked at, below which a disagreement is told."""
+MOST_TOLD = 5
+
+
+def prior_lines(found: Fit) -> list[str]:
+    """Return what people are told of the prior that a fit used; nothing without one."""
+    prior = found.model.prior
+    if prior is None:
+        return []
+    source = prior.posterior.source
+    of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
+    fleet = source.campaign and not source.revision  # it says itself of which arms
+    lines = [
+        f"Prior: {source.campaign or 'a posterior'}"
+        + (f", revision {source.revision}" if source.revision else "")
+        + f" ({source.n_readings} readings{'' if fleet else of})."
+    ]
+    told = disagreements(found)
+    for c in told[:MOST_TOLD]:
+        lines.append(
+            f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the "
+            "prior allows: wear, a crash or a repair?"
+        )
+    if len(told) > MOST_TOLD:
+        lines.append(f"  … and {len(told) - MOST_TOLD} more (--json lists them)")
+    known = {e.name for e in prior.posterior.effects}
+    new = [e.name for e in found.model.effects if of_arm(e) and e.name not in known]
+    ask = "hilcal compare EARLIER LATER says what has changed"
+    if new:
+        lines.append(f"  Its model did not have {names(new)}; {ask}.")
+    elif found.variance_factor_interval[0] > 1:
+        lines.append(f"  With it the model leaves more than the noise; {ask}.")
+    elif not told:
+        lines.append("  The readings agree with it.")
+    return lines
+
+
+def disagreements(found: Fit) -> list[Conflict]:
+    """Return the groups about which prior and readings disagree beyond chance, worst first."""
+    all_of = found.conflicts
+    return [c for c in all_of if c.p_value * len(all_of) < TELL_P]
+
+
+def _of(group: CarriedGroup) -> str:
+    words = group.effect.replace("_", " ")
+    if group.joint is not None:
+        return f"joint {group.joint}'s {words}"
+    return f"the {words} of {group.part}" if group.part else f"the {words}"

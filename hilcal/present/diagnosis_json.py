@@ -10,7 +10,7 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.residual_regression import Dependence
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 
 
 def to_json(d: Diagnosis) -> dict[str, object]:

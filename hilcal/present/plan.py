@@ -1,18 +1,14 @@
-"""The summary of a plan in words and tables, for people."""
+"""A plan, and the one that `next` makes, in words and tables."""
 
 import math
 from collections.abc import Iterator, Sequence
 
-from rich.console import RenderableType
-from rich.padding import Padding
-from rich.table import Table
-from rich.text import Text
-
 from hilcal import numbers
 from hilcal.design.confounding import Confounding
+from hilcal.design.next import SURE, Next, PairPower
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
-from hilcal.present import text
-from hilcal.present.text_run import spoken
+from hilcal.present.document import Block, Table, heading, note, pairs, table
+from hilcal.present.running import spoken
 from hilcal.store.plan import UNLOADED
 
 CRITERIA = {
@@ -32,21 +28,8 @@ LIKE = 1.1
 """A number of poses is enough where the end of the curve is not better by more than this factor.
 A choice."""
 
-PARAMETER_COLUMNS = ("parameter", "±", "magnitude", "unit", "± in %")
-PARAMETER_NOTE = "magnitude: estimated so far, else the effect's ordinary magnitude."
-CRITERIA_COLUMNS = (
-    "criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)", "certified"
-)  # fmt: skip
-CRITERIA_NOTE = (
-    "predicted: standard uncertainty of the prediction at the prediction poses; open: the same "
-    "with the effects outside of the model estimated as well. joint: largest relative uncertainty "
-    "of a joint compliance. O1 to O3: observability indices, larger is better; O1 and O3 with "
-    "these effects estimated as well. certified: lower bound of the efficiency by its own "
-    "criterion."
-)
 
-
-def plan_facts(s: PlanSummary) -> Iterator[RenderableType]:
+def plan_facts(s: PlanSummary) -> Iterator[Block]:
     """Yield what a plan costs and reaches, and what more poses would give."""
     yield from _facts(s)
     if larger := [c for c in s.curve if c.poses > s.poses]:
@@ -54,25 +37,16 @@ def plan_facts(s: PlanSummary) -> Iterator[RenderableType]:
         yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
 
 
-def _facts(s: PlanSummary) -> Iterator[RenderableType]:
-    yield text.heading("Plan")
-    rows = Table.grid(padding=(0, 2))
-    rows.add_column(no_wrap=True)
-    rows.add_column(overflow="fold")
-    for name, value in cost_rows(s):
-        rows.add_row(name, Text(value, style="bold" if name == "efficiency" else ""))
-    yield Padding(rows, (0, 0, 1, 0))
+def _facts(s: PlanSummary) -> Iterator[Block]:
+    yield from (heading("Plan"), pairs(cost_rows(s)), "")
 
 
-def plan_screen(s: PlanSummary) -> Iterator[RenderableType]:
+def plan_screen(s: PlanSummary) -> Iterator[Block]:
     """Yield what a plan costs and reaches, on one screen; `plan_report` yields the rest as well."""
     yield from plan_facts(s)
-    out = text.table("predicted for", "parameters", "±", "unit", "± in %, worst", left=(0, 3))
-    for row in effect_rows(s.parameters):
-        out.add_row(*row)
-    if out.row_count:
-        yield out
-        yield ""
+    heads = ("predicted for", "parameters", "±", "unit", "± in %, worst")
+    if s.parameters:
+        yield from (table(*heads, rows=effect_rows(s.parameters), left=(0, 3)), "")
     if seen := detectable(s):
         (first, least), (last, most) = seen[0], seen[-1]
         yield f"Outside of the model: {first} is seen from {least}, ..., {last} from {most}."
@@ -105,25 +79,17 @@ def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str,
         yield effect, count, least if least == most else f"{least} to {most}", unit, worst
 
 
-def plan_report(s: PlanSummary) -> Iterator[RenderableType]:
+def plan_report(s: PlanSummary) -> Iterator[Block]:
     """Yield the tables and remarks of a plan."""
     yield from _facts(s)
     if s.confounding is not None:
         yield f"{order_remark(s)}\n"
     if s.parameters:
-        yield text.heading("Predicted standard uncertainty")
-        out = text.table(*PARAMETER_COLUMNS, left=(0, 3))
-        for row in parameter_rows(s.parameters):
-            out.add_row(*row)
-        yield out
-        yield Text(f"{PARAMETER_NOTE}\n", style="dim")
+        yield heading("Predicted standard uncertainty")
+        yield from parameters_table(s)
     if s.criteria:
-        yield text.heading("Comparison of criteria, for the same number of readings")
-        out = text.table(*CRITERIA_COLUMNS, left=(0,))
-        for row in criteria_rows(s):
-            out.add_row(*row, style="bold" if row[0].endswith("(this)") else "")
-        yield out
-        yield Text(f"{CRITERIA_NOTE}\n", style="dim")
+        yield heading("Comparison of criteria, for the same number of readings")
+        yield from criteria_table(s)
     if s.curve:
         yield from _curve(s.curve, s.poses)
     if s.detectable:
@@ -208,8 +174,8 @@ def _lost(c: Confounding) -> str:
     return f"{max(1, math.ceil(100 * c.correlation**2 - 1e-6))} %"
 
 
-def parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of `PARAMETER_COLUMNS`; parameters of one effect and unit share a prefix."""
+def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str, ...]]:
+    """Yield rows; parameters of one effect and unit share a prefix."""
     for p in parameters:
         alike = [o for o in parameters if o.unit == p.unit and _effect(o.name) == _effect(p.name)]
         sizes = [o.std if o.value is None else o.value for o in alike]
@@ -226,11 +192,34 @@ def _effect(name: str) -> str:
     return name.split(".")[0]
 
 
-def criteria_rows(s: PlanSummary) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of `CRITERIA_COLUMNS`."""
+def parameters_table(s: PlanSummary) -> Iterator[Block]:
+    """Yield the table of predicted standard uncertainties."""
+    yield table(
+        *("parameter", "±", "magnitude", "unit", "± in %"),
+        rows=_parameter_rows(s.parameters),
+        left=(0, 3),
+    )
+    yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
+
+
+def criteria_table(s: PlanSummary) -> Iterator[Block]:
+    """Yield what plans by other criteria would reach with as many readings."""
+    out = table(
+        *(
+            "criterion",
+            "predicted ±",
+            "open ±",
+            "joint ±",
+            "O1 (D)",
+            "O2 (K)",
+            "O3 (E)",
+            "certified",
+        )
+    )
     for c in s.criteria:
-        yield (
-            f"{c.criterion} (this)" if c.criterion == s.criterion else c.criterion,
+        this = c.criterion == s.criterion
+        out.add(
+            f"{c.criterion} (this)" if this else c.criterion,
             "-" if c.position_std_m is None else numbers.length(c.position_std_m),
             "-" if c.position_open_m is None else numbers.length(c.position_open_m),
             "-" if c.joint_share is None else f"{numbers.digits(100 * c.joint_share, 2)} %",
@@ -238,19 +227,28 @@ def criteria_rows(s: PlanSummary) -> Iterator[tuple[str, ...]]:
             numbers.digits(c.o2, 2),
             numbers.digits(c.o3),
             "-" if c.efficiency is None else _floor(c.efficiency),
+            tone="strong" if this else "text",
         )
+    yield out
+    yield note(
+        "predicted: standard uncertainty of the prediction at the prediction poses; open: the same "
+        "with the effects outside of the model estimated as well. joint: largest relative "
+        "uncertainty of a joint compliance. O1 to O3: observability indices, larger is better; O1 "
+        "and O3 with these effects estimated as well. certified: lower bound of the efficiency by "
+        "its own criterion.\n"
+    )
 
 
-def _curve(curve: Sequence[CurvePoint], poses: int) -> Iterator[RenderableType]:
-    yield text.heading("Sample-size curve: how many poses are enough")
-    out = text.table("poses", "predicted ±", "", left=(2,))
+def _curve(curve: Sequence[CurvePoint], poses: int) -> Iterator[Block]:
+    yield heading("Sample-size curve: how many poses are enough")
+    out = table("poses", "predicted ±", "", left=(2,))
     top = max(point.position_std_m for point in curve)
     for point in curve:
         size = max(1, round(BAR * point.position_std_m / top)) if top > 0 else 1
-        bar = Text("█" * size, style="cyan")
-        if point.poses == poses:
-            bar.append("  this plan", style="bold")
-        out.add_row(str(point.poses), numbers.length(point.position_std_m), bar)
+        this = point.poses == poses
+        bar = "█" * size + "  this plan" * this
+        length = numbers.length(point.position_std_m)
+        out.add(str(point.poses), length, bar, tone="strong" if this else "text")
     yield out
     yield f"{enough(curve)}\n"
 
@@ -280,16 +278,139 @@ def undetectable(s: PlanSummary) -> str:
     return f"These readings cannot detect {numbers.names(names, 'or')}." if names else ""
 
 
-def _detectable(s: PlanSummary) -> Iterator[RenderableType]:
-    yield text.heading("Minimum detectable effects outside of the model")
-    out = text.table("effect", "from")
-    for row in detectable(s):
-        out.add_row(*row)
-    if out.row_count:
-        yield out
-        yield Text(
-            "from: rms displacement of the target that is one sigma of these readings.\n",
-            style="dim",
-        )
+def _detectable(s: PlanSummary) -> Iterator[Block]:
+    yield heading("Minimum detectable effects outside of the model")
+    if found := detectable(s):
+        yield table("effect", "from", rows=found)
+        yield note("from: rms displacement of the target that is one sigma of these readings.\n")
     if words := undetectable(s):
         yield f"{words}\n"
+
+
+_STRETCHED = 1.15
+_MOST_LOADS = 2
+_LEAST_SHARE = 0.1
+
+
+def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+    """Yield the powers of the pairs, now and then, and what makes the difference.
+
+    Args:
+        found: the plan and what it tells.
+        poses: of the plan, beside the reference.
+        readings: of the plan.
+        details: all pairs, not the one of each suspect that is separated least.
+    """
+    yield heading("Telling the suspects apart")
+    yield power_table(found.powers if details else weakest(found.powers))
+    yield note(
+        "now, then: where the first effect is there, the chance that the readings so far, and with "
+        "those planned as well, reject a fit with the second in its place (test at 1 %).\n"
+    )
+    yield f"{powers_summary(found.powers, poses, readings)} {_difference(found)}\n"
+    for remark in found.notes:
+        yield f"note: {remark}"
+
+
+def weakest(powers: Sequence[PairPower]) -> tuple[PairPower, ...]:
+    """Return of each effect that may be there the pair that is separated least."""
+    least: dict[str, PairPower] = {}
+    for t in powers:
+        if t.effect not in least or t.then < least[t.effect].then:
+            least[t.effect] = t
+    return tuple(least.values())
+
+
+def brief_plan(s: PlanSummary) -> str:
+    """Say in two sentences what a plan costs and how good it is."""
+    loads = numbers.names([load_name(name) for name in s.loads])
+    certain = "" if s.efficiency is None else f" Efficiency {certified(s.efficiency)}."
+    return (
+        f"Plan: {s.readings} readings at {s.poses} poses and the reference, {loads}; takes about "
+        f"{spoken(s.duration.total)}.{certain} --details shows the rest.\n"
+    )
+
+
+def poses_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
+    """Yield what further poses tell of a misfit that depends on the pose alone.
+
+    Args:
+        found: the plan and the powers.
+        poses: of the plan, beside the reference.
+        readings: of the plan.
+        details: all pairs, not the one of each suspect that is told least.
+    """
+    yield heading("Poses where nothing was read yet")
+    yield (
+        f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "
+        f"{readings} unloaded readings at {poses} poses, spread over the joints' range.\n"
+    )
+    if found.powers:
+        some = found.powers if details else weakest(found.powers)
+        yield power_table(some, "and this is fitted")
+        yield note(
+            "now, then: chance that it passes every test of a missing effect, poses left out "
+            "included, with the readings so far and with those planned as well.\n"
+        )
+
+
+def power_table(powers: Sequence[PairPower], rival: str = "this is ruled out") -> Table:
+    """Return the table of powers of pairs, now and with the plan."""
+    return table("if this is there", rival, "now", "then", rows=power_rows(powers), left=(0, 1))
+
+
+def power_rows(powers: Sequence[PairPower]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield effect, rival, and the powers now and with the plan."""
+    for t in powers:
+        then = "not in this cell" if t.not_separable else chance(t.then)
+        yield t.effect, t.rival, chance(t.now), then
+
+
+def chance(power: float) -> str:
+    """Write a chance; no test is certain."""
+    return "> 99 %" if power > 0.995 else numbers.percent(power)
+
+
+def _at_least(power: float) -> str:
+    """Write a lower bound of a chance, rounded down."""
+    return f"{min(int(100 * power + 1e-9), 99)} %"
+
+
+def powers_summary(powers: Sequence[PairPower], poses: int, readings: int) -> str:
+    """Say in a sentence what the plan will settle."""
+    able = [t for t in powers if not t.not_separable]
+    head = f"{readings} readings at {poses} poses"
+    if not able:
+        return f"{head} rule out none of the suspects."
+    least = min(able, key=lambda t: t.then)
+    if least.then < SURE:
+        return (
+            f"{head}: the weakest pair is {least.effect}, where it is there, and {least.rival}, "
+            f"which they rule out with a chance of {chance(least.then)} ({chance(least.now)} now); "
+            "more poses raise it."
+        )
+    if len(able) == len(powers):
+        return (
+            f"{head} separate the suspects: whichever is there, each of the others is ruled out "
+            f"with a chance of at least {_at_least(least.then)}."
+        )
+    return (
+        f"{head} separate what can be separated in this cell: each of these pairs with a chance of "
+        f"at least {_at_least(least.then)}."
+    )
+
+
+def _difference(found: Next) -> str:
+    """Say which loads and poses make the difference."""
+    by = sorted(found.shares.items(), key=lambda pair: -pair[1])
+    named = [
+        f"{'the unloaded readings' if load == UNLOADED else load} ({numbers.percent(share)})"
+        for load, share in by[:_MOST_LOADS]
+        if share >= _LEAST_SHARE
+    ]
+    words = f"What separates the weakest pair comes from {numbers.names(named)}"
+    if found.stretched > _STRETCHED:
+        words += ", most of it with the arm stretched out"
+    elif found.stretched < 1 / _STRETCHED:
+        words += ", most of it with the arm drawn in"
+    return f"{words}."

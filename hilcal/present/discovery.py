@@ -1,10 +1,8 @@
-"""Laws that the readings speak for, in words, for people and as JSON."""
+"""Laws that the readings speak for, in words and as JSON."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from rich.console import RenderableType
-from rich.text import Text
 
 from hilcal import numbers
 from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
@@ -12,7 +10,9 @@ from hilcal.discovery.curve import Curve
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.proposal import LawSearch
-from hilcal.present import text, text_unknown
+from hilcal.present.diagnosis import curves, sparkline
+from hilcal.present.document import Block, Words, heading, table
+from hilcal.present.fit import model_name
 
 FEW = 3
 LEAST_BINS = 3
@@ -20,12 +20,12 @@ LEAST_BINS = 3
 NOT_TRIED = "could not be tried in the exact model"
 
 
-def discovery_report(d: Discovery) -> Iterator[RenderableType]:
+def discovery_report(d: Discovery) -> Iterator[Block]:
     """Yield what was found, or why nothing is proposed."""
-    yield text.heading(f"Laws for what {text.model_name(d.fit.model.named)} leaves unexplained")
+    yield heading(f"Laws for what {model_name(d.fit.model.named)} leaves unexplained")
     if not d.laws:
         yield numbers.sentence(silence(d))
-        yield from text_unknown.curves(d.carried)
+        yield from curves(d.carried)
         return
     yield (
         f"{d.candidates} candidates were tried. Searched for without them, laws explain "
@@ -80,8 +80,8 @@ def _what_helps(d: Discovery) -> str:
     return "measure more poses, or record what else may matter"
 
 
-def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
-    yield Text(law.formula, style="bold green" if first else "bold")
+def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
+    yield Words(law.formula, "good" if first else "strong")
     yield f"  acts on      {', '.join(law.acts_on)}"
     yield f"  depends on   {', '.join(law.variables) or 'nothing: a constant'}"
     for c in law.parameters:
@@ -109,20 +109,20 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[RenderableType]:
         yield f"  seen for     {', '.join(seen)}; nothing is known outside"
 
 
-def curve_tables(curves: Sequence[Curve]) -> Iterator[RenderableType]:
+def curve_tables(of: Sequence[Curve]) -> Iterator[Block]:
     """Yield the law over each quantity beside the mean of the readings there."""
-    for c in curves:
+    for c in of:
         x, y, std, _ = c.binned
         if len(x) < LEAST_BINS:
             continue
         unit, factor = numbers.unit_for(c.unit, list(y))
         head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
         law = np.interp(x, *c.line)
-        out = text.table(head, f"{c.of} [{unit}] {text_unknown.sparkline(list(y))}", "±", "law")
+        out = table(head, f"{c.of} [{unit}] {sparkline(list(y))}", "±", "law")
         for at, seen, error, told in zip(x, y, std, law, strict=True):
             value, spread = numbers.with_std(factor * float(seen), factor * float(error))
             places = len(value.partition(".")[2])
-            out.add_row(numbers.digits(float(at)), value, spread, f"{factor * told:.{places}f}")
+            out.add(numbers.digits(float(at)), value, spread, f"{factor * told:.{places}f}")
         yield ""
         yield out
 
@@ -150,7 +150,7 @@ def coefficient(c: Coefficient) -> str:
     return f"{value} ± {std} {'' if unit == '1' else unit}".rstrip()
 
 
-def refined_laws(s: LawSearch) -> Iterator[RenderableType]:
+def refined_laws(s: LawSearch) -> Iterator[Block]:
     """Yield what the searches of a refinement came to: laws that stayed, or why there is none."""
     for d in s.found:
         if not d.laws:
@@ -160,7 +160,7 @@ def refined_laws(s: LawSearch) -> Iterator[RenderableType]:
         if law.name not in s.files:
             yield f"{law.formula} was tried, and did not lower the error on poses left out."
             continue
-        yield text.heading(f"{law.name}: a law that the catalogue does not have")
+        yield heading(f"{law.name}: a law that the catalogue does not have")
         yield from _law(law, d, first=True)
         yield (
             f"It is the effect {law.name} in {s.files[law.name]}, to be edited; commands that read "
@@ -173,7 +173,7 @@ def laws_json(s: LawSearch) -> dict[str, object]:
     return {
         "discover": [
             {
-                **to_json(d),
+                **discovery_json(d),
                 "written": str(s.files[d.laws[0].name])
                 if d.laws and d.laws[0].name in s.files
                 else None,
@@ -183,7 +183,7 @@ def laws_json(s: LawSearch) -> dict[str, object]:
     }
 
 
-def to_json(d: Discovery) -> dict[str, object]:
+def discovery_json(d: Discovery) -> dict[str, object]:
     """Return the document of `discover`."""
     return {
         "model": list(d.fit.model.named),
