@@ -16,6 +16,7 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import CERTAIN, follows, misses, model_name, where_table
+from hilcal.present.story import REVISION_HEADS
 from hilcal.present.verdict import broken, headline, implausible, message
 
 SUSPECTS = 6
@@ -112,22 +113,26 @@ def finer(d: Diagnosis) -> Iterator[str]:
 
 def revisions_table(rows: Sequence[tuple[int, str, Fit, str]]) -> Table:
     """Return the table in which the error falls, from (number, change, fit, verdict)."""
-    errors = ("poses\nfitted", "\nσ", "poses\nleft out", "\nσ")
-    out = table("rev.", "model", *errors, "variance\nfactor", "verdict", left=(0, 1, 7))
-    for number, change, fit, verdict in rows:
-        out.add(
-            str(number),
-            change or model_name(fit.model.named),
-            numbers.length(fit.error.rms_m),
-            f"{fit.error.rms_sigma:.2f}",
-            numbers.length(fit.holdout.rms_m),
-            f"{fit.holdout.rms_sigma:.2f}",
-            numbers.digits(fit.variance_factor),
-            verdict.replace("_", " "),
-        )
+    out = table(*REVISION_HEADS, left=(0, 1, 7))
+    for row in rows:
+        out.add(*revision_cells(*row))
     floor = numbers.length(full_prediction(rows[-1][2]).noise_floor)
     out.add("", "noise alone", floor, "1.00", floor, "1.00", "1", "", tone="note")
     return out
+
+
+def revision_cells(number: int, change: str, fit: Fit, verdict: str) -> tuple[str, ...]:
+    """Return the cells of a revision in `revisions_table`."""
+    return (
+        str(number),
+        change or model_name(fit.model.named),
+        numbers.length(fit.error.rms_m),
+        f"{fit.error.rms_sigma:.2f}",
+        numbers.length(fit.holdout.rms_m),
+        f"{fit.holdout.rms_sigma:.2f}",
+        numbers.digits(fit.variance_factor),
+        verdict.replace("_", " "),
+    )
 
 
 def key() -> Words:
@@ -214,6 +219,8 @@ def redundant_line(d: Diagnosis) -> Iterator[str]:
         )
 
 
+NEAR = 0.99
+"""Component from which a direction is called an axis; a choice."""
 BARS = "▁▂▃▄▅▆▇█"
 CURVES = 2
 
@@ -253,8 +260,11 @@ def moves(d: Dependence) -> str:
     """Say what errs with a variable."""
     if d.y_unit == "rad":
         return d.moves
+    main = int(np.argmax(np.abs(d.direction)))
+    if d.direction[main] > NEAR:
+        return f"the {d.moves} along base {'xyz'[main]}"
     along = ", ".join(f"{v:.2f}" for v in d.direction)
-    return f"the target along ({along}) in base axes"
+    return f"the {d.moves} along ({along}) in base axes"
 
 
 def sparkline(values: Sequence[float]) -> str:

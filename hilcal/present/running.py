@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, RenderableType
 from rich.progress import (
@@ -21,8 +21,6 @@ from rich.text import Text
 
 from hilcal import numbers
 from hilcal.design.goal import parse_goal
-from hilcal.measuring.connect import ConnectionResult
-from hilcal.measuring.dry_run import DryRun
 from hilcal.measuring.progress import (
     Answered,
     GoalMet,
@@ -34,6 +32,10 @@ from hilcal.measuring.progress import (
 )
 from hilcal.present.document import Block, table
 
+if TYPE_CHECKING:
+    from hilcal.measuring.connect import ConnectionResult
+    from hilcal.measuring.dry_run import DryRun
+
 
 def spoken(seconds: float) -> str:
     """Return a duration for people: "45 s", "12 min", "3 h 05 min"."""
@@ -43,7 +45,7 @@ def spoken(seconds: float) -> str:
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def check_report(answers: tuple[ConnectionResult, ...], dry: DryRun | None) -> Iterator[Block]:
+def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") -> Iterator[Block]:
     """Yield who answered, in which state, and every problem."""
     out = table("device", "driver", "", "who answers, and what it says", left=(0, 1, 2, 3))
     for a in answers:
@@ -63,7 +65,7 @@ def check_report(answers: tuple[ConnectionResult, ...], dry: DryRun | None) -> I
         yield from _dry_report(dry)
 
 
-def _dry_report(dry: DryRun) -> Iterator[Block]:
+def _dry_report(dry: "DryRun") -> Iterator[Block]:
     if dry.problems:
         yield f"The plan cannot be run ({len(dry.problems)}):"
         for problem in dry.problems:

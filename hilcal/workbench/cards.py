@@ -418,9 +418,8 @@ def laws(view: View, d: Snapshot) -> None:
     """Draw the laws of the model that the catalogue does not have."""
     title("Laws beyond the catalogue")
     for one in d.revision.laws:
-        ui.label(f"{one.name}: {one.formula}; {one.coefficients}; acts on {one.acts_on}").classes(
-            "soft"
-        )
+        told = "; ".join(f"{what}: {said}" for what, said in one.facts)
+        ui.label(f"{one.title}: {told}").classes("soft")
         chart(view, law(one)).props("data-part=law")
 
 

@@ -4,13 +4,12 @@ import numpy as np
 import plotly.graph_objects as go
 
 from hilcal.present.charts import style
-from hilcal.present.charts.readings_drawn import worst_and_even
-from hilcal.present.story import Regressor
+from hilcal.present.story import Curve, worst_and_even
 
 MOST = 1500
 
 
-def added_variable(r: Regressor, effect: str) -> go.Figure:
+def added_variable(r: Curve, effect: str) -> go.Figure:
     """Draw residual over regressor, both freed of what the model can do.
 
     Where the suspect is right the points lie on the line of slope 1, where it explains nothing

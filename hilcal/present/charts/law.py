@@ -1,18 +1,19 @@
 """A law that the catalogue does not have, over what it depends on, beside the readings."""
 
+import numpy as np
 import plotly.graph_objects as go
 
 from hilcal.present.charts import style
 from hilcal.present.charts.readings_drawn import escaped
-from hilcal.present.story import StoryLaw
+from hilcal.present.story import Curve
 
 
-def law(of: StoryLaw) -> go.Figure:
+def law(of: Curve) -> go.Figure:
     """Draw a law as a line, and what the readings say by themselves with standard uncertainties."""
+    line = np.zeros((2, 0)) if of.line is None else of.line
     traces = [
         go.Scatter(
-            x=style.drawn(of.line[0]),
-            y=style.drawn(of.line[1]),
+            **dict(zip("xy", style.drawn(line), strict=True)),
             mode="lines",
             line={"color": style.NOISE, "width": 2},
             name="law",
@@ -29,8 +30,8 @@ def law(of: StoryLaw) -> go.Figure:
         ),
     ]
     says = (
-        f"{of.formula}: {of.y_label} over {of.x_label}; where the law is right, the readings "
-        "(points) lie on it (line, interpolated where there are none)."
+        f"{of.y_label} over {of.x_label}. {of.says} The law is the line, interpolated where there "
+        "are no readings (points)."
     )
     x, y = escaped(of.x_label), escaped(of.y_label)
     return style.figure(says, x=x, y=y, traces=traces, height=340)

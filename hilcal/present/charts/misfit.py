@@ -10,7 +10,7 @@ from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.present.charts import style
 from hilcal.present.charts.readings_drawn import escaped
 from hilcal.present.fit import CERTAIN, follows
-from hilcal.present.story import StoryCurve
+from hilcal.present.story import Curve
 
 MOST = 12
 
@@ -31,7 +31,7 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
-def misfit_curve(c: StoryCurve) -> go.Figure:
+def misfit_curve(c: Curve) -> go.Figure:
     """Draw how the error depends on a variable, with standard uncertainties."""
     trace = go.Scatter(
         x=[escaped(n) for n in c.names] if c.names else c.x,
@@ -43,10 +43,7 @@ def misfit_curve(c: StoryCurve) -> go.Figure:
         hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
         showlegend=False,
     )
-    says = (
-        f"{c.y_label} over {c.variable}, from {c.y.min():.3g} to {c.y.max():.3g}; "
-        f"{100 * c.share:.0f} % of the misfit on poses left out follows it."
-    )
+    says = f"{c.y_label} over {c.title}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
     return style.figure(says, x=c.x_label, y=c.y_label, traces=[trace], height=300)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from hilcal import numbers
 from hilcal.names import escaped as without_controls
 from hilcal.present.charts import style
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Story, StoryRevision, levels, worst_and_even
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
@@ -42,7 +42,7 @@ class Drawn:
         """What is said where not all readings are drawn; else empty."""
         if len(self.index) == self.of:
             return ""
-        worst = worst_count(len(self.index))
+        worst = max(1, len(self.index) // 5)
         return (
             f" Of {self.of} readings {len(self.index)} are drawn: the {worst} furthest off and an "
             "even choice of the others."
@@ -70,7 +70,7 @@ def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> Drawn:
         of=len(story),
         sigma=sigma[index],
         size_m=size[index],
-        level=style.levels(revision.whitened_norm2[index]),
+        level=levels(revision.whitened_norm2[index]),
         names=tuple(
             f"{place(story, int(i))}: {numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
             for i in index
@@ -90,18 +90,3 @@ def place(story: Story, i: int) -> str:
 def escaped(words: str) -> str:
     """Return words without a meaning in the HTML that plotly takes for labels."""
     return html.escape(without_controls(words), quote=False)
-
-
-def worst_count(most: int) -> int:
-    """Return how many of those drawn are the worst."""
-    return max(1, most // 5)
-
-
-def worst_and_even(badness: Floats, most: int) -> Ints:
-    """Return at most `most` indices, growing: the worst fifth, the others chosen evenly."""
-    if len(badness) <= most:
-        return np.arange(len(badness))
-    worst = np.argsort(-badness, kind="stable")[: worst_count(most)]
-    rest = np.setdiff1d(np.arange(len(badness)), worst)
-    even = rest[np.linspace(0, len(rest) - 1, most - len(worst)).round().astype(np.int64)]
-    return np.sort(np.concatenate([worst, np.unique(even)]))

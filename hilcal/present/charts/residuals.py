@@ -7,7 +7,7 @@ import plotly.graph_objects as go
 
 from hilcal.present.charts import style
 from hilcal.present.charts.readings_drawn import Drawn, drawn, escaped
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -104,7 +104,7 @@ def chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
             x=style.drawn(x[mine]),
             y=style.drawn(d.sigma[mine]),
             mode="markers",
-            name=style.LEVEL_NAMES[k],
+            name=LEVEL_NAMES[k],
             marker={"color": style.LEVELS[k], "symbol": style.SYMBOLS[k], "size": 6},
             text=d.named(mine),
             customdata=d.index[mine],

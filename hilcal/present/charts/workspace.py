@@ -8,7 +8,7 @@ import plotly.graph_objects as go
 from hilcal import numbers
 from hilcal.present.charts import style
 from hilcal.present.charts.readings_drawn import drawn
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, levels
 
 LONGEST = 0.25
 """Length of the largest residual as drawn, m; a choice."""
@@ -49,14 +49,14 @@ def workspace(
             go.Scatter(
                 **dict(zip("xy", style.drawn(at[mine]).T.copy(), strict=True)),
                 mode="markers",
-                name=style.LEVEL_NAMES[k],
+                name=LEVEL_NAMES[k],
                 showlegend=False,
                 marker={"color": style.LEVELS[k], "size": 5, "symbol": style.SYMBOLS[k]},
                 text=d.named(mine),
                 hovertemplate="%{text}<extra></extra>",
             )
         )
-    outside = int((style.levels(revision.whitened_norm2) == len(style.LEVELS) - 1).sum())
+    outside = int((levels(revision.whitened_norm2) == len(style.LEVELS) - 1).sum())
     says = (
         f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
         f"are outside the noise (crosses, red); the largest error is "

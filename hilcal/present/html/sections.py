@@ -29,9 +29,10 @@ from hilcal.present.document import (
     note,
     table,
 )
-from hilcal.present.fit import background_line, model_name, parameters, where_table
+from hilcal.present.fit import background_line, parameters, where_table
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import missing
+from hilcal.present.story import REVISION_HEADS
 from hilcal.present.verdict import message
 
 MOST_CURVES = 2
@@ -67,7 +68,7 @@ def _where(m: ReportContent) -> Section:
     if d is not None:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
-            parts += [Chart(c.variable, misfit_curve(c)) for c in curves]
+            parts += [Chart(c.title, misfit_curve(c)) for c in curves]
         told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
     parts.append(_noise(m))
@@ -100,15 +101,9 @@ def _laws(m: ReportContent) -> Section | None:
     if not found:
         return None
     parts: list[Block] = []
-    for name in dict.fromkeys(one.name for one in found):
-        first = next(one for one in found if one.name == name)
-        rows = (
-            ("law", first.formula),
-            ("acts on", first.acts_on),
-            ("coefficients", first.coefficients),
-        )
-        parts.append(table("", "", rows=rows, caption=f"{name}, an effect of a file"))
-    parts += [Chart(f"{one.name}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
+    for name, facts in {one.title: one.facts for one in found}.items():
+        parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
+    parts += [Chart(f"{one.title}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
     parts.append(
         note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
@@ -142,24 +137,8 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
 def _revisions(m: ReportContent) -> Section:
     parts: list[Block] = [
         Chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
-        table(
-            *("revision", "change", "fitted, rms", "left out, rms", "left out, σ"),
-            *("variance factor", "verdict"),
-            caption="Revisions",
-            rows=(
-                (
-                    str(r.revision),
-                    r.change or model_name(r.model),
-                    numbers.length(r.error_fit["rms_m"]),
-                    numbers.length(r.error_holdout["rms_m"]),
-                    f"{r.error_holdout['rms_sigma']:.2f}",
-                    numbers.digits(r.variance_factor),
-                    r.verdict.replace("_", " "),
-                )
-                for r in m.story.revisions
-            ),
-        ),
-    ]  # fmt: skip
+        table(*REVISION_HEADS, rows=(r.cells for r in m.story.revisions), caption="Revisions"),
+    ]
     if not m.stored:
         parts.append(
             "No revision is stored in the campaign: the baseline was fitted for this report "

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Story, StoryRevision, worst_and_even
 from hilcal.present.viewer import style
 from hilcal.robot.body import body_poses
 from hilcal.types import Floats, Ints
@@ -22,8 +22,6 @@ class Limits:
     balls: int = 60
     pairs: int = 150
     bars: int = 150
-    points: int = 1500
-    parameters: int = 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,14 +162,3 @@ def capped(vectors: Floats, length: float) -> Floats:
     """(K, 3) vectors, those longer than `length` shortened to it."""
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, length / np.maximum(norm, 1e-300)))
-
-
-def worst_and_even(badness: Floats, count: int) -> Ints:
-    """Return at most `count` indices, growing: the worst fifth, the rest spread evenly."""
-    n = len(badness)
-    if n <= count:
-        return np.arange(n)
-    worst = np.argsort(-badness, kind="stable")[: max(1, count // 5)]
-    rest = np.setdiff1d(np.arange(n), worst)
-    even = rest[np.linspace(0, len(rest) - 1, count - len(worst)).round().astype(np.int64)]
-    return np.sort(np.concatenate([worst, np.unique(even)]))

@@ -8,7 +8,6 @@ import rerun as rr
 
 from hilcal.present.fleet import unlike_words
 from hilcal.present.viewer import arm_shapes, style
-from hilcal.present.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, ticks, write
 from hilcal.present.viewer.fleet_digest import FAR, TypeDigest
 from hilcal.robot.body import body_poses, capsules
 from hilcal.types import Floats
@@ -21,7 +20,6 @@ _NAMED = 40
 """Arms up to which each has its name beside it; a choice."""
 _ROWS = 12
 """Parameters that are drawn at most; a choice."""
-_LEFT = 0.3 * WIDTH
 
 
 def places(d: TypeDigest) -> Floats:
@@ -121,59 +119,6 @@ def rows(d: TypeDigest) -> list[int]:
     """Return the parameters that are drawn: those with the farthest arms, in their order."""
     far = np.nanmax(np.abs(np.where(np.isfinite(d.units), d.units, 0.0)), axis=0)
     return sorted(np.argsort(-far, kind="stable")[:_ROWS].tolist())
-
-
-def parameters(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
-    """Log a dot per arm and parameter, in σ of the type; the band is of `FAR` σ."""
-    chosen = rows(d)
-    most = float(np.nanmax(np.abs(d.units[:, chosen]), initial=FAR)) * 1.1 + 0.5
-    row = (np.arange(len(chosen)) + 0.5) * HEIGHT / max(len(chosen), 3)
-
-    def across(sigmas: Floats) -> Floats:
-        return np.asarray(_LEFT + (WIDTH - _LEFT) * (sigmas / most + 1) / 2)
-
-    edge = across(np.array([-FAR, FAR]))
-    rec.log(
-        f"{path}/band",
-        rr.Boxes2D(
-            mins=[(edge[0], 0.0)],
-            sizes=[(edge[1] - edge[0], HEIGHT)],
-            colors=[style.NOISE],
-            radii=rr.Radius.ui_points(1.0),
-            draw_order=-20.0,
-        ),
-        static=True,
-    )
-    for name, wanted, color, size in (
-        ("like", False, style.MEASURED, 3.0),
-        ("unlike", True, style.RED, 6.0),
-    ):
-        which = np.argwhere((d.odd[:, chosen] == wanted) & np.isfinite(d.units[:, chosen]))
-        at = [(across(d.units[a, chosen[i]]), row[i]) for a, i in which]
-        rec.log(
-            f"{path}/{name}",
-            rr.Points2D(at, colors=[color], radii=rr.Radius.ui_points(size)),
-            static=True,
-        )
-        if wanted:
-            told = [d.pooled.arms[a] for a, _ in which]
-            spots = [(float(x), float(y) + RAISED - 6.0) for x, y in at]
-            write(rec, f"{path}/arms", spots, told, static=True)
-    marks = ticks(-most, most)
-    lines = [[(float(x), 0.0), (float(x), HEIGHT)] for x in across(marks)]
-    rec.log(
-        f"{path}/axes",
-        rr.LineStrips2D(
-            lines, colors=[(90, 92, 100)], radii=rr.Radius.ui_points(0.6), draw_order=-10.0
-        ),
-        static=True,
-    )
-    places_ = [(0.38 * _LEFT, float(y) + RAISED) for y in row]
-    places_ += [(float(x), FOOT) for x in across(marks)] + [(0.5 * (WIDTH + _LEFT), BELOW)]
-    words = [d.names[k] for k in chosen] + [f"{x:g}" for x in marks]
-    few = f"; {len(chosen)} of {len(d.names)} parameters" if len(chosen) < len(d.names) else ""
-    words.append(f"distance from the mean of the type in its σ; frame: ±{FAR:g}{few}")
-    write(rec, f"{path}/words", places_, words, static=True)
 
 
 def drift(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:

@@ -10,9 +10,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
-from hilcal.present.fleet import type_lines
-from hilcal.present.viewer import flat, fleet_scene, layout, style
+from hilcal.present.document import heading
+from hilcal.present.fleet import type_report
+from hilcal.present.viewer import fleet_scene, layout
 from hilcal.present.viewer.fleet_digest import TypeDigest, type_digest
+from hilcal.present.viewer.markdown import markdown
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
 
 if TYPE_CHECKING:  # above this layer
@@ -22,9 +24,8 @@ _LEAST_RANGE_S = 86400.0
 GUIDE = """### How to read this
 - **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
   in a red frame. Amber: beyond 3 σ, which chance does to one parameter in some hundred.
-- **Parameters**: a dot for each arm, in σ of the type: the spread from arm to arm together with the
-  uncertainty of the arm's own campaigns.
-- **By date**: the same of each campaign. A line that leaves the others has changed; lines that go
+- **By date**: each campaign in σ of the type: the spread from arm to arm together with the
+  uncertainty of the campaign. A line that leaves the others has changed; lines that go
   the same way are wear.
 """
 
@@ -48,34 +49,18 @@ def _log(rec: rr.RecordingStream, types: list[TypeDigest]) -> None:
     rec.send_recording_name(f"hilcal fleet: {arms} arms")
     for i, d in enumerate(types):
         fleet_scene.arms(rec, f"arms{i}", d)
-        fleet_scene.parameters(rec, f"parameters{i}", d)
         fleet_scene.drift(rec, f"date{i}", d)
         rec.log(f"words/type{i}", _markdown(_told(d)), static=True)
-        rec.log(f"words/table{i}", _markdown(_table(d)), static=True)
     rec.log("words/guide", _markdown(GUIDE), static=True)
     flush(rec)
 
 
 def _told(d: TypeDigest) -> str:
-    t = d.pooled
-    odd = list(dict.fromkeys(o.arm for o in t.odd))
+    odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
     verb = "is" if len(odd) == 1 else "are"
     title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
-    lines = [f"### {style.escaped(title)}"]
-    lines += [f"{style.escaped(t.type)}: {len(t.arms)} arms, {len(t.campaigns)} campaigns.", ""]
-    lines += [f"{style.escaped(line)}  " for line in type_lines(t)]
-    return "\n".join(lines)
-
-
-def _table(d: TypeDigest) -> str:
-    lines = ["| parameter | mean | ± | from arm to arm |", "| --- | ---: | ---: | ---: |"]
-    for p in d.pooled.parameters:
-        unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
-        mean, std = numbers.with_std(factor * p.mean, factor * p.mean_std)
-        between = f"{numbers.digits(factor * p.between)} {unit}"
-        cells = (p.parameter, mean, std, between)
-        lines.append("| " + " | ".join(style.escaped(c) or " " for c in cells) + " |")
-    return "\n".join(lines)
+    name, table, note, *lines = type_report(d.pooled)
+    return markdown([heading(title), name, *lines, table, note])
 
 
 def _markdown(text: str) -> rr.TextDocument:
@@ -83,7 +68,7 @@ def _markdown(text: str) -> rr.TextDocument:
 
 
 def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
-    """Left: the arms over their campaigns by date. Right: the verdict over the parameters."""
+    """Left: the arms over their campaigns by date. Right: the verdict and the parameters."""
     many = len(types) > 1
     of = [f"{d.pooled.type}: " if many else "" for d in types]
     arms = [_arms(f"arms{i}", of[i], d) for i, d in enumerate(types)]
@@ -101,24 +86,10 @@ def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
         rrb.TextDocumentView(origin=f"words/type{i}", name=f"{of[i]}Unlike the type")
         for i in range(len(types))
     ]
-    words += [
-        rrb.TextDocumentView(origin=f"words/table{i}", name=f"{of[i]}In common")
-        for i in range(len(types))
-    ]
     words.append(rrb.TextDocumentView(origin="words/guide", name="How to read this"))
-    dots = [
-        rrb.Spatial2DView(
-            origin=f"parameters{i}",
-            name=f"{of[i]}Each arm against its type [σ]; red: unlike",
-            background=layout.BACKGROUND,
-            visual_bounds=rrb.VisualBounds2D(x_range=(-6.0, flat.WIDTH + 6.0), y_range=flat.BOUNDS),
-        )
-        for i in range(len(types))
-    ]
     left = rrb.Vertical(rrb.Tabs(*arms), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Vertical(rrb.Tabs(*words), rrb.Tabs(*dots), row_shares=[2, 3])
     return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[3, 2]),
+        rrb.Horizontal(left, rrb.Tabs(*words), column_shares=[3, 2]),
         rrb.TimePanel(timeline="date", state="collapsed", play_state="paused"),
         rrb.SelectionPanel(state="hidden"),
         rrb.BlueprintPanel(state="hidden"),

@@ -5,14 +5,13 @@ from typing import Literal
 import numpy as np
 import rerun.blueprint as rrb
 
-from hilcal.present.viewer import errors, eye, flat
+from hilcal.present.viewer import eye
 from hilcal.present.viewer.digest import Digest
 from hilcal.present.viewer.scene import center, seen
 
-FOLLOWS = "Residual against suspect"
+FOLLOWS = "What the residual follows"
 LAW = "Law beyond the catalogue"
-LIMITS = "Could have been seen"
-ERRORS = "Error of each revision [µm, logarithmic]; framed: this one"
+ERRORS = "Error of each revision [µm]"
 EYE = np.array([1.05, -1.35, 0.55])
 # Views that draw with light colours stay dark in the light theme too.
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
@@ -28,27 +27,21 @@ def blueprint(d: Digest) -> rrb.Blueprint:
     left = rrb.Vertical(
         rrb.Tabs(_residuals(d), _deflections(d)),
         rrb.Tabs(
-            _flat(errors.ORIGIN, ERRORS, errors.WIDTH, errors.BOUNDS),
-            rrb.BarChartView(
-                origin="bars",
-                name=bars_title(d),
-                plot_legend=rrb.PlotLegend(visible=False),
-            ),
+            rrb.TimeSeriesView(origin="errors", name=ERRORS),
+            _bars("bars", bars_title(d)),
         ),
         row_shares=[11, 4],
     )
-    laws = [_flat("law", LAW)] if any(r.laws for r in d.story.revisions) else []
+    laws = [_bars("law", LAW)] if any(r.laws for r in d.story.revisions) else []
     right = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
             rrb.TextDocumentView(origin="words/details", name="Details"),
-            rrb.TextDocumentView(origin="words/limits", name=LIMITS),
             rrb.TextDocumentView(origin="words/guide", name="How to read this"),
         ),
         rrb.Tabs(
-            _flat("regressor", FOLLOWS),
+            _bars("follows", FOLLOWS),
             *laws,
-            _flat("parameters", "Parameters in σ (whiskers ±2 σ)"),
             rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
             rrb.TextDocumentView(origin="words/revisions", name="Table"),
             rrb.TextLogView(origin="log", name="Log"),
@@ -111,13 +104,5 @@ def _deflections(d: Digest) -> rrb.Spatial3DView:
     return _view3d(d, deflection_title(d), "residual")
 
 
-def _flat(
-    origin: str, name: str, w: float = flat.WIDTH, y: tuple[float, float] = flat.BOUNDS
-) -> rrb.Spatial2DView:
-    x = 0.03 * w + 7.0
-    return rrb.Spatial2DView(
-        origin=origin,
-        name=name,
-        background=BACKGROUND,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-x, w + x), y_range=y),
-    )
+def _bars(origin: str, name: str) -> rrb.BarChartView:
+    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))

@@ -8,6 +8,7 @@ from scipy import stats
 
 from hilcal.measuring.progress import LiveResidual, ReadingStored
 from hilcal.present.live_messages import Measuring
+from hilcal.present.story import LIMITS
 from hilcal.present.viewer import style
 from hilcal.robot.body import body_poses
 from hilcal.store.plan import UNLOADED, Step
@@ -150,7 +151,7 @@ class LiveDigest:
     @property
     def wrong(self) -> bool:
         """Whether more readings are outside than noise leaves there, see `ALARM`."""
-        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
         return self.outside > 0 and bool(chance < ALARM)
 
     @property

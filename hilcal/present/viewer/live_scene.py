@@ -9,8 +9,8 @@ import rerun as rr
 from hilcal.measuring.progress import ArmAt, GoalMet, Phase, ReadingStored, Remark
 from hilcal.present.live_messages import Measuring, Revised
 from hilcal.present.running import figures, met_words
-from hilcal.present.story import Story, check
-from hilcal.present.viewer import errors, layout, live_layout, live_words, scene, stream, style
+from hilcal.present.story import Story
+from hilcal.present.viewer import layout, live_layout, live_words, scene, stream, style
 from hilcal.present.viewer.arm_shapes import MovingArm
 from hilcal.present.viewer.digest import Digest, Limits, digest
 from hilcal.present.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
@@ -207,7 +207,6 @@ class LiveScene:
 
     def _revised(self, story: Story) -> None:
         """Draw a revision with those before it, of the same readings."""
-        check(story)
         rec, before = self._rec, self._story
         new = story.revisions[0]
         earlier = (
@@ -220,7 +219,6 @@ class LiveScene:
         if not earlier:
             stream.begin(rec, d)
         rec.set_time("revision", sequence=new.revision)
-        errors.error_picture(rec, d, static=False)
         stream.tell_revision(rec, d, new)
         rec.disable_timeline("revision")
         titles = _titles(d)

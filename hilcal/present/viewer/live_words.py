@@ -2,7 +2,6 @@
 
 from hilcal import numbers
 from hilcal.present.running import spoken, status_words
-from hilcal.present.viewer import style
 from hilcal.present.viewer.live_digest import Judged, LiveDigest
 from hilcal.present.viewer.style import escaped
 
@@ -61,7 +60,7 @@ def _heading(d: LiveDigest) -> str:
 def _sentence(d: LiveDigest) -> str:
     if d.judged == 0:
         return "The first readings tell where tracker and target are; then each one is compared."
-    share = style.percent(d.outside / d.judged)
+    share = numbers.percent(d.outside / d.judged)
     told = (
         f"**{d.outside} of {d.judged}** ({share}) compared readings are outside their 99 % noise "
         "ball (noise alone: 1 %)."
@@ -85,7 +84,7 @@ def _worst(d: LiveDigest) -> list[str]:
 def _loads(d: LiveDigest) -> list[str]:
     lines = ["| load | compared | outside | |", "|---|---|---|---|"]
     lines += [
-        f"| {escaped(name)} | {count} | {outside} | {style.bars(outside / count)} |"
+        f"| {escaped(name)} | {count} | {outside} | {numbers.percent(outside / count)} |"
         for name, (count, outside) in d.loads.items()
     ]
     return [*lines, ""]

@@ -3,6 +3,7 @@
 import numpy as np
 import rerun as rr
 
+from hilcal import numbers
 from hilcal.present.story import StoryRevision
 from hilcal.present.viewer import arm_shapes, style
 from hilcal.present.viewer.digest import Digest, capped, deviation, quaternions_of
@@ -128,7 +129,7 @@ def pose_words(d: Digest, r: StoryRevision, i: int) -> str:
     length = float(np.linalg.norm(r.residual[i]))
     number = d.story.target
     name = "" if number is None else f"{style.safe(d.story.target_names[number[i]])} "
-    return f"{name}{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+    return f"{name}{numbers.length(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
 
 
 def leader(d: Digest, i: int) -> Floats:

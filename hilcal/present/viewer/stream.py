@@ -17,9 +17,10 @@ import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.present.live_viewer import PORT
-from hilcal.present.story import Story, StoryRevision, check
-from hilcal.present.viewer import charts, errors, layout, scene, style, words
+from hilcal.present.story import Story, StoryRevision
+from hilcal.present.viewer import charts, layout, scene, style, words
 from hilcal.present.viewer.digest import Digest, Limits, digest
+from hilcal.present.viewer.markdown import markdown
 from hilcal.whole_file import replace_file
 
 APPLICATION = "hilcal"
@@ -47,7 +48,6 @@ def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.Recor
         The open stream; it closes, and ends its sinks, when it is dropped.
 
     Raises:
-        InputError: the story's arrays do not fit together.
         HilcalError: a sink does not take the data (disk full, ...).
     """
     d, rec = _open(story, limits)
@@ -62,7 +62,7 @@ def save(story: Story, path: Path, limits: Limits | None = None) -> None:
     """Write a story as a recording file, whole or not at all; an existing file is replaced.
 
     Raises:
-        InputError: the folder is missing, or the story's arrays do not fit together.
+        InputError: the folder is missing.
         HilcalError: the file cannot be written.
     """
     path = Path(path)
@@ -80,7 +80,7 @@ def serve(
     The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
 
     Raises:
-        InputError: the story's arrays do not fit together, or the port is taken.
+        InputError: the port is taken.
         HilcalError: the port cannot be served.
     """
     disable_analytics()
@@ -129,8 +129,9 @@ def recording_id(story: Story) -> str:
     for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
         sha.update(np.ascontiguousarray(array).tobytes())
     for r in story.revisions:
-        told = (r.revision, r.change, r.model, r.verdict, r.suspects, r.parameters, r.rivals)
-        sha.update(repr((*told, r.limits, [c.variable for c in r.curves])).encode())
+        sha.update(
+            repr((r.revision, r.change, r.verdict, r.cells, sorted(r.panels.items()))).encode()
+        )
         sha.update(np.ascontiguousarray(r.residual).tobytes())
     return str(uuid.UUID(bytes=sha.digest()[:16]))
 
@@ -217,7 +218,6 @@ def executable() -> str:
 
 
 def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:
-    check(story)
     return digest(story, limits or Limits()), opened(recording_id(story))
 
 
@@ -225,7 +225,6 @@ def tell(rec: rr.RecordingStream, d: Digest) -> None:
     """Log the whole story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
     begin(rec, d)
-    errors.error_picture(rec, d)
     for r in d.story.revisions:
         rec.set_time("revision", sequence=r.revision)
         tell_revision(rec, d, r)
@@ -238,6 +237,7 @@ def tell(rec: rr.RecordingStream, d: Digest) -> None:
 def begin(rec: rr.RecordingStream, d: Digest) -> None:
     """Log what is the same in every revision."""
     scene.static_scene(rec, d)
+    charts.error_series(rec)
     rec.log("words/guide", _markdown(words.GUIDE), static=True)
 
 
@@ -246,8 +246,7 @@ def tell_revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     scene.revision_scene(rec, d, r)
     charts.revision_charts(rec, d, r)
     rec.log("words/verdict", _markdown(words.verdict(d, r)))
-    rec.log("words/parameters", _markdown(words.parameters(r, d.limits.parameters)))
-    rec.log("words/limits", _markdown(words.limits(r)))
+    rec.log("words/parameters", _markdown(markdown(r.panels.get("parameters", ()))))
     rec.log("words/revisions", _markdown(words.revisions(d, r.revision)))
     rec.log("words/details", _markdown(words.details(d, r)))
     rec.log("log", rr.TextLog(words.log_line(d, r), level="INFO"))

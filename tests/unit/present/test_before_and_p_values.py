@@ -84,8 +84,10 @@ def test_a_p_value_reads_the_same_wherever_it_stands(absolute):
     value = numbers.chance(lead.score.p_value)
     assert numbers.p_equals(lead.score.p_value) in message(d)
     assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(d)))
-    revision = build_story([Chapter(1, None, absolute, d)]).revisions[0]
-    assert f"| {value} |" in words.suspects(revision)
+    story = build_story([Chapter(1, None, absolute, d)])
+    revision = story.revisions[0]
+    panel = words.verdict(digest(story, Limits()), revision)
+    assert f"| {value.replace('<', chr(92) + '<')} |" in panel
     assert numbers.p_equals(lead.score.p_value) in revision.message
 
 
@@ -109,7 +111,8 @@ def test_how_many_were_tested_stands_where_p_values_do(absolute):
     kinds = [v for v in d.misfit_breakdown if v.group not in ("pose", "direction")]
     assert f"{len(kinds)} variables were tested" in report
     story = build_story([Chapter(1, None, absolute, d)])
-    assert (story.revisions[0].tested, story.revisions[0].level) == (tests["count"], FALSE_ALARM)
+    details = words.details(digest(story, Limits()), story.revisions[0])
+    assert f"{tests['count']} effects were tested" in details
 
 
 def test_a_suspect_counts_only_below_the_shared_level(absolute):

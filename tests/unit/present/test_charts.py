@@ -27,6 +27,7 @@ from hilcal.present.charts.residuals import (
     residual_by_time,
 )
 from hilcal.present.charts.workspace import LONGEST, magnification, workspace
+from hilcal.present.story import LEVEL_NAMES
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -100,7 +101,7 @@ def test_levels_have_a_colour_and_a_mark():
     figure = residual_by_pose(told, told.revisions[0])
     limits = (0.0, *style.sigma_limits(), np.inf)
     for trace in figure.data:
-        k = style.LEVEL_NAMES.index(trace.name)
+        k = LEVEL_NAMES.index(trace.name)
         assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
         y = np.asarray(trace.y, float)
         assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()

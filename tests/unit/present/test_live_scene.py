@@ -193,9 +193,7 @@ def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):
 
 def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refined, tmp_path):
     growing = recorded(tmp_path / "growing.rrd", revisions(), end=False)
-    marks = [len(row) for row in rows(growing, "/errors/fit", "Points2D:positions")]
-    assert marks == [1, 2, 3, 4]
-    assert len(rows(refined, "/errors/fit", "Points2D:positions")[-1]) == 4
+    assert len(rows(growing, "/errors/fit", "Scalars:scalars")) == 4
     said = [row[0] for row in rows(growing, "/words/verdict", "TextDocument:text")]
     assert all(" of " not in text.splitlines()[0] for text in said)  # nobody knows the last yet
     said = [row[0] for row in rows(refined, "/words/verdict", "TextDocument:text")]
@@ -211,8 +209,9 @@ def test_other_readings_begin_another_story(tmp_path):
     other = story(poses=12)
     told = [*revisions(), (9.0, Revised(replace(other, revisions=(other.revisions[-1],))))]
     path = recorded(tmp_path / "two.rrd", told, end=False)
-    marks = [len(row) for row in rows(path, "/errors/fit", "Points2D:positions")]
-    assert marks == [1, 2, 3, 4, 1]
+    assert len(rows(path, "/errors/fit", "Scalars:scalars")) == 5
+    tables = [row[0] for row in rows(path, "/words/revisions", "TextDocument:text")]
+    assert tables[-1].count("\n|") < tables[-2].count("\n|")
 
 
 def contrast(a, b) -> float:
@@ -229,9 +228,8 @@ def test_words_in_pictures_are_legible_in_both_themes(refined):
     boxes = (36, 38, 43), (123, 124, 126)  # of the viewer, measured in pictures of both themes
     assert min(contrast(style.LABEL, box) for box in boxes) > 4.0
     white = 0xFFFFFFFF
-    for entity in ("errors/words", "errors/ticks", "regressor/labels", "parameters/labels"):
-        for row in rows(refined, f"/{entity}", "Points2D:colors"):
-            assert set(row) == {white}
+    for row in rows(refined, "/world/residual/worst", "Points3D:colors"):
+        assert set(row) == {white}
 
 
 @pytest.mark.vulkan

@@ -80,7 +80,7 @@ def large(m: ReportContent) -> ReportContent:
     told = m.story
     last = told.revisions[-1]
     many = tuple(
-        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "", model=("a",))
+        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "")
         for k in range(12)
     )
     named = tuple(f"calibration pose number {k:03d}" for k in range(len(told)))
