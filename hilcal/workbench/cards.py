@@ -15,10 +15,14 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.distinguish import Difference
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
-from hilcal.present.charts import error_per_revision, measured_predicted, misfit, residuals
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.law import law
-from hilcal.present.charts.residual_over import residual_over
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import added_variable, law, misfit_shares
+from hilcal.present.charts.readings import (
+    measured_predicted,
+    residual_by_load,
+    residual_by_pose,
+    residual_over,
+)
 from hilcal.present.fit import CERTAIN, follows, misses, model_name
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
@@ -138,7 +142,7 @@ def fails(view: View, d: Snapshot) -> None:
         ui.label("Nowhere beyond the noise: what is left is what it explains.").classes("soft")
         return
     ui.label(follows(d.diagnosis.misfit_breakdown)).classes("soft")
-    shown = chart(view, misfit.misfit_shares(d.diagnosis))
+    shown = chart(view, misfit_shares(d.diagnosis))
     shown.props("data-part=fails")
     shown.on("plotly_click", lambda e: _picked_bar(view, d, e))
     ui.label("Click a bar: the readings over that variable.").classes("soft")
@@ -258,7 +262,7 @@ def readings(view: View, d: Snapshot) -> None:
     found = None if plain_kind else view.session.recorded(d).get(variable or "")
     title("The readings" if variable is None else f"The readings over {variable}")
     if found is None or variable == "load":
-        kind = residuals.residual_by_load if variable == "load" else residuals.residual_by_pose
+        kind = residual_by_load if variable == "load" else residual_by_pose
         figure = kind(d.story, d.revision)
     else:
         name, factor = numbers.angle_or(found.unit)
@@ -328,7 +332,7 @@ def furthest(d: Snapshot) -> list[int]:
 def fell(view: View, d: Snapshot) -> None:
     """Draw how the error fell."""
     title("How the error fell")
-    chart(view, error_per_revision.error_per_revision(d.story)).props("data-part=fell")
+    chart(view, error_per_revision(d.story)).props("data-part=fell")
 
 
 def revisions(view: View, d: Snapshot) -> None:
@@ -411,7 +415,7 @@ def compared(view: View, d: Snapshot) -> None:
     """Draw what was measured against what is predicted."""
     title("Model and measurement")
     ui.label(misses(d.fit)).classes("soft")
-    chart(view, measured_predicted.measured_predicted(d.story, d.revision))
+    chart(view, measured_predicted(d.story, d.revision))
 
 
 def laws(view: View, d: Snapshot) -> None:

@@ -17,11 +17,10 @@ from hilcal.present.document import (
     Section,
     captioned,
 )
-from hilcal.present.html.appendix import appendix
 from hilcal.present.html.certificate import certificate
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import FirstScreen, first_screen
-from hilcal.present.html.sections import sections
+from hilcal.present.html.sections import appendix, sections
 
 HERE = Path(__file__).parent
 

@@ -1,4 +1,4 @@
-"""The sections after the certificate: each of charts, tables and the words of commands."""
+"""The sections after the certificate, and the appendix, which only another expert asks for."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -7,33 +7,47 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.fit import Fit
 from hilcal.present.build_story import curve, regressor
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.error_per_revision import error_per_revision
-from hilcal.present.charts.law import law
-from hilcal.present.charts.measured_predicted import measured_predicted
-from hilcal.present.charts.misfit import misfit_curve
-from hilcal.present.charts.noise_check import noise_check
-from hilcal.present.charts.residuals import residual_by_load, residual_by_pose, residual_by_time
-from hilcal.present.charts.workspace import workspace
-from hilcal.present.diagnosis import doubtful, redundant_line
+from hilcal.present.campaign import info_report
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import (
+    added_variable,
+    correlations,
+    law,
+    misfit_curve,
+    noise_check,
+)
+from hilcal.present.charts.readings import (
+    measured_predicted,
+    residual_by_joint,
+    residual_by_load,
+    residual_by_pose,
+    residual_by_time,
+    workspace,
+)
+from hilcal.present.diagnosis import could_have_been_seen, doubtful, redundant_line
 from hilcal.present.document import (
     Block,
     Chart,
     Section,
     Table,
+    Words,
     captioned,
+    heading,
     note,
     table,
 )
-from hilcal.present.fit import background_line, parameters, where_table
+from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import missing
+from hilcal.present.registration import covariance_words
 from hilcal.present.story import REVISION_HEADS
+from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
+from hilcal.store.command_line import COMMAND
 
 MOST_CURVES = 2
 MOST_LISTED = 6
@@ -192,4 +206,85 @@ def _too_few_repeats(fit: Fit) -> str:
     return (
         f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
         f"{what} by them: the model alone does."
+    )
+
+
+NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
+
+
+def appendix(m: ReportContent) -> tuple[Section, ...]:
+    """Return the sections of the appendix."""
+    found = {
+        "joints": ("Over each joint", _joints(m)),
+        "rejected": ("Rejected suspects", _rejected(m)),
+        "all": ("Parameters and what they mean", _all_parameters(m)),
+        "scalings": ("Scaling none, gu and gc", _scalings(m)),
+        "planned": ("As planned and as reached", _planned(m)),
+        "provenance": ("Provenance", _provenance(m)),
+    }
+    told = ((name, title, tuple(parts)) for name, (title, parts) in found.items())
+    return tuple(Section(name, f"Appendix: {title}", parts) for name, title, parts in told if parts)
+
+
+def _joints(m: ReportContent) -> Iterator[Block]:
+    for j in range(m.story.arm.n):
+        yield Chart(f"Over joint {j + 1}", residual_by_joint(m.story, m.left_out, j))
+    if m.tested is not None:
+        yield replace(worst_table(m.tested.shares), caption="Worst poses")
+
+
+def _rejected(m: ReportContent) -> Iterator[Block]:
+    d = m.diagnosis
+    if d is None:
+        return
+    if len(d.suspects) > MOST_LISTED:
+        yield suspects_table(d.suspects[MOST_LISTED:], "Other suspects")
+    rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
+    yield from added_variables(d, rejected)
+    yield from captioned(could_have_been_seen(d), "What could have been seen")
+
+
+def _all_parameters(m: ReportContent) -> Iterator[Block]:
+    yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
+    yield from captioned(remarks(m.fit))
+    yield Chart("Correlations", correlations(m.fit), wide=True, height=0)
+
+
+def _scalings(m: ReportContent) -> Iterator[Block]:
+    if len(m.scalings) > 1:
+        yield from captioned(scalings_table(m.scalings), "The same model with each scaling")
+
+
+def _planned(m: ReportContent) -> Iterator[Block]:
+    predicted = None if m.plan is None else m.plan.about.get("predicted_std")
+    if not isinstance(predicted, dict):
+        return
+    reached = {p.name: p for p in m.fit.parameters if p.std is not None}
+    rows = [
+        (n, numbers.sizes([(reached[n].unit, s)]),
+         numbers.sizes([(reached[n].unit, float(reached[n].std or 0.0))]))
+        for n, s in predicted.items() if isinstance(s, int | float) and n in reached
+    ]  # fmt: skip
+    if rows:
+        heads = ("parameter", "planned", "reached")
+        yield table(*heads, rows=rows, caption="Standard uncertainties")
+
+
+def _provenance(m: ReportContent) -> Iterator[Block]:
+    o = m.overview
+    yield table(
+        *("revision", "made (UTC)", "hilcal", "SHA-256 of its readings"),
+        rows=(
+            (str(r.number), r.created[:19].replace("T", " "), r.program_version, r.data_hash)
+            for r in o.revisions
+        ),
+        caption="Revisions by time and program",
+    )
+    made = [("the campaign", o.command or NOT_KEPT)]
+    made += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
+    yield table("made", "by", rows=made, caption="Commands as they were typed")
+    yield heading("Commands that show the same")
+    yield from (Words(c, "code") for c in m.commands)
+    yield from captioned(
+        info_report(o, m.name, covariance_words(m.covariance)), "The campaign file"
     )

@@ -13,7 +13,7 @@ from hilcal import numbers
 from hilcal.present.document import heading
 from hilcal.present.fleet import type_report
 from hilcal.present.viewer import fleet_scene, layout
-from hilcal.present.viewer.fleet_digest import TypeDigest, type_digest
+from hilcal.present.viewer.fleet_scene import TypeDigest, type_digest
 from hilcal.present.viewer.markdown import markdown
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
 

@@ -1,13 +1,81 @@
-"""The blueprint: which view stands where, and what its title says."""
+"""The blueprint: which view stands where, what its title says, and where its eye stands."""
 
 from typing import Literal
 
 import numpy as np
 import rerun.blueprint as rrb
 
-from hilcal.present.viewer import eye
+from hilcal.config import Obstacle
 from hilcal.present.viewer.digest import Digest
 from hilcal.present.viewer.scene import center, seen
+from hilcal.types import Bools, Floats
+
+_TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
+_HEIGHTS = (0.75, 1.2)
+_SAMPLES = np.linspace(0.0, 0.98, 80)  # of a line of sight
+_FOV = np.deg2rad(55.0)  # of the viewer's eye, upright
+_ASPECT = 1.15  # of a small window, without the room for labels at both sides
+_EDGE = 0.92  # of the view is used at most
+_FACTORS = np.arange(0.7, 2.51, 0.05)
+_WORTH = 0.02  # share of points that must come into sight for the eye to go one place further
+
+
+def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
+    """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
+    at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
+    out = np.zeros(len(points), dtype=np.bool_)
+    for x in things:
+        if x.center_m is not None and x.size_m is not None:
+            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
+            out |= off.all(axis=2).any(axis=1)
+        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
+            off = at - np.array(x.bottom_m)
+            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
+            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
+    return np.asarray(out)
+
+
+def direction(
+    turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
+) -> Floats:
+    """Return the direction (3,) to the eye, in half sizes of the picture.
+
+    Args:
+        turn: about z, that is preferred, rad.
+        middle: (3,) of the picture, m.
+        size: half size of the picture, m.
+        points: (K, 3) what is to be seen, m.
+        things: what may hide it.
+    """
+    places = [
+        np.array([1.7 * np.cos(turn + a), 1.7 * np.sin(turn + a), z])
+        for z in _HEIGHTS
+        for a in _TURNS
+    ]
+    cost = [
+        hidden(middle + size * place, points, things).mean() + _WORTH * k
+        for k, place in enumerate(places)
+    ]
+    return places[int(np.argmin(cost))]
+
+
+def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
+    """Return (K,) which of the points (K, 3) an eye sees that looks at a place, z upwards."""
+    ahead = (look - eye) / np.linalg.norm(look - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    way = points - eye
+    depth = way @ ahead
+    half = _EDGE * np.tan(_FOV / 2) * depth
+    upright = np.abs(way @ np.cross(right, ahead))
+    return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
+
+
+def near(look: Floats, way: Floats, points: Floats) -> Floats:
+    """Return the place (3,) of the eye, as near along `way` from `look` as shows all points."""
+    places = [look + f * way for f in _FACTORS]
+    return next((x for x in places if in_view(x, look, points).all()), places[-1])
+
 
 FOLLOWS = "What the residual follows"
 LAW = "Law beyond the catalogue"
@@ -89,7 +157,7 @@ def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
         line_grid=GRID,
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=eye.near(middle, EYE * size, seen(d)),
+            position=near(middle, EYE * size, seen(d)),
             look_target=middle,
             eye_up=(0.0, 0.0, 1.0),
         ),

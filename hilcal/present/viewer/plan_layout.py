@@ -1,12 +1,74 @@
-"""The blueprint of a plan's recording: which view stands where, and what its title says."""
+"""The charts and the blueprint of a plan's recording."""
 
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
-from hilcal.present.viewer import eye, plan_charts, plan_scene
+from hilcal.design.summary import PlanSummary
+from hilcal.present.plan import load_name
+from hilcal.present.viewer import layout, plan_scene, style
 from hilcal.present.viewer.plan_digest import PlanDigest
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
+
+_DOT = 3.5
+
+
+def schedule(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
+    colors = plan_scene.load_colors(d.loads)
+    for k, name in enumerate(d.loads):
+        _dots(rec, d, f"load{k}", load_name(name), np.flatnonzero(d.load == k), tuple(colors[k]))
+    if d.unseen.any():
+        lost = np.flatnonzero(d.unseen)
+        _dots(rec, d, "unseen", "not seen by the tracker", lost, style.RED, "cross")
+
+
+def _dots(
+    rec: rr.RecordingStream,
+    d: PlanDigest,
+    entity: str,
+    name: str,
+    steps: Ints,
+    color: style.Color,
+    marker: str = "circle",
+) -> None:
+    points = rr.SeriesPoints(
+        names=[f"{style.safe(name)}: {len(steps)}"],
+        colors=[color],
+        markers=[marker],  # type: ignore[list-item]
+        marker_sizes=[_DOT if marker == "circle" else 2.0 * _DOT],
+    )
+    rec.log(f"schedule/{entity}", points, static=True)
+    rec.send_columns(
+        f"schedule/{entity}",
+        indexes=[rr.TimeColumn("step", sequence=d.numbers[steps])],
+        columns=rr.Scalars.columns(scalars=d.time[steps] / 60.0),
+    )
+
+
+def curve_unit(s: PlanSummary) -> tuple[str, float]:
+    """Return the unit of the sample-size curve and its factor."""
+    return numbers.unit_for("m", [p.position_std_m for p in s.curve])
+
+
+def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
+    """Log the sample-size curve as bars; the one nearest to the plan is a series of its own."""
+    poses = np.array([p.poses for p in s.curve], dtype=float)
+    height = curve_unit(s)[1] * np.array([p.position_std_m for p in s.curve])
+    width = 0.6 * float(np.diff(poses).min(initial=poses.max(initial=1.0)))
+    own = np.zeros(len(poses), dtype=np.bool_)
+    own[np.argmin(np.abs(poses - s.poses))] = True
+    for name, bars, color in (("other", ~own, style.GREY), ("plan", own, style.MEASURED)):
+        if bars.any():
+            chart = rr.BarChart(
+                height[bars],
+                abscissa=poses[bars],
+                widths=np.full(int(bars.sum()), width),
+                color=color,
+            )
+            rec.log(f"curve/{name}", chart, static=True)
+
 
 _FPS = 2.0
 _LOOKED_AT = 20
@@ -48,7 +110,7 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
 
 def curve_title(d: PlanDigest) -> str:
     """Return the title of the sample-size curve, with its unit."""
-    unit = plan_charts.curve_unit(d.summary)[0]
+    unit = curve_unit(d.summary)[0]
     return f"Position ± [{unit}] by number of poses; blue: nearest to this plan"
 
 
@@ -88,7 +150,7 @@ def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
         turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
-    return eye.direction(turn, middle, size, points, d.config.obstacles)
+    return layout.direction(turn, middle, size, points, d.config.obstacles)
 
 
 def _view3d(name: str, contents: list[str], place: Floats, look: Floats) -> rrb.Spatial3DView:

@@ -22,7 +22,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.charts import style
-from hilcal.present.charts.law import law
+from hilcal.present.charts.evidence import law
 from hilcal.present.viewer import save
 from tests.support.campaigns import NOTHING, campaign
 

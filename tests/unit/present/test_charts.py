@@ -13,20 +13,26 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.build_story import Chapter, build_story, of_left_out, regressor
 from hilcal.present.charts import style
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.correlations import correlations, parameter_correlations
-from hilcal.present.charts.error_per_revision import error_per_revision
-from hilcal.present.charts.measured_predicted import measured_predicted
-from hilcal.present.charts.misfit import misfit_curve, misfit_shares
-from hilcal.present.charts.noise_check import noise_check
-from hilcal.present.charts.readings_drawn import drawn
-from hilcal.present.charts.residuals import (
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import (
+    added_variable,
+    correlations,
+    misfit_curve,
+    misfit_shares,
+    noise_check,
+    parameter_correlations,
+)
+from hilcal.present.charts.readings import (
+    LONGEST,
+    drawn,
+    magnification,
+    measured_predicted,
     residual_by_joint,
     residual_by_load,
     residual_by_pose,
     residual_by_time,
+    workspace,
 )
-from hilcal.present.charts.workspace import LONGEST, magnification, workspace
 from hilcal.present.story import LEVEL_NAMES
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story

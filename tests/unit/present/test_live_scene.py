@@ -10,8 +10,8 @@ import rerun as rr
 from rerun.chunk import RrdReader
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
-from hilcal.present.live_messages import Measuring, Revised
-from hilcal.present.viewer import live, live_words, style
+from hilcal.present.live_viewer import Measuring, Revised
+from hilcal.present.viewer import live, live_digest, style
 from hilcal.present.viewer.live_digest import BALL, FLUENT, GROUPS, LIMIT, LiveDigest, judged
 from hilcal.present.viewer.live_scene import MANY, LiveScene
 from tests.support.live_story import BLIND, events, measuring, plan, residual
@@ -134,7 +134,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
             d.add(e)
     assert d.judged == 2 * (len(told.plan.steps) - BLIND)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in live_words.status(d)
+    assert " right |" in live_digest.status(d)
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
@@ -165,7 +165,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return live_words.status(d)
+        return live_digest.status(d)
 
     bad, good = status(6.0), status(0.0)
     assert "✗ The simple model fails" in bad
@@ -178,7 +178,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
 
 
 def test_without_a_model_there_is_no_judgement():
-    assert "no judgement yet" in live_words.status(LiveDigest.of(measuring()))
+    assert "no judgement yet" in live_digest.status(LiveDigest.of(measuring()))
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):

@@ -1,26 +1,27 @@
-"""The page that compares two campaigns of one arm."""
+"""The pages that compare two campaigns of one arm, or the arms of a fleet."""
+
+from typing import TYPE_CHECKING
 
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
-from hilcal.present.charts.change import changes_chart, error_by_pose
+from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_by_pose
 from hilcal.present.comparison import comparison_report, next_step, sentence
-from hilcal.present.document import (
-    Block,
-    Chart,
-    Section,
-    Words,
-    heading,
-    table,
-)
+from hilcal.present.document import Block, Chart, Section, Words, captioned, heading, table
+from hilcal.present.fleet import closing, type_report, unlike_words
 from hilcal.present.html.first_screen import Card, FirstScreen
 from hilcal.present.html.page import render
+
+if TYPE_CHECKING:
+    from hilcal.transfer.fleet import Fleet
 
 Named = tuple[str, str]
 
 
-def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str) -> str:
+def comparison_page(
+    c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str
+) -> str:
     """Return the comparison as HTML.
 
     Args:
@@ -58,10 +59,10 @@ def page(c: Comparison, files: tuple[Named, Named], operator: str, made: str, ve
         Section("provenance", "Provenance", provenance),
     )
     return render("Comparison of two campaigns", f"{arm}, {earlier} and {later}, {made[:10]}",
-                  first_screen(c, earlier), sections)  # fmt: skip
+                  comparison_screen(c, earlier), sections)  # fmt: skip
 
 
-def first_screen(c: Comparison, earlier: str) -> FirstScreen:
+def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     """Return what the first screen says."""
     found, t = c.changes, c.today
     error = t.prediction.error
@@ -97,3 +98,52 @@ def first_screen(c: Comparison, earlier: str) -> FirstScreen:
         ("What to do?", numbers.sentence(next_step(c, earlier))),
     )
     return FirstScreen(headline, tone, answers, tuple(cards), "", None)
+
+
+def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
+    """Return a fleet as HTML.
+
+    Args:
+        fleet: the fleet.
+        directory: that its campaigns are in.
+        made: when the fleet_page was made, ISO 8601, UTC.
+        version: of the program.
+    """
+    sections = []
+    for k, t in enumerate(fleet.types):
+        drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
+        told = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
+        sections.append(Section(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
+    rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
+    heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
+    sections.append(
+        Section(
+            "campaigns",
+            "Campaigns",
+            (table(*heads, rows=rows, caption="Campaigns"), *closing(fleet)),
+        )
+    )
+    about = f"{directory}, {made[:10]}, hilcal {version}"
+    return render("A fleet of arms", about, _fleet_screen(fleet), tuple(sections))
+
+
+def _fleet_screen(fleet: "Fleet") -> FirstScreen:
+    odd = [o for t in fleet.types for o in t.odd]
+    arms = list(dict.fromkeys(o.arm for o in odd))
+    wear = [name for t in fleet.types for name in t.wear]
+    headline = f"Unlike their type: {numbers.names(arms)}" if arms else "No arm is unlike its type"
+    cards = (
+        Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
+        Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
+    )
+    answers = (
+        ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
+        ("What wears?", ", ".join(wear) or "No drift that the arms have in common."),
+        (
+            "What to do?",
+            "Measure these arms again, and look at these joints."
+            if arms
+            else "Nothing; the prior serves the next arm.",
+        ),
+    )
+    return FirstScreen(headline, "bad" if arms else "good", answers, cards, "", None)
