@@ -103,24 +103,34 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
         )
 
 
-def _changes(c: Comparison) -> Iterator[Block]:
+def headline(c: Comparison) -> str:
+    """Say in a few words whether something has changed."""
     found = c.changes
     if not found.found and found.explained:
-        yield heading("Nothing has changed beyond the uncertainty.")
+        return "Nothing has changed beyond the uncertainty"
+    if c.another_arm:
+        return "This looks like another arm of the same type"
+    if found.found:
+        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in found.found)))
+        return f"Something has changed: {parts}"
+    return "Something has changed, and no single candidate explains it"
+
+
+def _changes(c: Comparison) -> Iterator[Block]:
+    found = c.changes
+    yield heading("What has changed" if found.found and not c.another_arm else f"{headline(c)}.")
+    if not found.found and found.explained:
         yield from _limits(c)
         return
     if c.another_arm:
-        yield heading("This looks like another arm of the same type.")
         yield (
             "The calibration predicts these readings no better than the arm as drawn, and no few "
             "changes explain them."
         )
         return
     if not found.found:
-        yield heading("Something has changed, and no single candidate explains it.")
         yield _left(c)
         return
-    yield heading("What has changed")
     for change in found.found:
         yield sentence(change)
         if change.same_as:

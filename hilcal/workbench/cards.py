@@ -16,7 +16,7 @@ from hilcal.diagnosis.distinguish import Difference
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
 from hilcal.present.charts.comparisons import error_per_revision
-from hilcal.present.charts.evidence import added_variable, law, misfit_shares
+from hilcal.present.charts.evidence import added_variable, curve_chart, misfit_shares
 from hilcal.present.charts.readings import (
     measured_predicted,
     residual_by_load,
@@ -424,7 +424,7 @@ def laws(view: View, d: Snapshot) -> None:
     for one in d.revision.laws:
         told = "; ".join(f"{what}: {said}" for what, said in one.facts)
         ui.label(f"{one.title}: {told}").classes("soft")
-        chart(view, law(one)).props("data-part=law")
+        chart(view, curve_chart(one)).props("data-part=law")
 
 
 def viewer(view: View) -> None:

@@ -96,15 +96,7 @@ def error_by_pose(c: Comparison) -> go.Figure:
         for n, load, e, s in zip(names, loads, error, stated, strict=True)
     ]
     traces = [
-        go.Scatter(
-            x=poses,
-            y=style.drawn(values),
-            mode="markers",
-            name=name,
-            marker={"color": color, "symbol": symbol, "size": 7},
-            hovertext=hover,
-            hoverinfo="text",
-        )
+        style.marks(poses, values, color, symbol, 7, name=name, hovertext=hover, hoverinfo="text")
         for values, name, color, symbol in (
             (error, "error today", style.MEASURED, "circle"),
             (stated, "standard deviation that the calibration states", style.NOISE, "line-ew-open"),

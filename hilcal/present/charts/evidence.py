@@ -29,30 +29,15 @@ def added_variable(r: Curve, effect: str) -> go.Figure:
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
     traces = [
-        go.Scatter(
-            x=style.drawn(r.x[at]),
-            y=style.drawn(r.y[at]),
-            mode="markers",
-            marker={"color": style.MEASURED, "size": 5},
+        style.marks(
+            r.x[at],
+            r.y[at],
             name="readings",
+            size=5,
             hovertemplate="would explain %{x:.1f}, residual %{y:.1f}<extra></extra>",
         ),
-        go.Scatter(
-            x=ends,
-            y=ends,
-            mode="lines",
-            line={"color": style.NOISE, "dash": "dash"},
-            name="if it is right: slope 1",
-            hoverinfo="skip",
-        ),
-        go.Scatter(
-            x=ends,
-            y=slope * ends,
-            mode="lines",
-            line={"color": style.RED},
-            name=f"found: slope {slope:.2f}",
-            hoverinfo="skip",
-        ),
+        style.line(ends, ends, "if it is right: slope 1", dash="dash"),
+        style.line(ends, slope * ends, f"found: slope {slope:.2f}", style.RED),
     ]
     note = "" if len(at) == len(r.x) else f" Of {len(r.x)} points {len(at)} are drawn."
     says = (
@@ -81,20 +66,24 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     return bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
-def misfit_curve(c: Curve) -> go.Figure:
-    """Draw how the error depends on a variable, with standard uncertainties."""
-    trace = go.Scatter(
+def curve_chart(c: Curve) -> go.Figure:
+    """Draw means over a variable with standard uncertainties, and the law, where there is one."""
+    joined = not c.names and c.line is None
+    points = go.Scatter(
         x=[escaped(n) for n in c.names] if c.names else c.x,
         y=c.y,
         error_y={"type": "data", "array": c.error, "color": style.GREY},
-        mode="markers" if c.names else "lines+markers",
+        mode="lines+markers" if joined else "markers",
         marker={"color": style.MEASURED, "size": 8},
         line={"color": style.MEASURED},
+        name="readings, mean ± standard uncertainty",
         hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
-        showlegend=False,
+        showlegend=c.line is not None,
     )
-    says = f"{c.y_label} over {c.title}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
-    return style.figure(says, x=c.x_label, y=c.y_label, traces=[trace], height=300)
+    says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
+    traces = [points] if c.line is None else [style.line(*c.line, "law"), points]
+    x, y = escaped(c.x_label), escaped(c.y_label)
+    return style.figure(says, x=x, y=y, traces=traces, height=320)
 
 
 def bars(
@@ -128,35 +117,6 @@ def _short(value: float) -> str:
     if abs(value) < 0.005:
         return "0"
     return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
-
-
-def law(of: Curve) -> go.Figure:
-    """Draw a law as a line, and what the readings say by themselves with standard uncertainties."""
-    line = np.zeros((2, 0)) if of.line is None else of.line
-    traces = [
-        go.Scatter(
-            **dict(zip("xy", style.drawn(line), strict=True)),
-            mode="lines",
-            line={"color": style.NOISE, "width": 2},
-            name="law",
-            hoverinfo="skip",
-        ),
-        go.Scatter(
-            x=of.x,
-            y=of.y,
-            error_y={"type": "data", "array": of.error, "color": style.GREY},
-            mode="markers",
-            marker={"color": style.MEASURED, "size": 8},
-            name="readings, mean ± standard uncertainty",
-            hovertemplate="%{x:.3g}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
-        ),
-    ]
-    says = (
-        f"{of.y_label} over {of.x_label}. {of.says} The law is the line, interpolated where there "
-        "are no readings (points)."
-    )
-    x, y = escaped(of.x_label), escaped(of.y_label)
-    return style.figure(says, x=x, y=y, traces=traces, height=340)
 
 
 MOST_CORRELATED = 30
@@ -234,13 +194,10 @@ def noise_check(fit: Fit) -> go.Figure:
             marker={"color": style.MEASURED},
             hovertemplate="%{x:.2f} σ: %{y} elements<extra></extra>",
         ),
-        go.Scatter(
-            x=fine,
-            y=len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9)),
-            mode="lines",
-            name="the stated noise",
-            line={"color": style.NOISE, "width": 2},
-            hoverinfo="skip",
+        style.line(
+            fine,
+            len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9)),
+            "the stated noise",
         ),
     ]
     low, high = fit.variance_factor_interval

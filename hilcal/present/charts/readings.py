@@ -183,12 +183,11 @@ def over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
 def chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
     """Draw residuals over x (K,); each point carries the number of its reading."""
     traces = [
-        go.Scatter(
-            x=style.drawn(x[mine]),
-            y=style.drawn(d.sigma[mine]),
-            mode="markers",
+        style.marks(
+            x[mine],
+            d.sigma[mine],
+            *(style.LEVELS[k], style.SYMBOLS[k]),
             name=LEVEL_NAMES[k],
-            marker={"color": style.LEVELS[k], "symbol": style.SYMBOLS[k], "size": 6},
             text=d.named(mine),
             customdata=d.index[mine],
             hovertemplate="%{text}<extra></extra>",
@@ -235,26 +234,15 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     y = 1e6 * (story.measured - offset)
     x = 1e6 * (revision.predicted - offset)
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
-    traces: list[object] = [
-        go.Scatter(
-            x=ends,
-            y=ends,
-            mode="lines",
-            name="exact",
-            line={"color": style.NOISE, "dash": "dash"},
-            hoverinfo="skip",
-        )
-    ]
+    traces: list[object] = [style.line(ends, ends, "exact", dash="dash")]
     at = d.index
     for k, axis in enumerate(AXES):
         traces.append(
-            go.Scatter(
-                x=style.drawn(x[at, k]),
-                y=style.drawn(y[at, k]),
-                mode="markers",
+            style.marks(
+                x[at, k],
+                y[at, k],
+                *((style.MEASURED, style.HOLDOUT, style.AMBER)[k], style.SYMBOLS[k]),
                 name=f"base {axis}",
-                marker={"color": (style.MEASURED, style.HOLDOUT, style.AMBER)[k], "size": 6,
-                        "symbol": style.SYMBOLS[k]},
                 text=list(d.names),
                 hovertemplate=f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} "
                 "µm<extra></extra>",
@@ -299,22 +287,13 @@ def workspace(
         start, end = at[worst], at[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
+        traces.append(style.line(*lines.T, color=style.LEVELS[k]))
         traces.append(
-            go.Scatter(
-                **dict(zip("xy", style.drawn(lines).T.copy(), strict=True)),
-                mode="lines",
-                line={"color": style.LEVELS[k], "width": 2},
-                showlegend=False,
-                hoverinfo="skip",
-            )
-        )
-        traces.append(
-            go.Scatter(
-                **dict(zip("xy", style.drawn(at[mine]).T.copy(), strict=True)),
-                mode="markers",
+            style.marks(
+                *at[mine].T,
+                *(style.LEVELS[k], style.SYMBOLS[k], 5),
                 name=LEVEL_NAMES[k],
                 showlegend=False,
-                marker={"color": style.LEVELS[k], "size": 5, "symbol": style.SYMBOLS[k]},
                 text=d.named(mine),
                 hovertemplate="%{text}<extra></extra>",
             )

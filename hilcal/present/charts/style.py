@@ -6,6 +6,7 @@ tells anything by colour alone.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
@@ -80,6 +81,30 @@ def figure(
     out.update_layout(xaxis={"title": {"text": x}}, yaxis={"title": {"text": y}})
     out.update_layout(**layout)
     return out
+
+
+def line(
+    x: Floats, y: Floats, name: str = "", color: str = NOISE, dash: str = "solid"
+) -> go.Scatter:
+    """Return a line that tells nothing when it is pointed at."""
+    return go.Scatter(
+        x=drawn(x),
+        y=drawn(y),
+        mode="lines",
+        line={"color": color, "width": 2, "dash": dash},
+        name=name,
+        showlegend=bool(name),
+        hoverinfo="skip",
+    )
+
+
+def marks(
+    x: object, y: Floats, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
+) -> go.Scatter:
+    """Return points; `more` is their name and what they tell."""
+    x = drawn(x) if isinstance(x, np.ndarray) else x
+    marker = {"color": color, "symbol": symbol, "size": size}
+    return go.Scatter(x=x, y=drawn(y), mode="markers", marker=marker, **more)
 
 
 def says(chart: go.Figure) -> str:

@@ -7,7 +7,7 @@ from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
 from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_by_pose
-from hilcal.present.comparison import comparison_report, next_step, sentence
+from hilcal.present.comparison import comparison_report, headline, next_step, sentence
 from hilcal.present.document import Block, Chart, Section, Words, captioned, heading, table
 from hilcal.present.fleet import closing, type_report, unlike_words
 from hilcal.present.html.first_screen import Card, FirstScreen
@@ -64,24 +64,15 @@ def comparison_page(
 
 def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     """Return what the first screen says."""
-    found, t = c.changes, c.today
+    found, t, told = c.changes, c.today, headline(c)
     error = t.prediction.error
     worse = t.p_value < LEVEL
-    if not found.found and found.explained:
-        headline, tone = "Nothing has changed beyond the uncertainty", "good"
-    elif c.another_arm:
-        headline, tone = "This looks like another arm of the same type", "bad"
-    elif not found.found:
-        headline, tone = "Something has changed, and no single candidate explains it", "bad"
-    else:
-        parts = numbers.names(list(dict.fromkeys(x.candidate.part for x in found.found)))
-        headline, tone = f"Something has changed: {parts}", "bad"
     good = (
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
         f"{numbers.digits(t.z, 2)} times what it states: "
         + ("more than its uncertainty." if worse else "no more than its uncertainty.")
     )
-    what = " ".join(sentence(x) for x in found.found) or headline + "."
+    what = " ".join(sentence(x) for x in found.found) or f"{told}."
     cards = [
         Card(
             "Error today",
@@ -97,7 +88,8 @@ def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
         ("What has changed?", what),
         ("What to do?", numbers.sentence(next_step(c, earlier))),
     )
-    return FirstScreen(headline, tone, answers, tuple(cards), "", None)
+    tone = "good" if not found.found and found.explained else "bad"
+    return FirstScreen(told, tone, answers, tuple(cards), "", None)
 
 
 def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
@@ -106,7 +98,7 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     Args:
         fleet: the fleet.
         directory: that its campaigns are in.
-        made: when the fleet_page was made, ISO 8601, UTC.
+        made: when the page was made, ISO 8601, UTC.
         version: of the program.
     """
     sections = []

@@ -16,8 +16,7 @@ from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import (
     added_variable,
     correlations,
-    law,
-    misfit_curve,
+    curve_chart,
     noise_check,
 )
 from hilcal.present.charts.readings import (
@@ -82,7 +81,7 @@ def _where(m: ReportContent) -> Section:
     if d is not None:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
-            parts += [Chart(c.title, misfit_curve(c)) for c in curves]
+            parts += [Chart(c.title, curve_chart(c)) for c in curves]
         told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
     parts.append(_noise(m))
@@ -117,7 +116,7 @@ def _laws(m: ReportContent) -> Section | None:
     parts: list[Block] = []
     for name, facts in {one.title: one.facts for one in found}.items():
         parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
-    parts += [Chart(f"{one.title}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
+    parts += [Chart(f"{one.title}: {one.y_label}", curve_chart(one)) for one in found[:MOST_LAWS]]
     parts.append(
         note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "

@@ -171,13 +171,7 @@ def arms(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
     )
     rec.log(
         f"{path}/names",
-        rr.Points3D(
-            at[named] + top + above,
-            labels=[style.safe(_label(d, int(a))) for a in named],
-            colors=[style.LABEL],
-            radii=1e-4,
-            show_labels=True,
-        ),
+        arm_shapes.labels(at[named] + top + above, [_label(d, int(a)) for a in named]),
         static=True,
     )
     if marked.any():

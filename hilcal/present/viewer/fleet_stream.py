@@ -1,7 +1,5 @@
 """The recording of a fleet: which arm is unlike its type, in which joint, and since when."""
 
-import hashlib
-import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,7 @@ from hilcal.present.document import heading
 from hilcal.present.fleet import type_report
 from hilcal.present.viewer import fleet_scene, layout
 from hilcal.present.viewer.fleet_scene import TypeDigest, type_digest
-from hilcal.present.viewer.markdown import markdown
+from hilcal.present.viewer.markdown import document, markdown
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
 
 if TYPE_CHECKING:  # above this layer
@@ -40,7 +38,8 @@ def record_fleet(fleet: "Fleet", path: Path) -> None:
     path = Path(path)
     require_folder(path)
     types = [type_digest(t, fleet.members) for t in fleet.types]
-    rec = opened(_recording_id(types))
+    told = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
+    rec = opened(told, *(a for d in types for a in (d.units, d.seconds, d.campaigns)))
     write(rec, _blueprint(types), lambda: _log(rec, types), path)
 
 
@@ -50,8 +49,8 @@ def _log(rec: rr.RecordingStream, types: list[TypeDigest]) -> None:
     for i, d in enumerate(types):
         fleet_scene.arms(rec, f"arms{i}", d)
         fleet_scene.drift(rec, f"date{i}", d)
-        rec.log(f"words/type{i}", _markdown(_told(d)), static=True)
-    rec.log("words/guide", _markdown(GUIDE), static=True)
+        rec.log(f"words/type{i}", document(_told(d)), static=True)
+    rec.log("words/guide", document(GUIDE), static=True)
     flush(rec)
 
 
@@ -61,10 +60,6 @@ def _told(d: TypeDigest) -> str:
     title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
     name, table, note, *lines = type_report(d.pooled)
     return markdown([heading(title), name, *lines, table, note])
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")
 
 
 def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
@@ -88,14 +83,7 @@ def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
     ]
     words.append(rrb.TextDocumentView(origin="words/guide", name="How to read this"))
     left = rrb.Vertical(rrb.Tabs(*arms), rrb.Tabs(*dates), row_shares=[3, 2])
-    return rrb.Blueprint(
-        rrb.Horizontal(left, rrb.Tabs(*words), column_shares=[3, 2]),
-        rrb.TimePanel(timeline="date", state="collapsed", play_state="paused"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return layout.whole(rrb.Horizontal(left, rrb.Tabs(*words), column_shares=[3, 2]), "date")
 
 
 def _whole(d: TypeDigest) -> rrb.TimeAxis:
@@ -110,25 +98,5 @@ def _arms(origin: str, of: str, d: TypeDigest) -> rrb.Spatial3DView:
     at, reach = fleet_scene.places(d), max(d.arm.reach, 0.1)
     middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * reach])
     size = float(np.ptp(at, axis=0).max()) + reach
-    return rrb.Spatial3DView(
-        origin=origin,
-        name=f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where",
-        background=layout.BACKGROUND,
-        line_grid=layout.GRID,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=middle + size * np.array([0.68, 0.0, 0.36]),
-            look_target=middle,
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
-
-
-def _recording_id(types: list[TypeDigest]) -> str:
-    """Return an identifier that depends on the content of the recording alone."""
-    sha = hashlib.sha256()
-    for d in types:
-        sha.update(repr((d.pooled.type, d.pooled.arms, d.pooled.odd, d.names)).encode())
-        for array in (d.units, d.seconds, d.campaigns):
-            sha.update(np.ascontiguousarray(array).tobytes())
-    return str(uuid.UUID(bytes=sha.digest()[:16]))
+    name = f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where"
+    return layout.view3d(origin, name, middle + size * np.array([0.68, 0.0, 0.36]), middle)

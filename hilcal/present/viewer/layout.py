@@ -1,6 +1,7 @@
 """The blueprint: which view stands where, what its title says, and where its eye stands."""
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -87,6 +88,45 @@ BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidCol
 GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
 
 
+def whole(
+    contents: rrb.Container,
+    timeline: str,
+    play: Literal["paused", "following"] = "paused",
+    fps: float | None = None,
+) -> rrb.Blueprint:
+    """Return a blueprint of these views alone, over a line for the time."""
+    return rrb.Blueprint(
+        contents,
+        rrb.TimePanel(timeline=timeline, state="collapsed", fps=fps, play_state=play),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def view3d(
+    origin: str,
+    name: str,
+    place: Floats,
+    look: Floats,
+    contents: Sequence[str] = ("$origin/**",),
+    **more: Any,
+) -> rrb.Spatial3DView:
+    """Return a 3-D view whose eye stands at a place and looks at another, z upwards."""
+    return rrb.Spatial3DView(
+        origin=origin,
+        contents=list(contents),
+        name=name,
+        background=BACKGROUND,
+        line_grid=GRID,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
+        ),
+        **more,
+    )
+
+
 def blueprint(d: Digest) -> rrb.Blueprint:
     """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
 
@@ -117,14 +157,7 @@ def blueprint(d: Digest) -> rrb.Blueprint:
         row_shares=[5, 4],
     )
     play: Literal["following", "paused"] = "following" if d.story.growing else "paused"
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0, play_state=play),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "revision", play, fps=1.0)
 
 
 def residual_title(d: Digest) -> str:
@@ -149,19 +182,8 @@ def bars_title(d: Digest) -> str:
 
 def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
     middle, size = center(d)
-    return rrb.Spatial3DView(
-        origin="world",
-        contents=["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"],
-        name=name,
-        background=BACKGROUND,
-        line_grid=GRID,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=near(middle, EYE * size, seen(d)),
-            look_target=middle,
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
+    contents = ["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"]
+    return view3d("world", name, near(middle, EYE * size, seen(d)), middle, contents)
 
 
 def _residuals(d: Digest) -> rrb.Spatial3DView:

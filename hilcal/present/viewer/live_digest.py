@@ -1,6 +1,7 @@
 """A campaign while it is measured: places of its readings, a tally, and what it says in words."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -8,11 +9,12 @@ from scipy import stats
 
 from hilcal import numbers
 from hilcal.measuring.progress import LiveResidual, ReadingStored
+from hilcal.present.document import Block, Items, heading, table
 from hilcal.present.live_viewer import Measuring
 from hilcal.present.running import spoken, status_words
 from hilcal.present.story import LIMITS
 from hilcal.present.viewer import style
-from hilcal.present.viewer.style import escaped
+from hilcal.present.viewer.markdown import markdown
 from hilcal.robot.body import body_poses
 from hilcal.store.plan import UNLOADED, Step
 from hilcal.types import Floats
@@ -202,18 +204,32 @@ What is missing in the model is not asked while measuring: `hilcal refine` does,
 
 def status(d: LiveDigest) -> str:
     """Return how far the campaign is, and what the readings say so far."""
-    lines = [f"### {_heading(d)}", _sentence(d), ""]
+    return markdown(_status(d))
+
+
+def _status(d: LiveDigest) -> Iterator[Block]:
     left = f", {spoken(d.left)} left" if d.left > 0 else ""
-    lines += [f"**{d.done} of {d.total}** readings{left}. {escaped(d.phase)}", ""]
+    yield from (heading(_heading(d)), _sentence(d))
+    yield f"{d.done} of {d.total} readings{left}. {d.phase}"
     goal = None if d.last is None else d.last.goal
     if goal is not None and (told := status_words(goal)):
-        lines += [f"Goal: {escaped(told)}.", ""]
+        yield f"Goal: {told}."
     if len(d.loads) > 1 and d.outside:
-        lines += _loads(d)
+        rows = ((n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in d.loads.items())
+        yield table("load", "compared", "outside", "", rows=rows)
     if d.worst and d.worst[0].level > 0:
-        lines += _worst(d)
-    lines += [f"- note: {escaped(text)}" for text in d.remarks[-_REMARKS:]]
-    return "\n".join(lines) + "\n"
+        worst = (
+            (
+                f"{j.step.pose} {j.target}".rstrip(),
+                j.step.load,
+                numbers.length(j.length),
+                f"{j.sigma:.1f}",
+            )
+            for j in d.worst
+            if j.level > 0
+        )
+        yield table("worst so far", "load", "residual", "in σ", rows=worst, left=(0, 1))
+    yield Items(tuple(f"note: {text}" for text in d.remarks[-_REMARKS:]))
 
 
 def residual(found: Judged) -> str:
@@ -234,29 +250,9 @@ def _sentence(d: LiveDigest) -> str:
         return "The first readings tell where tracker and target are; then each one is compared."
     share = numbers.percent(d.outside / d.judged)
     told = (
-        f"**{d.outside} of {d.judged}** ({share}) compared readings are outside their 99 % noise "
+        f"{d.outside} of {d.judged} ({share}) compared readings are outside their 99 % noise "
         "ball (noise alone: 1 %)."
     )
     if d.wrong:
-        told += " Something is missing in it: `hilcal refine` says what, after measuring."
+        told += " Something is missing in it: hilcal refine says what, after measuring."
     return told
-
-
-def _worst(d: LiveDigest) -> list[str]:
-    lines = ["| worst so far | load | residual | in σ |", "|---|---|---|---|"]
-    lines += [
-        f"| {escaped(f'{j.step.pose} {j.target}'.rstrip())} | {escaped(j.step.load)} "
-        f"| {numbers.length(j.length)} | {j.sigma:.1f} |"
-        for j in d.worst
-        if j.level > 0
-    ]
-    return [*lines, ""]
-
-
-def _loads(d: LiveDigest) -> list[str]:
-    lines = ["| load | compared | outside | |", "|---|---|---|---|"]
-    lines += [
-        f"| {escaped(name)} | {count} | {outside} | {numbers.percent(outside / count)} |"
-        for name, (count, outside) in d.loads.items()
-    ]
-    return [*lines, ""]

@@ -12,11 +12,11 @@ from hilcal.measuring.progress import ArmAt, GoalMet, Phase, ReadingStored, Rema
 from hilcal.present.live_viewer import Measuring, Revised
 from hilcal.present.running import figures, met_words
 from hilcal.present.story import Story
-from hilcal.present.viewer import layout, live_digest, scene, stream, style
-from hilcal.present.viewer.arm_shapes import MovingArm
-from hilcal.present.viewer.digest import Digest, Limits, digest
-from hilcal.present.viewer.layout import BACKGROUND, EYE, GRID
+from hilcal.present.viewer import layout, live_digest, stream, style
+from hilcal.present.viewer.arm_shapes import MovingArm, labels
+from hilcal.present.viewer.digest import Digest, digest
 from hilcal.present.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
+from hilcal.present.viewer.markdown import document
 from hilcal.robot.body import body_poses
 from hilcal.types import Floats
 
@@ -26,7 +26,7 @@ IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
 
 
 def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
-    """Return the live_blueprint.
+    """Return the blueprint.
 
     Args:
         d: the campaign.
@@ -40,19 +40,13 @@ def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
     )
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
     middle, size = _live_center(d)
-    scene = rrb.Spatial3DView(
-        origin="world",
-        contents=[f"+ {world}/**"],
-        name=f"{of} {RESIDUALS}",
-        background=BACKGROUND,
-        line_grid=GRID,
+    scene = layout.view3d(
+        "world",
+        f"{of} {RESIDUALS}",
+        layout.near(middle, layout.EYE * size, live_seen(d)),
+        middle,
+        [f"+ {world}/**"],
         overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=layout.near(middle, EYE * size, live_seen(d)),
-            look_target=middle,
-            eye_up=(0.0, 0.0, 1.0),
-        ),
     )
     in_time = rrb.TimeSeriesView(
         origin=series,
@@ -68,17 +62,14 @@ def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
         rrb.TextDocumentView(origin="words/measuring", name="So far"),
         rrb.TextDocumentView(origin="words/live_guide", name="How to read this"),
     )
-    return rrb.Blueprint(
+    return layout.whole(
         rrb.Horizontal(
             rrb.Vertical(scene, in_time, row_shares=[11, 4]),
             rrb.Vertical(told, _log(), row_shares=[3, 2]),
             column_shares=[3, 2],
         ),
-        rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="following"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
+        TIMELINE,
+        "following",
     )
 
 
@@ -158,10 +149,10 @@ class LiveScene:
         if self._story is None:
             return
         self._rec.reset_time()
-        d = digest(replace(self._story, growing=False), Limits())
+        d = digest(replace(self._story, growing=False))
         stream.tell(self._rec, d)
         self._rec.reset_time()
-        d = d if to_open else digest(self._story, Limits())
+        d = d if to_open else digest(self._story)
         self._rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
 
     # measuring
@@ -180,7 +171,7 @@ class LiveScene:
         rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._arm = MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
-        rec.log("words/live_guide", _markdown(live_digest.GUIDE), static=True)
+        rec.log("words/live_guide", document(live_digest.GUIDE), static=True)
         rec.log(
             f"{self._world}/planned",
             rr.Points3D(d.anchor.reshape(-1, 3), colors=[style.GREY], radii=[0.006]),
@@ -281,10 +272,10 @@ class LiveScene:
         words = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
             words += f"{', ' * bool(worst.target)}{worst.target}: {live_digest.residual(worst)}"
-        rec.log(f"{self._world}/last", scene.label(d.place(event.step, target) + _ABOVE, words))
+        rec.log(f"{self._world}/last", labels([d.place(event.step, target) + _ABOVE], [words]))
 
     def _words(self, d: LiveDigest) -> None:
-        self._rec.log("words/measuring", _markdown(live_digest.status(d)))
+        self._rec.log("words/measuring", document(live_digest.status(d)))
 
     def _log(self, text: str, level: str = "INFO") -> None:
         self._rec.log("log", rr.TextLog(style.safe(text), level=level))
@@ -301,7 +292,7 @@ class LiveScene:
             else tuple(r for r in before.revisions if r.revision < new.revision)
         )
         self._story = replace(story, revisions=(*earlier, *story.revisions), growing=True)
-        d = digest(self._story, Limits())
+        d = digest(self._story)
         if not earlier:
             stream.begin(rec, d)
         rec.set_time("revision", sequence=new.revision)
@@ -338,7 +329,3 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
 
 def _titles(d: Digest) -> tuple[str, ...]:
     return layout.residual_title(d), layout.deflection_title(d), layout.bars_title(d)
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")

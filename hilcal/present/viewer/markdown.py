@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 
+import rerun as rr
+
 from hilcal.present.document import Block, Chart, Items, Table, Words
 from hilcal.present.viewer.style import escaped
 
@@ -11,6 +13,11 @@ MARKS = {"good": "✓ ", "doubt": "✗ "}
 def markdown(blocks: Iterable[Block]) -> str:
     """Return blocks as markdown in which no text has a meaning, nor lacks a glyph."""
     return "\n\n".join(filter(None, map(_one, blocks)))
+
+
+def document(text: str) -> rr.TextDocument:
+    """Return markdown as the viewer takes it."""
+    return rr.TextDocument(text, media_type="text/markdown")
 
 
 def _one(block: Block) -> str:

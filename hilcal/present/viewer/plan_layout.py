@@ -73,8 +73,6 @@ def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
 _FPS = 2.0
 _LOOKED_AT = 20
 """Steps whose arm is to be seen from the eye."""
-# Views that draw with light colours stay dark in the light theme too.
-_DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
 SCHEDULE = "Schedule: minute of each reading by step, colour by load"
@@ -98,13 +96,10 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
     if details:
         right.append(rrb.Tabs(*details))
     shares = [5, 4][: len(right)]
-    return rrb.Blueprint(
+    return layout.whole(
         rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
-        rrb.TimePanel(timeline="step", state="collapsed", fps=_FPS, play_state="paused"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
+        "step",
+        fps=_FPS,
     )
 
 
@@ -131,7 +126,7 @@ def _details(d: PlanDigest) -> list[rrb.View]:
 
 def _steps(d: PlanDigest) -> rrb.Spatial3DView:
     middle, size = plan_scene.framed(d)
-    return _view3d(STEPS, ["+ $origin/**"], middle + size * _eye(d, middle, size), middle)
+    return layout.view3d("world", STEPS, middle + size * _eye(d, middle, size), middle)
 
 
 def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
@@ -139,7 +134,7 @@ def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
     contents += [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
     at = d.target.mean(axis=0)
     far = float(np.linalg.norm(place - at))
-    return _view3d(f"{TRACKER}, {numbers.length(far)} away", contents, place, at)
+    return layout.view3d("world", f"{TRACKER}, {numbers.length(far)} away", place, at, contents)
 
 
 def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
@@ -151,21 +146,6 @@ def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
     return layout.direction(turn, middle, size, points, d.config.obstacles)
-
-
-def _view3d(name: str, contents: list[str], place: Floats, look: Floats) -> rrb.Spatial3DView:
-    return rrb.Spatial3DView(
-        origin="world",
-        contents=contents,
-        name=name,
-        background=_DARK,
-        line_grid=rrb.LineGrid3D(
-            visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 60)
-        ),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
-        ),
-    )
 
 
 def _schedule() -> rrb.TimeSeriesView:

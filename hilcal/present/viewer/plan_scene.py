@@ -111,13 +111,7 @@ def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
     if things:
         rec.log(
             "world/obstacles/names",
-            rr.Points3D(
-                [_named_at(x) for x in things],
-                labels=[style.safe(x.name) for x in things],
-                colors=[style.LABEL],
-                radii=[1e-4],
-                show_labels=True,
-            ),
+            arm_shapes.labels([_named_at(x) for x in things], [x.name for x in things]),
             static=True,
         )
 
@@ -196,13 +190,7 @@ def _tracker(rec: rr.RecordingStream, place: Floats) -> None:
     )
     rec.log(
         "world/tracker/name",
-        rr.Points3D(
-            [place + 2.2 * _HEAD * up],
-            labels=["tracker"],
-            colors=[style.LABEL],
-            radii=[1e-4],
-            show_labels=True,
-        ),
+        arm_shapes.labels([place + 2.2 * _HEAD * up], ["tracker"]),
         static=True,
     )
 
@@ -277,19 +265,13 @@ def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) ->
     above = d.target + np.array([0.0, 0.0, _LABEL_ABOVE])
     above[:, 2] += d.rank.max(initial=0) * BEAD_GAP * d.reach
     words = [
-        style.safe(f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}")
+        f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}"
         for k, s in enumerate(d.plan.steps, start=1)
     ]
     rec.send_columns(
         "world/label",
         indexes=time,
-        columns=rr.Points3D.columns(
-            positions=above + np.array([0.0, 0.0, 0.25 * _LABEL_ABOVE]),
-            labels=words,
-            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(d), 1)),
-            radii=np.full(len(d), 1e-4),
-            show_labels=[True] * len(d),
-        ),
+        columns=arm_shapes.label_columns(above + np.array([0.0, 0.0, 0.25 * _LABEL_ABOVE]), words),
     )
     rec.send_columns(
         "world/label/leader",

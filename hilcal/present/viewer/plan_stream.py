@@ -1,7 +1,5 @@
 """The recording of a plan: a file that shows it before anything is measured, also in words."""
 
-import hashlib
-import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,13 +14,12 @@ from hilcal.design.summary import PlanSummary
 from hilcal.measuring.sight import UNKNOWN as NO_TRACKER
 from hilcal.present import plan
 from hilcal.present import plan as plan_blocks
-from hilcal.present.document import Block, heading, pairs
+from hilcal.present.document import Block, Words, heading, pairs, table
 from hilcal.present.running import spoken
 from hilcal.present.viewer import plan_layout, plan_scene, style
-from hilcal.present.viewer.markdown import markdown
+from hilcal.present.viewer.markdown import document, markdown
 from hilcal.present.viewer.plan_digest import SEEN, PlanDigest, plan_digest
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
-from hilcal.present.viewer.style import escaped
 from hilcal.store.plan import UNLOADED, Plan
 
 _DETECTABLE = 6
@@ -72,40 +69,33 @@ def sight(d: PlanDigest) -> str:
 def step_card(d: PlanDigest, k: int) -> str:
     """Return step k (from 0) in words."""
     step = d.plan.steps[k]
-    under = "unloaded" if step.load == UNLOADED else f"under {escaped(step.load)}"
-    lines = [
-        f"### Step {k + 1} of {len(d)}: {escaped(step.pose)}, {under}",
-        f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}.",
-        "",
-    ]
-    if k and d.load[k] != d.load[k - 1]:
-        lines += [f"**Before it: {_change(step.load)}, by hand.**", ""]
-    lines += [_sight(d, k), "", "| joint | deg |", "|---|---|"]
+    under = "unloaded" if step.load == UNLOADED else f"under {step.load}"
+    head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {under}")
+    when = f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}."
+    changes = bool(k) and d.load[k] != d.load[k - 1]
+    before = [Words(f"Before it: {_change(step.load)}, by hand.", "strong")] if changes else []
     angles = np.rad2deg(d.plan.joints(step.pose))
-    lines += [
-        f"| {escaped(name)} | {angle:.1f} |"
-        for name, angle in zip(d.cell.arm.joint_names, angles, strict=True)
-    ]
+    rows = [(n, f"{a:.1f}") for n, a in zip(d.cell.arm.joint_names, angles, strict=True)]
     x, y, z = d.target[k]
     what = "Target" if d.cell.target_known else "Flange (the target's place is not known)"
-    lines += ["", f"{what} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."]
-    return "\n".join(lines)
+    place = f"{what} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
+    return markdown([head, when, *before, _sight(d, k), table("joint", "deg", rows=rows), place])
 
 
 def _change(load: str) -> str:
-    return "everything is taken off" if load == UNLOADED else f"{escaped(load)} is hung"
+    return "everything is taken off" if load == UNLOADED else f"{load} is hung"
 
 
-def _sight(d: PlanDigest, k: int) -> str:
+def _sight(d: PlanDigest, k: int) -> Words:
     if d.tracker is None:
-        return f"{escaped(NO_TRACKER)[0].upper()}{escaped(NO_TRACKER)[1:]}."
+        return Words(numbers.sentence(NO_TRACKER))
     far = float(np.linalg.norm(d.tracker - d.target[k]))
     way = f"at {far:.2f} m"
     if d.incidence is not None:
         way += f", {np.rad2deg(d.incidence[k]):.0f}° off the reflector's normal"
     if d.sight[k] == SEEN:
-        return f"✓ The tracker sees the target {way}."
-    return f"✗ **The tracker does not see the target** {way}: {escaped(d.why[k])}."
+        return Words(f"✓ The tracker sees the target {way}.")
+    return Words(f"✗ The tracker does not see the target {way}: {d.why[k]}.", "strong")
 
 
 GUIDE = """### How to read this
@@ -157,7 +147,7 @@ def record_plan(
     path = Path(path)
     require_folder(path)
     d = plan_digest(cell, config, plan, summary, powers)
-    rec = opened(_recording_id(d))
+    rec = opened(d.config.to_json(), d.plan.to_json(), d.summary, d.powers)
     write(rec, plan_layout.blueprint(d), lambda: _log(rec, d), path)
 
 
@@ -171,8 +161,7 @@ def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
         ("parameters", markdown(plan_blocks.parameters_table(d.summary))),
         ("criteria", markdown(plan_blocks.criteria_table(d.summary))),
     ):
-        document = rr.TextDocument(text, media_type="text/markdown")
-        rec.log(f"words/{name}", document, static=True)
+        rec.log(f"words/{name}", document(text), static=True)
     if d.summary.curve:
         plan_layout.curve(rec, d.summary)
     flush(rec)
@@ -185,9 +174,3 @@ def _log(rec: rr.RecordingStream, d: PlanDigest) -> None:
         columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
     )
     flush(rec)
-
-
-def _recording_id(d: PlanDigest) -> str:
-    """Return an identifier that depends on the content of the recording alone."""
-    content = "\n".join((d.config.to_json(), d.plan.to_json(), repr(d.summary), repr(d.powers)))
-    return str(uuid.UUID(bytes=hashlib.sha256(content.encode()).digest()[:16]))

@@ -55,9 +55,9 @@ def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None
     )
     rec.log(
         "world/residual/worst",
-        label(
-            story.anchor[worst] + _LABEL_ABOVE,
-            f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}",
+        arm_shapes.labels(
+            [story.anchor[worst] + _LABEL_ABOVE],
+            [f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}"],
         ),
     )
     rec.log(
@@ -114,12 +114,9 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
     rec.send_columns(
         "world/residual/worst",
         indexes=[time],
-        columns=rr.Points3D.columns(
-            positions=story.anchor[worst] + _LABEL_ABOVE,
-            labels=[style.safe(f"pose {story.pose_name(i)}: {pose_words(d, r, i)}") for i in worst],
-            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(worst), 1)),
-            radii=np.full(len(worst), 1e-4),
-            show_labels=[True] * len(worst),
+        columns=arm_shapes.label_columns(
+            story.anchor[worst] + _LABEL_ABOVE,
+            [f"pose {story.pose_name(i)}: {pose_words(d, r, i)}" for i in worst],
         ),
     )
 
@@ -192,11 +189,4 @@ def _deflections(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
             colors=style.LEVEL_COLORS[style.levels(r.whitened_norm2[some])],
             radii=rr.Radius.ui_points(1.6),
         ),
-    )
-
-
-def label(position: Floats, text: str) -> rr.Points3D:
-    """Return words at a place, in the colour that is legible in both themes."""
-    return rr.Points3D(
-        [position], labels=[style.safe(text)], colors=[style.LABEL], radii=[1e-4], show_labels=True
     )

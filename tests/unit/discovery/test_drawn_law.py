@@ -22,7 +22,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.charts import style
-from hilcal.present.charts.evidence import law
+from hilcal.present.charts.evidence import curve_chart
 from hilcal.present.viewer import save
 from tests.support.campaigns import NOTHING, campaign
 
@@ -77,7 +77,7 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
     assert one.x_label == "q_5 [°]"
     assert one.y_label == "dq_3/τ_3 of joint 3 [µrad/(N·m)]"
     assert dict(one.facts)["coefficients"].startswith("a = ")
-    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(law(one))
+    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(curve_chart(one))
     save(story, tmp_path / "x.rrd")
     chunks = RrdReader(tmp_path / "x.rrd").stream().filter(content="/law/law").to_chunks()
     rows = [row for c in chunks for row in c.to_record_batch().to_pylist()]

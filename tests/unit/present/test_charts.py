@@ -17,7 +17,7 @@ from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import (
     added_variable,
     correlations,
-    misfit_curve,
+    curve_chart,
     misfit_shares,
     noise_check,
     parameter_correlations,
@@ -179,7 +179,7 @@ def test_shares_and_curves_of_the_misfit():
         [100 * v.share for v in d.misfit_breakdown if v.share >= 0.01][:12],
     )
     for curve in (ANGLE, LOAD):
-        (trace,) = misfit_curve(curve).data
+        (trace,) = curve_chart(curve).data
         np.testing.assert_allclose(np.asarray(trace.y, float), curve.y)
         np.testing.assert_allclose(np.asarray(trace.error_y.array, float), curve.error)
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.present.document import table
 from hilcal.present.story import worst_and_even
-from hilcal.present.viewer import Limits, charts, digest, layout, save, style
+from hilcal.present.viewer import charts, digest, layout, save, style
 from hilcal.present.viewer.markdown import markdown
 from hilcal.present.viewer.stream import executable
 from hilcal.robot.body import body_poses, capsules
@@ -150,7 +150,7 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
 
 def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
     strips = column(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
-    balls = digest.digest(told, Limits()).half_sizes
+    balls = digest.digest(told).half_sizes
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
         dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
@@ -196,7 +196,7 @@ def test_timelines_are_revision_and_pose(recording):
 
 def test_every_reading_has_its_arrow(told, recording):
     drawn = column(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = digest.digest(told, Limits()).residual_scale
+    scale = digest.digest(told).residual_scale
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (READINGS, 3)
@@ -278,7 +278,7 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert path.stat().st_size < 20e6
     arrows = column(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = layout.residual_title(digest.digest(big, Limits()))
+    title = layout.residual_title(digest.digest(big))
     assert f"about {len(arrows[0])} of 3000" in title
     balls = column(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
     origins = column(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
