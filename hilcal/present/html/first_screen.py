@@ -12,7 +12,7 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import names
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
-from hilcal.present.verdict import UNCALIBRATED, message
+from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -70,22 +70,12 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
     """Return the verdict in a few words, and its tone."""
     if d is None:
         return "Not judged: only a model fitted with scaling gc can be", "doubt"
-    lead = d.lead.effect if d.lead is not None else ""
-    if d.verdict == "adequate":
-        if d.fit.mode == "deflection":
-            return f"The model is good for deflections; {UNCALIBRATED}", "good"
-        return "The model is good: what is left is noise", "good"
-    if d.verdict == "missing_effect":
-        return f"The model is incomplete: {lead} is missing", "bad"
-    if d.wrong_figures:
-        return "A figure of the cell seems to be wrong: correct it first", "bad"
-    if d.verdict == "ambiguous":
-        if d.reason == "inseparable_addition":
-            return "The model is good, but another one would be as good", "doubt"
-        return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
-    if d.verdict == "unknown_effect":
-        return "The model is incomplete: no known effect explains what is left", "bad"
-    return "The stated noise is wrong: the model cannot be judged by it", "doubt"
+    said = headline(d)
+    if d.verdict == "missing_effect" and d.lead is not None:
+        said = f"{said}: {d.lead.effect}"
+    good, open_ = d.verdict == "adequate", d.verdict in ("ambiguous", "noise_misjudged")
+    tone = "good" if good else "doubt" if open_ and not d.wrong_figures else "bad"
+    return f"{said[0].upper()}{said[1:]}", tone
 
 
 def how_good(m: ReportContent) -> str:
