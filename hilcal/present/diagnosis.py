@@ -18,6 +18,7 @@ from hilcal.present.document import Block, Table, Tone, Words, heading, note, ta
 from hilcal.present.fit import CERTAIN, follows, misses, model_name, where_table
 from hilcal.present.story import REVISION_HEADS
 from hilcal.present.verdict import broken, headline, implausible, message
+from hilcal.types import Floats
 
 SUSPECTS = 6
 
@@ -275,13 +276,36 @@ def sparkline(values: Sequence[float]) -> str:
 
 
 def curve_table(d: Dependence) -> Table:
-    """Return the table of a dependence, with its bars in the heading."""
-    unit, factor = numbers.unit_for(d.y_unit, list(d.y))
+    """Return the table of a dependence."""
     head = f"{d.variable} [{d.unit}]" if d.unit else d.variable
-    out = table(head, f"error [{unit}] {sparkline(list(d.y))}", "±")
-    for k, (x, y, error) in enumerate(zip(d.x, d.y, d.error, strict=True)):
-        name = d.labels[k] if d.labels else numbers.digits(float(x))
-        out.add(name, *numbers.with_std(factor * float(y), factor * float(error)))
+    return binned_table((head, "error"), d.y_unit, (d.x, d.y, d.error), d.labels)
+
+
+def binned_table(
+    heads: tuple[str, str],
+    unit_of: str,
+    bins: tuple[Floats, Floats, Floats],
+    names: Sequence[str] = (),
+    law: Floats | None = None,
+) -> Table:
+    """Return means over bins of a variable, drawn as bars in the heading.
+
+    Args:
+        heads: the variable, and what the means are of.
+        unit_of: of the means, SI.
+        bins: (K,) variable, mean and its standard uncertainty.
+        names: (K,) of the bins, where the variable only counts them.
+        law: (K,) of a law there.
+    """
+    x, y, error = bins
+    unit, factor = numbers.unit_for(unit_of, list(y))
+    bars = f"{heads[1]} [{unit}] {sparkline(list(y))}"
+    out = table(heads[0], bars, "±", *(() if law is None else ("law",)))
+    for k in range(len(x)):
+        value, spread = numbers.with_std(factor * float(y[k]), factor * float(error[k]))
+        places = len(value.partition(".")[2])
+        more = () if law is None else (f"{factor * law[k]:.{places}f}",)
+        out.add(names[k] if names else numbers.digits(float(x[k])), value, spread, *more)
     return out
 
 

@@ -10,8 +10,8 @@ from hilcal.discovery.curve import Curve
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.proposal import LawSearch
-from hilcal.present.diagnosis import curves, sparkline
-from hilcal.present.document import Block, Words, heading, table
+from hilcal.present.diagnosis import binned_table, curves
+from hilcal.present.document import Block, Words, heading
 from hilcal.present.fit import model_name
 
 FEW = 3
@@ -115,16 +115,9 @@ def curve_tables(of: Sequence[Curve]) -> Iterator[Block]:
         x, y, std, _ = c.binned
         if len(x) < LEAST_BINS:
             continue
-        unit, factor = numbers.unit_for(c.unit, list(y))
         head = c.quantity if c.quantity_unit == "1" else f"{c.quantity} [{c.quantity_unit}]"
-        law = np.interp(x, *c.line)
-        out = table(head, f"{c.of} [{unit}] {sparkline(list(y))}", "±", "law")
-        for at, seen, error, told in zip(x, y, std, law, strict=True):
-            value, spread = numbers.with_std(factor * float(seen), factor * float(error))
-            places = len(value.partition(".")[2])
-            out.add(numbers.digits(float(at)), value, spread, f"{factor * told:.{places}f}")
         yield ""
-        yield out
+        yield binned_table((head, c.of), c.unit, (x, y, std), law=np.interp(x, *c.line))
 
 
 def curve_json(c: Curve) -> dict[str, object]:

@@ -106,50 +106,16 @@ def where_wrong(m: ReportContent) -> str:
 
 
 def missing(d: Diagnosis | None) -> str:
-    """Say in few words what is missing; the whole sentence stands with the evidence."""
+    """Say what is missing, and what that effect is."""
     if d is None:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    if d.wrong_figures:
-        return numbers.sentence(message(d))
-    if d.reason == "inseparable_addition":
-        return _as_good(d)
-    if d.reason == "no_suspect":
-        best = f": the best, {d.suspects[0].effect}, does not" if d.suspects else ""
-        return (
-            f"No effect of the catalogue surely explains what is left{best}. hilcal discover "
-            "searches a law for it."
-        )
-    lead = d.lead
-    if lead is None or d.reason == "insufficient_catalogue":
-        return numbers.sentence(message(d), d.significant)
-    explained = (
-        f"explains {numbers.percent(lead.share)} of the misfit, "
-        f"{numbers.percent(max(lead.holdout_share, 0.0))} on poses left out"
-    )
-    name = lead.coarse or lead.effect
-    law = f"{name} is: {d.fit.model.catalogue[name].summary}."
-    if d.reason == "inseparable_suspects":
-        others = numbers.few([r.effect for r in d.separability])
-        return (
-            f"{lead.effect}, which {explained}; or {others}: these readings do not separate them. "
-            f"hilcal next plans those that do. {law}"
-        )
-    what = f"joints that differ in {name}: it" if lead.coarse else f"{name}: it"
-    return numbers.sentence(f"{what} {explained}. {law}", d.significant)
-
-
-def _as_good(d: Diagnosis) -> str:
-    """Say which effects of an adequate model others could replace."""
-    doubts = [
-        f"{a.effect} could as well be "
-        + (numbers.few(a.same_as, 1) if a.same_as else f"{len(a.others)} other effects together")
-        for a in d.alternatives
-        if a.inseparable
-    ]
-    told = "; ".join(doubts)
-    return f"Nothing that lowers the error. But {told}. hilcal next plans what separates them."
+    said = numbers.sentence(message(d), d.significant)
+    if d.lead is None or d.wrong_figures:
+        return said
+    name = d.lead.coarse or d.lead.effect
+    return f"{said} {name} is: {d.fit.model.catalogue[name].summary}."
 
 
 def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:

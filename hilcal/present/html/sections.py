@@ -41,7 +41,6 @@ from hilcal.present.document import (
 )
 from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
 from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import missing
 from hilcal.present.registration import covariance_words
 from hilcal.present.story import REVISION_HEADS
 from hilcal.present.validation import worst_table
@@ -93,8 +92,9 @@ def _evidence(m: ReportContent) -> Section:
     if d is None:
         said = "Not diagnosed: only a model fitted with scaling gc can be."
         return Section("evidence", title, (said,))
-    said = numbers.sentence(message(d), d.significant)
-    parts: list[Block] = [] if said == missing(d) else [said]
+    parts: list[Block] = []
+    if d.verdict == "adequate":  # else the first screen has it
+        parts.append(numbers.sentence(message(d)))
     parts.append(suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += [*doubtful(d), *redundant_line(d)]
     parts += added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
