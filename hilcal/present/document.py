@@ -42,6 +42,10 @@ class Words(Printable):
     stressed: str = ""
     indent: int = 0
 
+    def __str__(self) -> str:
+        """Return the text."""
+        return self.text
+
 
 @dataclass(frozen=True, slots=True)
 class Items(Printable):

@@ -126,24 +126,38 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     return out
 
 
+def residual_over(
+    story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
+) -> go.Figure:
+    """Draw the residual of each reading in σ over a variable.
+
+    Args:
+        story: N readings.
+        revision: of the model.
+        values: (N,) of the variable, in units for people; NaN where it is not known.
+        name: of the variable.
+        unit: of the values; "" for a pure number.
+    """
+    d = drawn(story, revision)
+    known = np.isfinite(values)
+    middle = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
+    says = over(revision, middle, name, unit)
+    return chart(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
+
+
 def residual_by_joint(story: Story, revision: StoryRevision, joint: int) -> go.Figure:
     """Draw the residual of each reading in σ over the angle of a joint (from 0)."""
-    d = drawn(story, revision)
-    name = f"joint {joint + 1} angle"
     angle = np.degrees(story.q[:, joint])
-    return chart(d, angle[d.index], f"{name} [°]", over(revision, angle, name, "°"))
+    return residual_over(story, revision, angle, f"joint {joint + 1} angle", "°")
 
 
 def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw the residual of each reading in σ over the time; over its row where none is known."""
-    d = drawn(story, revision)
     if story.time_s is None:
         rows = np.arange(len(story), dtype=float)
-        says = over(revision, rows, "row order", "")
-        return chart(d, rows[d.index], "row, in the order of the file", says)
+        return residual_over(story, revision, rows, "row, in the order of the file", "")
     minutes = (story.time_s - story.time_s.min()) / 60
-    says = over(revision, minutes, "time", "min")
-    return chart(d, minutes[d.index], "time since the first reading [min]", says)
+    return residual_over(story, revision, minutes, "time since the first reading", "min")
 
 
 def worst_of(names: Sequence[str], sigma: Floats) -> list[tuple[str, float, int]]:
@@ -199,25 +213,6 @@ def chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
         out.add_hline(limit, line={"color": color, "dash": "dot", "width": 1})
     out.update_yaxes(rangemode="tozero")
     return out
-
-
-def residual_over(
-    story: Story, revision: StoryRevision, values: Floats, name: str, unit: str
-) -> go.Figure:
-    """Draw the residual of each reading in σ over a variable.
-
-    Args:
-        story: N readings.
-        revision: of the model.
-        values: (N,) of the variable, in units for people; NaN where it is not known.
-        name: of the variable.
-        unit: of the values; "" for a pure number.
-    """
-    d = drawn(story, revision)
-    known = np.isfinite(values)
-    middle = np.where(known, values, np.median(values[known]) if known.any() else 0.0)
-    says = over(revision, middle, name, unit)
-    return chart(d, values[d.index], f"{name} [{unit}]" if unit else name, says)
 
 
 AXES = ("x", "y", "z")
