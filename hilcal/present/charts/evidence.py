@@ -81,7 +81,7 @@ def curve_chart(c: Curve) -> go.Figure:
         showlegend=c.line is not None,
     )
     says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
-    traces = [points] if c.line is None else [style.line(*c.line, "law"), points]
+    traces = [points] if c.line is None else [style.line(c.line[0], c.line[1], "law"), points]
     x, y = escaped(c.x_label), escaped(c.y_label)
     return style.figure(says, x=x, y=y, traces=traces, height=320)
 

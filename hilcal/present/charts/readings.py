@@ -282,11 +282,10 @@ def workspace(
         start, end = at[worst], at[worst] + times * residual[worst]
         gap = np.full_like(start, np.nan)  # between one line and the next
         lines = np.stack([start, end, gap], axis=1).reshape(-1, 2)
-        traces.append(style.line(*lines.T, color=style.LEVELS[k]))
+        traces.append(style.line(lines[:, 0], lines[:, 1], color=style.LEVELS[k]))
         traces.append(
             style.marks(
-                *at[mine].T,
-                *(style.LEVELS[k], style.SYMBOLS[k], 5),
+                *(at[mine, 0], at[mine, 1], style.LEVELS[k], style.SYMBOLS[k], 5),
                 name=LEVEL_NAMES[k],
                 showlegend=False,
                 text=d.named(mine),
