@@ -166,6 +166,7 @@ def captioned(blocks: Iterable[Block], caption: str = "") -> tuple[Block, ...]:
             if found in used:
                 found = f"{found}: {block.heads[0]}"
             used.add(found)
-            block = replace(block, caption=found)
+            heads = tuple(" ".join(head.split()) for head in block.heads)
+            block = replace(block, caption=found, heads=heads)
         out.append(block)
     return tuple(out)
