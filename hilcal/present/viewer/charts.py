@@ -96,15 +96,24 @@ def curve_bars(rec: rr.RecordingStream, entity: str, c: Curve | None) -> None:
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
             continue
         x, y = bars[part]
-        apart = float(np.diff(np.sort(x)).min(initial=np.ptp(x) or 1.0)) or 1.0
-        width = 0.4 * apart if "law" in bars else 0.8 * apart
+        order = np.argsort(x, kind="stable")
+        edges = _edges(x[order])
+        width = np.diff(edges) / len(bars)
         chart = rr.BarChart(
-            y,
-            abscissa=x - 0.4 * apart + k * width,
-            widths=np.full(len(x), width),
+            y[order],
+            abscissa=edges[:-1] + k * width,
+            widths=width,
             color=(style.MEASURED, style.NOISE)[k],
         )
         rec.log(f"{entity}/{part}", chart)
+
+
+def _edges(x: Floats) -> Floats:
+    """(K + 1,) of bins about growing centres (K,): half-way between them."""
+    if len(x) == 1:
+        return np.array([x[0] - 0.5, x[0] + 0.5])
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
 
 
 def _means(c: Curve) -> tuple[Floats, Floats]:

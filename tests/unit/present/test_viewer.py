@@ -92,21 +92,24 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
         assert called in {words for _, words, _ in charts.SERIES}
 
 
-def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return abscissae and heights of the bars of a revision."""
-    found = [
-        column(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"]
-        for name in ("abscissa", "values")
-    ]
-    return np.array(found[0]), np.array(found[1])
+def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return left and right edges and heights of the bars of a revision."""
+    left, width, height = (
+        np.array(column(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
+        if name != "widths"
+        else np.array(column(path, entity, f"BarChart:{name}", "revision")[revision])
+        for name in ("abscissa", "widths", "values")
+    )
+    return left, left + width, height
 
 
-def test_a_curve_is_drawn_by_bars_at_its_values(tmp_path):
+def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
     told, path = doubtful(), tmp_path / "doubt.rrd"
     save(told, path)
-    x, height = bars(path, "/follows/mean", 2)
+    left, right, height = bars(path, "/follows/mean", 2)
     np.testing.assert_allclose(height, ANGLE.y)
-    np.testing.assert_allclose(np.diff(x), np.diff(ANGLE.x))
+    assert ((left < ANGLE.x) & (ANGLE.x < right)).all()
+    np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
     assert 3 not in column(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
 
 
@@ -114,15 +117,15 @@ def test_loads_stand_beside_each_other_in_their_order(tmp_path):
     told, path = doubtful(), tmp_path / "load.rrd"
     third = replace(told.revisions[2], follows=LOAD)
     save(replace(told, revisions=(third,)), path)
-    x, height = bars(path, "/follows/mean", 2)
+    left, right, height = bars(path, "/follows/mean", 2)
     np.testing.assert_allclose(height, LOAD.y)
-    np.testing.assert_allclose(np.diff(x), 1.0)
+    np.testing.assert_allclose(right - left, 1.0)
 
 
 def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
-    x, height = bars(recording, "/follows/mean", 0)
-    assert 4 <= len(x) <= 12
-    assert np.all(np.diff(x) > 0)
+    left, _, height = bars(recording, "/follows/mean", 0)
+    assert 4 <= len(left) <= 12
+    assert np.all(np.diff(left) > 0)
     follows = told.revisions[0].follows
     assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
 
@@ -131,7 +134,7 @@ def test_a_curve_of_one_bin_or_no_height_is_drawn(tmp_path):
     one = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
     told = doubtful()
     save(replace(told, revisions=(replace(told.revisions[2], follows=one),)), tmp_path / "one.rrd")
-    assert bars(tmp_path / "one.rrd", "/follows/mean", 2)[1].tolist() == [0.0]
+    assert bars(tmp_path / "one.rrd", "/follows/mean", 2)[2].tolist() == [0.0]
 
 
 def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
