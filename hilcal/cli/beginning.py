@@ -22,7 +22,7 @@ from hilcal.errors import InputError, StoppedError
 from hilcal.measuring import devices
 from hilcal.measuring.connect import driver
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present.document import heading
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
 from hilcal.tables.units import LENGTHS
 from hilcal.toml import check_section
@@ -390,7 +390,7 @@ def init(
     _complete(draft)
     written = cell_text(draft.data, f"The cell of a {draft.data['robot']['model']}")
     replace_file(cell, written)
-    t.show(text.heading(f"Written: {cell}"))
+    t.show(heading(f"Written: {cell}"))
     t.show(
         "Look it over: what was not answered stands there as an example. Then, without any "
         f"device:\n  hilcal plan {quoted(cell)} -o plan.json\n"

@@ -19,8 +19,8 @@ from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.bootstrap import DRAWS, check_draws
 from hilcal.identification.bootstrap import bootstrap as draw_again
+from hilcal.present.bootstrap import bootstrap_json, bootstrap_report
 from hilcal.present.progress import counting, working
-from hilcal.present.text_bootstrap import bootstrap_report, to_json
 
 
 def bootstrap(
@@ -49,4 +49,4 @@ def bootstrap(
         with counting(t.progress, "draws", draws) as advance:
             found = draw_again(fit, engine, draws, seed, advance)
     t.show(bootstrap_report(found))
-    t.document({"revision": number, "seed": seed, **to_json(found)})
+    t.document({"revision": number, "seed": seed, **bootstrap_json(found)})

@@ -38,7 +38,7 @@ from hilcal.errors import (
 )
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
-from hilcal.present import text_calibrate
+from hilcal.present.calibration import improvement_report, limit_failure, standing, step_heading
 from hilcal.present.progress import working
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
@@ -146,8 +146,8 @@ def calibrate(
         with working(t.progress) as say:
             found = p.compare(say)
     limit_m = p.settings.limit_m
-    t.show(text_calibrate.heading(Step("compare", output)))
-    t.show(text_calibrate.improvement_report(found, limit_m))
+    t.show(step_heading(Step("compare", output)))
+    t.show(improvement_report(found, limit_m))
     files = p.files
     t.show(
         f"\nThe calibration is in {output}, its test in {files.validation.name} and "
@@ -158,7 +158,7 @@ def calibrate(
     t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
     if limit_m is not None and found.over(limit_m):
-        words = text_calibrate.failure(found, limit_m)
+        words = limit_failure(found, limit_m)
         undecided = limit_m < found.everything.noise_m
         failed = CannotAnswerError(words) if undecided else LimitError(words)
     t.document({**_document(p), "improvement": found.to_dict(), "limit_m": limit_m}, failed)
@@ -263,14 +263,13 @@ def _procedure(
         raise InputError(f"{output}: its calibration is {what}")
     if not resume:
         raise InputError(
-            f"{output}: a calibration is there already, {text_calibrate.standing(p.next())}; go on "
-            f"with: {told.on}"
+            f"{output}: a calibration is there already, {standing(p.next())}; go on with: {told.on}"
         )
     _refuse_goal(p.settings.readings, asked, path)
     p = replace(p, settings=replace(p.settings, **asked))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
-    told.t.notice(f"{output}: a calibration, {text_calibrate.standing(p.next())}")
+    told.t.notice(f"{output}: a calibration, {standing(p.next())}")
     return p
 
 

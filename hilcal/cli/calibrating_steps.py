@@ -14,11 +14,12 @@ from hilcal.cli.terminal import Terminal
 from hilcal.config import CellConfig
 from hilcal.errors import StoppedError
 from hilcal.measuring.connect import connect
-from hilcal.present import text_calibrate, text_refine
+from hilcal.present.calibration import decision_report, step_heading, validation_lines
+from hilcal.present.diagnosis import key, revisions_table, verdict_line
+from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
+from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
-from hilcal.present.text_plan import plan_facts
-from hilcal.present.text_prior import prior_lines
 from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import REFINED, Step
@@ -54,7 +55,7 @@ class Operator:
             StoppedError: somebody does not want the arm to move.
         """
         while (step := self._p.next()).kind not in ("done", "compare"):
-            self._t.show(text_calibrate.heading(step, self._clock))
+            self._t.show(step_heading(step, self._clock))
             if step.moves:
                 self._moving(step)
             else:
@@ -129,10 +130,10 @@ class Operator:
         elif kind == "decide":
             decided: Decision = found
             of = self._p.settings
-            report = text_calibrate.decision_report(decided, of.goal_m, of.readings, self._clock)
+            report = decision_report(decided, of.goal_m, of.readings, self._clock)
             t.show(report)
         elif kind == "validate":
-            t.show(text_calibrate.validation_lines(found))
+            t.show(validation_lines(found))
 
 
 def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
@@ -143,8 +144,8 @@ def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
         Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
         for number, s in zip(refined["revisions"], found.steps, strict=True)
     ]
-    t.show(text_refine.revisions_table([r.shown for r in rows]))
-    t.show([text_refine.key(), text_refine.verdict_line(found.diagnosis), ""])
+    t.show(revisions_table([r.shown for r in rows]))
+    t.show([key(), verdict_line(found.diagnosis), ""])
     t.show(prior_lines(found.fit))
 
 

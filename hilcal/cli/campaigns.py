@@ -9,9 +9,9 @@ from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.text_info import info_report, to_json
+from hilcal.present.campaign import info_json, info_report
+from hilcal.present.fit import model_name
+from hilcal.present.registration import covariance_words
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
@@ -28,7 +28,7 @@ def info(run: Run, as_json: Json = False) -> None:
         parts = covariance_parts(file.about(COVERS), found.config)
         noise = NoiseEstimate.from_json(file.about(NOISE))
     t.show(info_report(found, run.name, covariance_words(parts, noise)))
-    t.document(to_json(found, str(run), parts))
+    t.document(info_json(found, str(run), parts))
 
 
 def accept(
@@ -100,4 +100,4 @@ def repair(
 
 
 def _named(record: RevisionRecord) -> str:
-    return f"revision {record.number} ({text.model_name(record.effects)})"
+    return f"revision {record.number} ({model_name(record.effects)})"

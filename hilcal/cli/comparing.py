@@ -14,7 +14,17 @@ from hilcal.errors import InputError
 from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
-from hilcal.present import text, text_change
+from hilcal.present.comparison import comparison_json, comparison_report, next_command
+from hilcal.present.document import heading
+from hilcal.present.fit import (
+    errors,
+    follows,
+    misses,
+    model_name,
+    where_table,
+    worst_poses,
+    worst_table,
+)
 from hilcal.present.progress import working
 from hilcal.transfer.compare import compare as compare_campaigns
 
@@ -57,13 +67,13 @@ def compare(
         found = compare_campaigns(
             o, there, revision, same_setup=True if same_setup else None, say=say
         )
-    name = text.model_name(titles(found.fit.model, found.fit.readings))
-    t.show(text.heading(f"{run.name}: {called(found.number)} ({name})"))
-    t.show(text_change.comparison_report(found, run.name, later.name))
-    command = text_change.next_command(found, str(run), str(later))
+    name = model_name(titles(found.fit.model, found.fit.readings))
+    t.show(heading(f"{run.name}: {called(found.number)} ({name})"))
+    t.show(comparison_report(found, run.name, later.name))
+    command = next_command(found, str(run), str(later))
     if command is not None:
         t.command(command)
-    t.document(text_change.to_json(found, str(run), str(later)))
+    t.document(comparison_json(found, str(run), str(later)))
 
 
 def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
@@ -78,12 +88,12 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
         if left_out:  # a background follows the fitted poses more closely than others
             raw, w = all_left_out(found)
             e = replace(e, raw=raw, whitening=w)
-        worst = text.worst_poses(e)
-    name = text.model_name(titles(found.model, found.readings))
-    t.show(text.heading(f"{called(number)}: {name}"))
-    t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
-    t.show([*text.where_table(places), ""])
-    t.show(text.worst_table(worst, left_out))
+        worst = worst_poses(e)
+    name = model_name(titles(found.model, found.readings))
+    t.show(heading(f"{called(number)}: {name}"))
+    t.show([misses(found), follows(places), "", errors(found), ""])
+    t.show([*where_table(places), ""])
+    t.show(worst_table(worst, left_out))
     t.document(
         {
             "revision": number,

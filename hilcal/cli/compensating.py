@@ -27,7 +27,13 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
-from hilcal.present import text_compensate
+from hilcal.present.calibration import (
+    compensation_json,
+    compensation_report,
+    fates,
+    refusals,
+    waypoints_table,
+)
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.tables.columns import joint_columns
@@ -129,22 +135,22 @@ def compensate(
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    refused = text_compensate.refusals(found, outside)
+    refused = refusals(found, outside)
     refused = ["; ".join(filter(None, both)) for both in zip(uncertain, refused, strict=True)]
-    fates = text_compensate.fates(task.waypoints, refused)
+    become = fates(task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
     if not leave or not kept:
         _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         found = calibration.compensate(q, acting, tool=task.tool)
-    document = text_compensate.document(calibration, task.points.names, found)
-    if fates:
-        document["waypoints"] = [asdict(fate) for fate in fates]
+    document = compensation_json(calibration, task.points.names, found)
+    if become:
+        document["waypoints"] = [asdict(fate) for fate in become]
     for path in output or ():
         _write(path, task, found, document)
-    t.show(text_compensate.report(calibration, task.points.names, q, found))
-    t.show(text_compensate.waypoints(fates))
+    t.show(compensation_report(calibration, task.points.names, q, found))
+    t.show(waypoints_table(become))
     _say_written(t, output or [])
     t.document({**document, "written": [str(path) for path in output or ()]})
 

@@ -7,7 +7,12 @@ from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import Json, argument
 from hilcal.cli.terminal import terminal
 from hilcal.config import reference
-from hilcal.present import text_config
+from hilcal.present.preparing import (
+    reference_page,
+    section_report,
+    sections_json,
+    sections_overview,
+)
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file
 
@@ -25,14 +30,14 @@ def config(
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
     if section is None:
-        t.show(text_config.overview(known))
-        t.document(text_config.to_json(known))
+        t.show(sections_overview(known))
+        t.document(sections_json(known))
         return
     found = reference.table(section, known)
-    t.show(text_config.section(found))
-    t.document(text_config.to_json((found,)))
+    t.show(section_report(found))
+    t.document(sections_json((found,)))
 
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     """Write the page of the reference."""
-    replace_file(path, text_config.page(reference.tables(DRIVERS_OWN)))
+    replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))

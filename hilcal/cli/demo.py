@@ -41,12 +41,21 @@ from hilcal.discovery.search import SAME
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.names import quoted
-from hilcal.present import text, text_calibrate, text_demo, text_refine
 from hilcal.present.build_story import Chapter
-from hilcal.present.diagnosis_document import to_json
+from hilcal.present.calibration import improvement_report
+from hilcal.present.diagnosis import (
+    compared,
+    key,
+    revisions_table,
+    step_report,
+    truth_table,
+    verdict_line,
+)
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.discovery import laws_json, refined_laws
+from hilcal.present.document import heading
 from hilcal.present.progress import working
-from hilcal.present.text_discover import laws_json, refined_laws
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import Files, Settings
 from hilcal.refinement import Refinement
@@ -133,18 +142,18 @@ def demo(
             for k, s in zip(numbered, found.steps, strict=True)
         ]
         for row, s in zip(rows, found.steps, strict=True):
-            t.show(text_demo.step_report(row.number, row.shown[1], s.diagnosis))
+            t.show(step_report(row.number, row.shown[1], s.diagnosis))
         if laws is not None:
             t.show(refined_laws(laws))
-        t.show(text.heading("The error, revision by revision"))
-        t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
-        truth = text_demo.compared(found.steps[-1].fit, r.world.truth)
+        t.show(heading("The error, revision by revision"))
+        t.show([revisions_table([r.shown for r in rows]), key()])
+        truth = compared(found.steps[-1].fit, r.world.truth)
         if truth:
-            t.show(text.heading("What was found against what is true"))
-            t.show([*text_demo.truth_table(truth)])
+            t.show(heading("What was found against what is true"))
+            t.show([*truth_table(truth)])
         improved = _put_to_use(t, p, m.measure, without_devices)
     ok, words = _judge(r, found) if laws is None else _judge_law(r, found, laws)
-    t.show([text_refine.verdict_line(found.diagnosis), "", text.heading(words)])
+    t.show([verdict_line(found.diagnosis), "", heading(words)])
     if r.world.own is not None and laws is not None:
         t.show(
             f"The simulated arm moved by {r.world.own.effect.summary} with the model's own "
@@ -248,7 +257,7 @@ def _campaign(
 
 def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Improvement | None:
     """Move the simulated arm to corrected targets, and say what its tracker measures there."""
-    t.show(text.heading("Put to use"))
+    t.show(heading("Put to use"))
     try:
         p.stop()
         while (step := p.next()).kind not in ("compare", "done"):
@@ -261,7 +270,7 @@ def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Imp
     except CannotAnswerError as error:
         t.show(f"{error}\n")
         return None
-    t.show([*text_calibrate.improvement_report(improved, None), ""])
+    t.show([*improvement_report(improved, None), ""])
     if drawn:
         t.show("What the tracker measures was drawn in the simulated world, through no wire.\n")
     return improved
@@ -290,7 +299,7 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
         INVENTED: "A law is hidden in it that no effect of the catalogue describes; the program "
         "does not know that.",
     }.get(choice, f"The effect {r.hidden} is hidden in it; the program does not know which.")
-    t.show(text.heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
+    t.show(heading(f"A simulated {r.cell.arm.name} and a laser tracker, seed {seed}"))
     t.show(
         f"{poses} poses, unloaded and under {len(loads)} loads ({', '.join(loads)}): "
         f"{len(r.readings)} readings.\n{what}"

@@ -18,9 +18,9 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present.discovery import discovery_json, discovery_report, silence
+from hilcal.present.fit import model_name
 from hilcal.present.progress import working
-from hilcal.present.text_discover import discovery_report, silence, to_json
 from hilcal.whole_file import replace_file
 
 
@@ -71,10 +71,10 @@ def discover(
                 if wanted
                 else baseline(o.cell, o.readings, o.mode(), catalogue)
             )
-            say(f"fitting {text.model_name(model.named)}")
+            say(f"fitting {model_name(model.named)}")
             found = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(found, say, name)
-    document = {"revision": number, **to_json(d), "written": None}
+    document = {"revision": number, **discovery_json(d), "written": None}
     t.show(discovery_report(d))
     if not d.laws:
         t.document(document, CannotAnswerError(silence(d)))

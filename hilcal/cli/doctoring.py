@@ -16,8 +16,8 @@ from hilcal.doctor.network import reachable
 from hilcal.doctor.ports import adapters, serial_ports
 from hilcal.doctor.program import program
 from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.present.preparing import doctor_report, doctor_summary
 from hilcal.present.progress import working
-from hilcal.present.text_doctor import doctor_report, summary
 
 SIMULATED = "simulated"
 """The port of a device that only the demo's own simulation has."""
@@ -48,7 +48,7 @@ def doctor(
     t.show(doctor_report(findings))
     failed: HilcalError | None = None
     if any(f.state == "problem" for f in findings):
-        failed = DeviceError(summary(findings))
+        failed = DeviceError(doctor_summary(findings))
     t.document({"ok": failed is None, "findings": [asdict(f) for f in findings]}, failed)
 
 

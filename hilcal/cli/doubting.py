@@ -28,10 +28,12 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.measuring.dry_run import dry_run
-from hilcal.present import text, text_demo
+from hilcal.present.diagnosis import step_report
+from hilcal.present.document import heading
+from hilcal.present.fit import model_name
+from hilcal.present.plan import next_report
 from hilcal.present.progress import Say, working
-from hilcal.present.text_next import next_report
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.procedure.separate import plan_of
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.records import content_hash
@@ -164,8 +166,8 @@ def doubted(
     suspects = left_open(d)
     if not suspects:
         return Doubted(found, d, *known, None, document)
-    t.show(text_demo.step_report(1, text.model_name(found.model.named), d))
-    t.show(text.heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
+    t.show(step_report(1, model_name(found.model.named), d))
+    t.show(heading(f"Ambiguous between {numbers.names(suspects)}: what would settle it?"))
     with working(t.progress) as say:
         place = first.joints(REFERENCE) if REFERENCE in first.pose_names else None
         rng = np.random.default_rng(seed)

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from rich.table import Table
-from rich.text import Text
 
 from hilcal.cli.options import EffectsFrom, Json, argument, catalogue_with, option
 from hilcal.cli.terminal import terminal
@@ -21,7 +19,7 @@ from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present.document import Table, note, table
 from hilcal.whole_file import replace_file
 
 OPTIONS_NOTE = (
@@ -43,13 +41,13 @@ def effects(
     states = example_states(cell)
     made = [kind(cell, states) for kind in catalogue.effects]
     defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
-    out = text.table("effect", "law", left=(0, 1))
+    out = table("effect", "law", left=(0, 1))
     for e in made:
         units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))
         needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
         count = len(e.parameters)
         facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
-        out.add_row(e.name, Text.assemble(e.summary, "\n", (facts, "dim")))
+        out.add(e.name, f"{e.summary}\n{facts}")
     t.show(out)
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
@@ -58,23 +56,22 @@ def effects(
             for file in catalogue.files
         ),
     ]
-    t.show(Text("\n".join(notes), style="dim"))
+    t.show(note("\n".join(notes)))
     t.show(["", _options_table(made, defaults)])
-    t.show(Text(OPTIONS_NOTE, style="dim"))
+    t.show(note(OPTIONS_NOTE))
     t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in made]})
 
 
 def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
     """Return the options of effects; an option that others have too is explained once."""
-    out = text.table("effect", "option", "what it chooses", left=(0, 1, 2))
+    out = table("effect", "option", "what it chooses", left=(0, 1, 2))
     explained: dict[tuple[str, str], str] = {}
     for e in made:
         for name, meaning in e.option_help.items():
             first = explained.setdefault((name, meaning), e.name)
             words = meaning if first == e.name else f"as for {first}"
             default = written(defaults[e.name][name])
-            given = ("\ndefault: " + default, "dim") if default else ("", "")
-            out.add_row(e.name, name, Text.assemble(words, given))
+            out.add(e.name, name, f"{words}\ndefault: {default}" if default else words)
     return out
 
 

@@ -21,7 +21,7 @@ from hilcal.identification import parameters_document
 from hilcal.identification.residual_table import residual_table
 from hilcal.numbers import length
 from hilcal.present.progress import Say, working
-from hilcal.present.text_registration import base_line
+from hilcal.present.registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.store.robot_file import ROBOT_FILE
 from hilcal.tables.write import check_suffix, revision_table, write_columns

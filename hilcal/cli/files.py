@@ -11,8 +11,8 @@ from hilcal.effects.written import chosen_options, read_effects_text, write_effe
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.model.model import Model
-from hilcal.present import text
 from hilcal.present.build_story import Chapter, build_story
+from hilcal.present.fit import model_name
 from hilcal.present.progress import Say, working
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
@@ -25,7 +25,7 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     number, found = run.fit_in_use(say, revision)
     if number is None:
         t.notice(
-            f"no revision yet: taking the baseline ({text.model_name(found.model.named)}; "
+            f"no revision yet: taking the baseline ({model_name(found.model.named)}; "
             f"{found.mode} readings); hilcal identify keeps it"
         )
     return number, found
@@ -48,7 +48,7 @@ def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tu
         number = run.store(found)
         t.notice(
             f"no revision yet: made the baseline, revision {number} "
-            f"({text.model_name(found.model.named)}; {found.mode} readings)"
+            f"({model_name(found.model.named)}; {found.mode} readings)"
         )
     return number, found
 

@@ -39,12 +39,9 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.other_arm import other_arm_of
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
+from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table
 from hilcal.present.progress import working
-from hilcal.present.text_prior import prior_lines
-from hilcal.present.text_registration import other_arm_line
-from hilcal.present.text_scalings import scalings_table
+from hilcal.present.registration import covariance_words, other_arm_line
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
 from hilcal.tables.files import is_parquet
@@ -120,13 +117,13 @@ def identify(
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
             fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
-                say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
+                say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
             before = len(o.file.revisions())
             number = o.append(kept)
-    t.show(text.fit_report(kept, details))
+    t.show(fit_report(kept, details))
     t.show(prior_lines(kept))
     if details or o.noise:
         t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))

@@ -11,8 +11,8 @@ from hilcal.cli.viewing import opening
 from hilcal.engine.engine import open_engine
 from hilcal.identification.posterior_document import write
 from hilcal.names import quoted
+from hilcal.present.fleet import fleet_report
 from hilcal.present.progress import counting
-from hilcal.present.text_fleet import fleet_report
 from hilcal.transfer.document import to_json
 from hilcal.transfer.fleet import fleet as pool_fleet
 from hilcal.transfer.members import entries

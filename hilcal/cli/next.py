@@ -34,9 +34,8 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identification.carried import CarriedPrior
 from hilcal.names import quoted
+from hilcal.present.plan import brief_plan, next_report, plan_report, poses_report
 from hilcal.present.progress import Say, working
-from hilcal.present.text_next import brief_plan, next_report, poses_report
-from hilcal.present.text_plan import plan_report
 from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
 

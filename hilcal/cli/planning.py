@@ -42,9 +42,9 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import plain
 from hilcal.measuring.connect import ConnectionResult, connect
 from hilcal.measuring.dry_run import DryRun, dry_run
-from hilcal.present import text_run
+from hilcal.present.plan import plan_report, plan_screen
 from hilcal.present.progress import Say, working
-from hilcal.present.text_plan import plan_report, plan_screen
+from hilcal.present.running import check_report
 from hilcal.store.plan import Plan, load_plan
 
 
@@ -148,7 +148,7 @@ def check(
         rig, answers = connect(config)
         if rig is not None:
             rig.close()
-    t.show(text_run.check_report(answers, dry))
+    t.show(check_report(answers, dry))
     failed: HilcalError | None = None
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")

@@ -2,14 +2,12 @@
 
 from pathlib import Path
 
-from rich.padding import Padding
-
 from hilcal.cell import Cell
 from hilcal.cli.terminal import Terminal
 from hilcal.errors import InputError
 from hilcal.identification.table_preview import preview_table
-from hilcal.present import text
-from hilcal.present.text_import import preview
+from hilcal.present.document import Words, heading
+from hilcal.present.preparing import import_preview
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file
 
@@ -29,10 +27,10 @@ def show_preview(
         raise InputError(f"{output}: the file exists; choose another name or give --force")
     found = preview_table(table, None if config is None else Cell.load(config), second)
     proposal, outcome = found.proposal, found.outcome
-    t.show(preview(proposal, found.rows, table.name))
+    t.show(import_preview(proposal, found.rows, table.name))
     if outcome:
-        t.show(text.heading("with this mapping:"))
-        t.show(Padding(words, (0, 0, 0, 2)) for words in outcome)
+        t.show(heading("with this mapping:"))
+        t.show(Words(words, indent=2) for words in outcome)
     if output is not None:
         if second is not None:
             _relative_second(proposal, output)

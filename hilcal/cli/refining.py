@@ -53,16 +53,23 @@ from hilcal.identification.fit_document import prior_to_json
 from hilcal.identification.frames_document import fit_to_json
 from hilcal.identification.other_arm import other_arm_of
 from hilcal.identification.weight import weight_note
-from hilcal.present import text, text_refine
 from hilcal.present.build_story import Chapter
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.diagnosis_document import suspect_json, to_json
+from hilcal.present.diagnosis import (
+    addition_lines,
+    curves,
+    diagnosis_report,
+    fell,
+    key,
+    revisions_table,
+    rose,
+    verdict_line,
+)
+from hilcal.present.diagnosis_json import suspect_json, to_json
+from hilcal.present.discovery import laws_json, refined_laws
+from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
-from hilcal.present.text_discover import laws_json, refined_laws
-from hilcal.present.text_prior import prior_lines
-from hilcal.present.text_registration import fitted_lines, other_arm_line
-from hilcal.present.text_unknown import curves
-from hilcal.present.verdict_words import message
+from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
+from hilcal.present.verdict import message
 from hilcal.refinement import Step as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.purpose import refuse_fitting
@@ -100,7 +107,7 @@ def diagnose(
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
         finish(found, say)
-    t.show(text_refine.diagnosis_report(d))
+    t.show(diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
 
 
@@ -171,15 +178,11 @@ def _change(
             Row(number, before, verdict, stored.added, stored.removed),
             Row(c.number, c.fit, d.verdict, c.added, c.removed),
         ]
-        t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
+        t.show([revisions_table([r.shown for r in rows]), key()])
         named = write_effect(effect, options or {})
-        t.show(
-            text_refine.fell(before, c.fit, named)
-            if adds
-            else text_refine.rose(before, c.fit, effect)
-        )
-        t.show([] if c.expected is None else text_refine.addition_lines(c.expected))
-        t.show(["", text_refine.verdict_line(d)])
+        t.show(fell(before, c.fit, named) if adds else rose(before, c.fit, effect))
+        t.show([] if c.expected is None else addition_lines(c.expected))
+        t.show(["", verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(say, c.number)
@@ -285,13 +288,13 @@ def refine(
                 Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
                 for number, s in zip(numbered, found.steps, strict=True)
             ]
-        t.show(text_refine.revisions_table([r.shown for r in rows]))
-        t.show(text_refine.key())
+        t.show(revisions_table([r.shown for r in rows]))
+        t.show(key())
         t.show(options_line(rows[-1].fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
-        t.show(text.set_aside(found.fit, details))
-        t.show(text_refine.verdict_line(found.diagnosis))
+        t.show(set_aside(found.fit, details))
+        t.show(verdict_line(found.diagnosis))
         if numbered[-1] <= before:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(found.fit)][: None if details else 1])
@@ -311,7 +314,7 @@ def refine(
             t.show(refined_laws(laws))
         last = found.diagnosis
         if last.verdict != "adequate" and not last.dependences:
-            t.show(text.follows(last.misfit_breakdown))
+            t.show(follows(last.misfit_breakdown))
         t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
         steps = zip(rows, found.steps, strict=True)
         chapters = [chapter_of(r.number, s) for r, s in steps]

@@ -20,8 +20,8 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError
 from hilcal.identification.full_covariance import campaign_readings
 from hilcal.measuring.dry_run import dry_run
+from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.progress import Say, counting, working
-from hilcal.present.text_demo import NEWCOMER
 from hilcal.procedure.procedure import Measure
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import Readings

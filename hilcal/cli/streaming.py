@@ -12,8 +12,8 @@ from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.carried import CarriedPrior
+from hilcal.present.fit import stream_report
 from hilcal.present.progress import counting
-from hilcal.present.text_stream import stream_report
 from hilcal.readings.covariance import tracker_noise
 from hilcal.stream.document import to_json
 from hilcal.stream.fit import fit_stream

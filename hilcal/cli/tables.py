@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from rich.padding import Padding
 
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, argument, option
@@ -17,10 +16,10 @@ from hilcal.identification.gate import examine
 from hilcal.identification.other_arm import other_arm
 from hilcal.identification.registration import Registration, register
 from hilcal.import_campaign import import_campaign
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
+from hilcal.present.document import Words, heading
+from hilcal.present.fit import target_words
 from hilcal.present.progress import working
-from hilcal.present.text_registration import other_arm_line, registration_lines
+from hilcal.present.registration import covariance_words, other_arm_line, registration_lines
 from hilcal.readings.readings import Readings
 
 
@@ -67,7 +66,7 @@ def import_(
     notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
-    t.show(text.heading(f"{len(readings)} readings of {poses} poses"))
+    t.show(heading(f"{len(readings)} readings of {poses} poses"))
     t.show(
         f"  robot {settings.robot.model}; each reading is a "
         f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
@@ -75,20 +74,20 @@ def import_(
     )
     targets = _targets(cell, readings)
     if targets:
-        t.show("  targets: " + "; ".join(text.target_words(**x) for x in targets))
-    t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
+        t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
+    t.show(Words(note, indent=2) for note in notes)
     registered = _registered(cell, readings)
     wrong = None if registered is None else examine(registered, readings)
     if registered is not None and not (wrong is not None and wrong.refused):
-        t.show(Padding(line, (0, 0, 0, 2)) for line in registration_lines(registered))
+        t.show(Words(line, indent=2) for line in registration_lines(registered))
     refused = wrong is not None and wrong.refused
     other = None if registered is None or refused else other_arm(registered, readings)
     if other is not None:
-        t.show(Padding(f"Note: {other_arm_line(other)}", (0, 0, 0, 2)))
+        t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
     if wrong is not None:
         said = description_words.words(wrong, cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
-        t.show(Padding(f"{begin}: {said}.", (0, 0, 0, 2)))
+        t.show(Words(f"{begin}: {said}.", indent=2))
     t.document(
         {
             "campaign": str(output),

@@ -8,8 +8,17 @@ from hilcal.cli.files import called, record_of, titles
 from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
 from hilcal.cli.terminal import terminal
 from hilcal.errors import CannotAnswerError, HilcalError, LimitError
-from hilcal.present import text, text_validate
+from hilcal.present.document import heading
+from hilcal.present.fit import model_name
 from hilcal.present.progress import working
+from hilcal.present.validation import (
+    extrapolation_json,
+    opening,
+    shares_json,
+    shares_report,
+    validation_failure,
+    validation_report,
+)
 from hilcal.tables.units import parse_length
 from hilcal.validation import validate as validate_campaign
 
@@ -44,19 +53,19 @@ def validate(
     ):
         record = record_of(t, o, say, revision)
         done = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
-        name = text.model_name(titles(done.model, o.fitted_readings(record)))
+        name = model_name(titles(done.model, o.fitted_readings(record)))
     judged, found, beyond, shares = done.judged, done.prediction, done.beyond, done.shares
-    t.show(text.heading(f"{called(judged.number)}: {name}"))
-    t.show(text_validate.opening(judged, found))
-    t.show(text_validate.validation_report(judged, found, beyond))
-    t.show(text_validate.shares_report(shares))
+    t.show(heading(f"{called(judged.number)}: {name}"))
+    t.show(opening(judged, found))
+    t.show(validation_report(judged, found, beyond))
+    t.show(shares_report(shares))
     if found.error.rms_sigma > OVER and not register:
         t.show(
             "Was the tracker set up anew for these readings? Then --register fits its place first."
         )
     failed: HilcalError | None = None
     if shares.passed is False:
-        words = text_validate.failure(shares, judged)
+        words = validation_failure(shares, judged)
         failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
     t.document(
         {
@@ -71,8 +80,8 @@ def validate(
             "error": found.error.to_json(),
             "variance_factor": found.variance_factor,
             "noise_floor_m": found.noise_floor,
-            **text_validate.to_json(beyond),
-            **text_validate.shares_json(shares),
+            **extrapolation_json(beyond),
+            **shares_json(shares),
         },
         failed,
     )

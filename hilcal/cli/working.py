@@ -11,8 +11,8 @@ from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
-from hilcal.present.covariance_words import covariance_words
 from hilcal.present.progress import working
+from hilcal.present.registration import covariance_words
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.schema import is_campaign
 from hilcal.workbench.guard import UNUSED_S

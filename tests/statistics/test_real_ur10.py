@@ -13,7 +13,7 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.validation import validate
 from hilcal.library import read_table
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement, refine
 from hilcal.robot.catalogue import configs_dir

@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from hilcal.cli.configuring import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
-from hilcal.present.text_config import page
+from hilcal.present.preparing import reference_page
 from hilcal.toml import Section, section_of
 from tests.support.cli_cases import ok, refused
 from tests.support.paths import ROOT
@@ -93,7 +93,7 @@ def test_no_key_is_invented() -> None:
 
 def test_the_page_of_the_reference_is_what_the_program_writes() -> None:
     path = ROOT / "docs" / "reference" / "cell-configuration.md"
-    assert path.read_text(encoding="utf-8") == page(list(TABLES.values())), (
+    assert path.read_text(encoding="utf-8") == reference_page(list(TABLES.values())), (
         "write it anew: python -c 'from hilcal.cli.configuring import write_page; write_page()'"
     )
 

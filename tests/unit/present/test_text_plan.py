@@ -17,7 +17,7 @@ from hilcal.design.summary import (
     PredictedParameter,
 )
 from hilcal.design.timing import Duration
-from hilcal.present.text_plan import certified, enough, order_remark, plan_report
+from hilcal.present.plan import certified, enough, order_remark, plan_report
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
