@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.asking import somebody_there
-from hilcal.cli.calibrating_steps import Operator
+from hilcal.cli.fits import PriorOptions
 from hilcal.cli.options import (
     POSES,
     CellFile,
@@ -21,10 +20,12 @@ from hilcal.cli.options import (
     catalogue_with,
     option,
 )
-from hilcal.cli.planning import read_cell
-from hilcal.cli.prior import PriorOptions
-from hilcal.cli.terminal import Terminal, terminal
-from hilcal.cli.viewing import followed
+from hilcal.cli.planning import answers_of, read_cell, refuse_unready
+from hilcal.cli.refining import chapter_of, rows_of
+from hilcal.cli.rehearsing import lasting_cell, to_the_end
+from hilcal.cli.running import measure
+from hilcal.cli.showing import followed
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
 from hilcal.effects.catalogue import Catalogue
@@ -38,11 +39,16 @@ from hilcal.errors import (
 )
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
-from hilcal.present import text_calibrate
+from hilcal.present import text_calibrate, text_refine
+from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.progress import working
+from hilcal.present.text_plan import plan_facts
+from hilcal.present.text_prior import prior_lines
+from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
 from hilcal.readings.whitening import Mode
+from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.new_campaign import may_write
 from hilcal.store.procedure_log import ProcedureLog
@@ -306,3 +312,122 @@ def _document(p: Procedure) -> dict[str, object]:
         "decisions": decisions,
         "validation": {k: v for k, v in validated.items() if k not in ("kind", "utc")},
     }
+
+
+class Operator:
+    """Does one step after the other, and asks before the arm moves."""
+
+    def __init__(
+        self,
+        t: Terminal,
+        p: Procedure,
+        stack: ExitStack,
+        rehearse: bool,
+        yes: bool,
+        viewer: LiveViewer | None = None,
+    ) -> None:
+        """Nothing is connected yet."""
+        self._viewer = viewer
+        self._t, self._p, self._stack = t, p, stack
+        self._rehearse, self._yes = rehearse, yes
+        self._clock = p.config.simulation.clock if rehearse else 1.0
+        self._simulated: CellConfig | None = None
+        self._ready = False
+
+    def to_the_end(self) -> None:
+        """Do all steps that are left but the comparison.
+
+        Raises:
+            StoppedError: somebody does not want the arm to move.
+        """
+        while (step := self._p.next()).kind not in ("done", "compare"):
+            self._t.show(text_calibrate.heading(step, self._clock))
+            if step.moves:
+                self._moving(step)
+            else:
+                self._computing(step)
+
+    def _moving(self, step: Step) -> None:
+        """Ask, and measure what is missing of a plan."""
+        self._check()
+        if not self._yes and somebody_there(self._t):
+            what = "The simulated arm will move." if self._rehearse else "The arm will move."
+            if not agreed(self._t, f"Measure now? {what}"):
+                raise StoppedError("not measured, nothing has moved")
+        config = self._config()
+
+        def work(campaign: CampaignFile, epoch: float | None) -> None:
+            measure(self._t, config, self._p.cell, campaign, epoch=epoch, viewer=self._viewer)
+
+        def whole() -> None:
+            self._p.measure(step, work)
+
+        if self._rehearse:
+            to_the_end(self._t, whole, lambda: _count(step.path))
+        else:
+            whole()
+
+    def _config(self) -> CellConfig:
+        """Return the configuration that leads to the devices; starts simulated ones."""
+        if not self._rehearse:
+            return self._p.config
+        if self._simulated is None:
+            with working(self._t.progress) as say:
+                say("starting the simulated devices")
+                self._simulated = self._stack.enter_context(lasting_cell(self._p))
+        return self._simulated
+
+    def _check(self) -> None:
+        """Ask every device once whether it is ready; nothing moves."""
+        if self._ready or self._rehearse:
+            return
+        answers = answers_of(self._t, self._p.config)
+        for a in answers:
+            name = "no answer" if a.report is None else a.report.name
+            self._t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
+        refuse_unready(answers)
+        self._ready = True
+
+    def _computing(self, step: Step) -> None:
+        """Do a step in which nothing moves, and say what came of it."""
+        p, t = self._p, self._t
+        if step.kind == "plan":
+            with working(t.progress) as say:
+                made = p.plan(say)
+            t.show(plan_facts(made.summary))
+            p.begin(made.plan, p.config)
+            return
+        viewer = self._viewer
+        with working(t.progress) as say:
+            if step.kind == "refine" and viewer is not None:
+                found: object = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
+            else:
+                found = p.compute(step, say)
+        self._say(step.kind, found)
+
+    def _say(self, kind: str, found: Any) -> None:
+        t = self._t
+        if kind == "refine":
+            _say_refined(t, self._p, found)
+        elif kind == "decide":
+            decided: Decision = found
+            of = self._p.settings
+            report = text_calibrate.decision_report(decided, of.goal_m, of.readings, self._clock)
+            t.show(report)
+        elif kind == "validate":
+            t.show(text_calibrate.validation_lines(found))
+
+
+def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
+    """Show the revisions and the verdict."""
+    with CampaignFile.open(p.run, read_only=True) as campaign:
+        refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
+    rows = rows_of(refined["revisions"], found.steps)
+    t.show(text_refine.revisions_table([r.shown for r in rows]))
+    t.show([text_refine.key(), text_refine.verdict_line(found.diagnosis), ""])
+    t.show(prior_lines(found.fit))
+
+
+def _count(path: Path) -> int:
+    with CampaignFile.open(path, read_only=True) as campaign:
+        return campaign.n_readings

@@ -1,22 +1,24 @@
-"""`compare`: model against measurement, of one campaign or of a later one of the same arm."""
+"""`compare` and `validate`: the model against what was measured, fitted and never fitted."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.files import called, finish, fit_of, titles
+from hilcal.cli.fits import called, finish, fit_of, record_of, titles
 from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
-from hilcal.present import text, text_change
+from hilcal.present import text, text_change, text_validate
 from hilcal.present.progress import working
+from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
+from hilcal.validation import validate as validate_campaign
 
 
 def compare(
@@ -98,4 +100,69 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
             ],
             "worst": [asdict(w) for w in worst],
         }
+    )
+
+
+OVER = 5.0
+"""Errors in units of the noise from which another place of the tracker is suspected; a guess."""
+
+
+def validate(
+    run: Run,
+    other: Annotated[Path, argument("OTHER.hilcal", "A campaign that was never fitted.")],
+    register: Annotated[
+        bool, option("--register", "The tracker was set up anew: fit its place first.")
+    ] = False,
+    limit: Annotated[
+        str | None,
+        option(
+            "--limit LENGTH",
+            'The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it is not kept.',
+        ),
+    ] = None,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Predict readings of another campaign with the model."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(other, read_only=True) as unseen,
+        working(t.progress) as say,
+    ):
+        record = record_of(t, o, say, revision)
+        done = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
+        name = text.model_name(titles(done.model, o.fitted_readings(record)))
+    judged, found, beyond, shares = done.judged, done.prediction, done.beyond, done.shares
+    t.show(text.heading(f"{called(judged.number)}: {name}"))
+    t.show(text_validate.opening(judged, found))
+    t.show(text_validate.validation_report(judged, found, beyond))
+    t.show(text_validate.shares_report(shares))
+    if found.error.rms_sigma > OVER and not register:
+        t.show(
+            "Was the tracker set up anew for these readings? Then --register fits its place first."
+        )
+    failed: HilcalError | None = None
+    if shares.passed is False:
+        words = text_validate.failure(shares, judged)
+        failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
+    t.document(
+        {
+            "revision": judged.number,
+            "model": list(done.model.named),
+            "readings": judged.mode,
+            "registered": register,
+            "n_readings": judged.readings,
+            "n_fitted": judged.fitted,
+            "never_fitted": judged.unseen,
+            "n_measurements": len(found.raw),
+            "error": found.error.to_json(),
+            "variance_factor": found.variance_factor,
+            "noise_floor_m": found.noise_floor,
+            **text_validate.to_json(beyond),
+            **text_validate.shares_json(shares),
+        },
+        failed,
     )

@@ -21,7 +21,15 @@ from hilcal.calibration.urscript import (
     with_joints,
 )
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import EffectsFrom, Json, Revision, argument, catalogue_with, option
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Revision,
+    argument,
+    catalogue_with,
+    check_new,
+    option,
+)
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
@@ -282,8 +290,7 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools
 def _check_output(path: Path, force: bool) -> None:
     if path.suffix not in WRITTEN:
         raise InputError(f"{path}: unknown kind of file; valid: {', '.join(WRITTEN)}")
-    if path.exists() and not force:
-        raise InputError(f"{path}: the file exists; choose another name or give --force")
+    check_new(path, force)
 
 
 def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> None:

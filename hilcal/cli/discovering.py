@@ -5,8 +5,16 @@ from typing import Annotated
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.files import check_options, fit_of, wanted_effects
-from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, option
+from hilcal.cli.fits import check_options, fit_of, wanted_effects
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Revision,
+    Run,
+    catalogue_with,
+    check_folder,
+    option,
+)
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.discovery import discover as search
@@ -58,8 +66,7 @@ def discover(
         )
     if wanted is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"-o {output}: no folder {output.absolute().parent}; make it first")
+    check_folder(output, f"-o {output}")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if wanted is None:

@@ -8,13 +8,12 @@ from typing import Annotated
 
 import numpy as np
 import tomli_w
-import typer
 
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected, corrected
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, option
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, check_new, option
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
@@ -31,53 +30,48 @@ MANY = 10.0
 """m; a distance along a joint's axis beyond which it is said that it cancels with others."""
 
 
-def _file(metavar: str, words: str) -> typer.models.OptionInfo:
-    found: typer.models.OptionInfo = typer.Option(metavar=metavar, help=words)
-    return found
-
-
 def export(
     run: Run,
     readings: Annotated[
-        Path | None, _file("F.csv|F.parquet", "The readings as stored, to be imported again.")
+        Path | None, option("F.csv|F.parquet", "The readings as stored, to be imported again.")
     ] = None,
     table: Annotated[
         Path | None,
-        _file("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
+        option("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
     ] = None,
     cell: Annotated[
-        Path | None, _file("CELL.toml", "The cell's configuration, for --readings.")
+        Path | None, option("CELL.toml", "The cell's configuration, for --readings.")
     ] = None,
     residuals: Annotated[
         Path | None,
-        _file("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
+        option("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
     ] = None,
     revisions: Annotated[
-        Path | None, _file("F.csv|F.parquet", "All revisions: model, errors, verdict.")
+        Path | None, option("F.csv|F.parquet", "All revisions: model, errors, verdict.")
     ] = None,
     parameters: Annotated[
         Path | None,
-        _file("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
+        option("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
     ] = None,
     calibration: Annotated[
-        Path | None, _file("F.json", "The identified arm, ready for compensate on any machine.")
+        Path | None, option("F.json", "The identified arm, ready for compensate on any machine.")
     ] = None,
-    urdf: Annotated[Path | None, _file("F.urdf", "The arm with its corrected geometry.")] = None,
-    dh: Annotated[Path | None, _file("F.toml|F.csv", "The same as a DH table.")] = None,
+    urdf: Annotated[Path | None, option("F.urdf", "The arm with its corrected geometry.")] = None,
+    dh: Annotated[Path | None, option("F.toml|F.csv", "The same as a DH table.")] = None,
     modified: Annotated[
         bool, option("--dh-modified", "Rows of --dh as Craig writes them.")
     ] = False,
     ur_kinematics: Annotated[
-        Path | None, _file("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
+        Path | None, option("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
     ] = None,
     ur_hash: Annotated[
         str | None,
-        _file(
+        option(
             "calib_N", "The connected arm's hash, so that the driver takes the file for its own."
         ),
     ] = None,
     frames: Annotated[
-        Path | None, _file("F.json", "Tool and base as fitted, and as a controller takes them.")
+        Path | None, option("F.json", "Tool and base as fitted, and as a controller takes them.")
     ] = None,
     revision: Revision = None,
     force: Annotated[bool, option("--force", "Replace existing files.")] = False,
@@ -160,8 +154,7 @@ def _check(
     if twice:
         raise InputError(f"{twice[0]}: two things cannot be written to one file")
     for path in wanted:
-        if path.exists() and not force:
-            raise InputError(f"{path}: the file exists; choose another name or give --force")
+        check_new(path, force)
 
 
 def _write_data(

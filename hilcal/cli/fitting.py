@@ -1,14 +1,20 @@
-"""`identify`: fit a model to the readings."""
+"""`identify` and `bootstrap`: fit a model to the readings, and draw them again."""
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 from hilcal import numbers
+from hilcal.calibration.streamed import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.files import (
+from hilcal.cell import Cell
+from hilcal.cli.fits import (
+    PriorOptions,
     check_options,
     chosen,
     finish,
+    fit_of,
     mode_of_option,
     scalings,
     titles,
@@ -22,32 +28,45 @@ from hilcal.cli.options import (
     Prior,
     PriorOf,
     Readings,
+    Revision,
     Run,
     Scheduler,
     Workers,
     catalogue_with,
+    check_workers,
     option,
 )
-from hilcal.cli.prior import PriorOptions
-from hilcal.cli.streaming import identify_stream
-from hilcal.cli.terminal import terminal
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.bootstrap import DRAWS, check_draws
+from hilcal.identification.bootstrap import bootstrap as draw_again
+from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.other_arm import other_arm_of
 from hilcal.present import text
 from hilcal.present.covariance_words import covariance_words
-from hilcal.present.progress import working
+from hilcal.present.progress import counting, working
+from hilcal.present.text_bootstrap import bootstrap_report
+from hilcal.present.text_bootstrap import to_json as bootstrap_json
 from hilcal.present.text_prior import prior_lines
 from hilcal.present.text_registration import other_arm_line
 from hilcal.present.text_scalings import scalings_table
+from hilcal.present.text_stream import stream_report
+from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
+from hilcal.stream.document import to_json as stream_json
+from hilcal.stream.fit import fit_stream
 from hilcal.tables.files import is_parquet
+from hilcal.tables.parquet_stream import open_stream
 
 
 def identify(
@@ -94,9 +113,7 @@ def identify(
                 f"{run}: the readings of a stream are absolute, and their scaling is gc; leave out "
                 "--scaling, --readings and --fit-validation"
             )
-        if effects_from and (scheduler is not None or workers not in (None, 1)):
-            raise InputError("--effects-from: other processes do not have its effects; --workers 1")
-        count = 1 if effects_from else workers
+        count = check_workers(workers, scheduler, effects_from)
         identify_stream(t, run, cell, named, catalogue, known, out, count, scheduler)
         return
     if any(option is not None for option in (cell, out, workers, scheduler)):
@@ -158,3 +175,61 @@ def options_line(found: Fit) -> list[str]:
 def options_json(found: Fit) -> dict[str, dict[str, object]]:
     """Return all options of the effects, by name."""
     return {e.name: dict(e.options) for e in found.model.effects}
+
+
+def identify_stream(
+    t: Terminal,
+    path: Path,
+    cell_path: Path | None,
+    effects: Mapping[str, Options] | None,
+    catalogue: Catalogue,
+    prior: CarriedPrior | None,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Fit a model to a stream, print it, and write its calibration."""
+    if cell_path is None:
+        raise InputError(f"{path}: a table has no cell; give --cell CELL.toml as well")
+    cell = Cell.load(cell_path)
+    config = cell.configured()
+    stream = open_stream(path, cell.arm, tracker_noise(config.tracker), config.tracker.station_m)
+    with open_engine(workers, scheduler) as engine:
+        shown = partial(counting, t.progress)
+        found = fit_stream(stream, cell, engine, effects, catalogue, prior, shown)
+    t.show(stream_report(found))
+    document = stream_json(found)
+    if out is not None:
+        source = {"stream": path.name, "readings": found.readings}
+        calibration_of_stream(found, source).save(out)
+        t.show(f"\n{out}: the calibration, for compensate and hc.Calibration")
+        document["calibration"] = str(out)
+    t.document(document)
+
+
+def bootstrap(
+    run: Run,
+    revision: Revision = None,
+    draws: Annotated[int, option("--draws N", "Campaigns drawn.")] = DRAWS,
+    seed: Annotated[int, option("--seed", "Of the draws.")] = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    check_draws(draws, seed)
+    count = check_workers(workers, scheduler, effects_from)
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        open_engine(count, scheduler) as engine,
+    ):
+        with working(t.progress) as say:
+            number, fit = fit_of(t, o, say, revision)
+            say("computing standard uncertainties")
+            _ = fit.uncertainty
+        with counting(t.progress, "draws", draws) as advance:
+            found = draw_again(fit, engine, draws, seed, advance)
+    t.show(bootstrap_report(found))
+    t.document({"revision": number, "seed": seed, **bootstrap_json(found)})

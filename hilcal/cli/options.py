@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from hilcal.effects.catalogue import Catalogue, installed
+from hilcal.errors import InputError
 
 
 def option(spec: str, meaning: str) -> Any:
@@ -117,3 +118,35 @@ Scheduler = Annotated[
 def one_by_default(workers: int | None, scheduler: str | None) -> tuple[int | None, str | None]:
     """Return what `open_engine` takes: this process where neither of both was given."""
     return (1 if workers is None and scheduler is None else workers), scheduler
+
+
+def check_workers(
+    workers: int | None, scheduler: str | None, effects_from: list[Path] | None
+) -> int | None:
+    """Return the number of processes: this one alone with effects of a file.
+
+    Raises:
+        InputError: others are asked for, which do not have its effects.
+    """
+    if effects_from and (scheduler is not None or workers not in (None, 1)):
+        raise InputError("--effects-from: other processes do not have its effects; --workers 1")
+    return 1 if effects_from else workers
+
+
+def check_seed(seed: int) -> int:
+    """Return a seed; a negative one is refused."""
+    if seed < 0:
+        raise InputError(f"--seed {seed}; valid: a whole number, 0 or more")
+    return seed
+
+
+def check_new(path: Path, force: bool) -> None:
+    """Refuse to replace a file without --force."""
+    if path.exists() and not force:
+        raise InputError(f"{path}: the file exists; choose another name or give --force")
+
+
+def check_folder(path: Path, what: str) -> None:
+    """Refuse a file in a folder that is not there, before any work is done."""
+    if not path.absolute().parent.is_dir():
+        raise InputError(f"{what}: no folder {path.absolute().parent}; make it first")

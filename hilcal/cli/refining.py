@@ -9,7 +9,8 @@ from typing import Annotated
 from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.files import (
+from hilcal.cli.fits import (
+    PriorOptions,
     check_options,
     check_record,
     finish,
@@ -36,9 +37,8 @@ from hilcal.cli.options import (
     catalogue_with,
     option,
 )
-from hilcal.cli.prior import PriorOptions
+from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
-from hilcal.cli.viewing import followed
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
 from hilcal.discovery.proposal import LawSearch
@@ -84,6 +84,14 @@ class Row:
         """The same as `revisions_table` takes it."""
         scatter = self.fit.readings.arm_scatter is not None
         return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
+
+
+def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[Row]:
+    """Return the steps of a refinement as they are listed, by the numbers of their revisions."""
+    return [
+        Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        for number, s in zip(numbers, steps, strict=True)
+    ]
 
 
 def diagnose(
@@ -281,10 +289,7 @@ def refine(
             ]
             before = len(o.file.revisions())
             numbered = (*begun, *o.append_records(records, *begun))
-            rows: list[Row] = [
-                Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
-                for number, s in zip(numbered, found.steps, strict=True)
-            ]
+            rows = rows_of(numbered, found.steps)
         t.show(text_refine.revisions_table([r.shown for r in rows]))
         t.show(text_refine.key())
         t.show(options_line(rows[-1].fit))

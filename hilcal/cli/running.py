@@ -11,7 +11,6 @@ from types import FrameType
 from typing import Annotated
 
 from hilcal.cell import Cell
-from hilcal.cli.asking import agreed, somebody_there
 from hilcal.cli.options import (
     POSES,
     CellFile,
@@ -23,8 +22,8 @@ from hilcal.cli.options import (
     option,
 )
 from hilcal.cli.planning import answer_json, dry_checked, make_checked, read_cell, refuse_unready
-from hilcal.cli.terminal import Terminal, terminal
-from hilcal.cli.viewing import followed
+from hilcal.cli.showing import followed
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.goal_rule import GoalRule

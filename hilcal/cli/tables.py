@@ -1,4 +1,4 @@
-"""`import`: tables in."""
+"""`import`: tables in; with `--preview` a proposal how a table is to be read."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -8,20 +8,23 @@ import numpy as np
 from rich.padding import Padding
 
 from hilcal.cell import Cell
-from hilcal.cli.options import Json, argument, option
-from hilcal.cli.previewing import show_preview
-from hilcal.cli.terminal import terminal
+from hilcal.cli.options import Json, argument, check_new, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import description_words, frames_document
 from hilcal.identification.gate import examine
 from hilcal.identification.other_arm import other_arm
 from hilcal.identification.registration import Registration, register
+from hilcal.identification.table_preview import preview_table
 from hilcal.import_campaign import import_campaign
 from hilcal.present import text
 from hilcal.present.covariance_words import covariance_words
 from hilcal.present.progress import working
+from hilcal.present.text_import import preview
 from hilcal.present.text_registration import other_arm_line, registration_lines
 from hilcal.readings.readings import Readings
+from hilcal.tables.guessing.proposal import Proposal
+from hilcal.whole_file import replace_file
 
 
 def import_(
@@ -128,3 +131,54 @@ def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
         {"name": name, "n_readings": int(count[k]), "known": known[k]}
         for k, name in enumerate(readings.target_names)
     ]
+
+
+def show_preview(
+    t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
+    force: bool,
+) -> None:  # fmt: skip
+    """Print what a table seems to hold; write the mapping file where one is asked for.
+
+    Raises:
+        InputError: a file that cannot be read, or an output that exists.
+    """
+    if output is not None and output.suffix != ".toml":
+        raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
+    if output is not None:
+        check_new(output, force)
+    found = preview_table(table, None if config is None else Cell.load(config), second)
+    proposal, outcome = found.proposal, found.outcome
+    t.show(preview(proposal, found.rows, table.name))
+    if outcome:
+        t.show(text.heading("with this mapping:"))
+        t.show(Padding(words, (0, 0, 0, 2)) for words in outcome)
+    if output is not None:
+        if second is not None:
+            _relative_second(proposal, output)
+        replace_file(output, proposal.to_toml(table.name))
+        t.notice(f"{output}: the mapping; import with --format {output}")
+    else:
+        t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
+    t.document(
+        {
+            "mapping": proposal.sections,
+            "understood": [
+                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+                for u in proposal.understood
+            ],
+            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
+            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
+            "missing": proposal.lacking,
+            "outcome": outcome,
+            "written": None if output is None else str(output),
+        }
+    )
+
+
+def _relative_second(proposal: Proposal, output: Path) -> None:
+    """Write the second file's path relative to the mapping file."""
+    section = proposal.sections["second_file"]
+    section["path"] = str(Path(section["path"]).absolute())
+    here = output.absolute().parent
+    if Path(section["path"]).is_relative_to(here):
+        section["path"] = str(Path(section["path"]).relative_to(here))

@@ -10,7 +10,8 @@ from hilcal.errors import InputError
 Length = Literal["m", "mm", "um", "in"]
 Angle = Literal["rad", "mrad", "deg", "arcsec"]
 Temperature = Literal["degC", "degF", "K"]
-LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "in": 0.0254}
+METRIC = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6}
+LENGTHS = {**METRIC, "in": 0.0254}
 """Metres in a unit."""
 ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": 0.017453292519943295, "arcsec": 4.84813681109536e-6}
 """Radians in a unit."""
@@ -35,7 +36,7 @@ def parse_length(text: str, what: str) -> float:
     Raises:
         InputError: anything else.
     """
-    return _parse(text, what, LENGTHS, 'a length over 0 in m, mm, um, e.g. "0.1 mm"')
+    return _parse(text, what, METRIC, 'a length over 0 in m, mm, um, e.g. "0.1 mm"')
 
 
 def parse_duration(text: str, what: str) -> float:

@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.prior import fitted_with
+from hilcal.cli.fits import fitted_with
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import carried_prior

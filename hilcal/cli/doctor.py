@@ -1,4 +1,4 @@
-"""`hilcal doctor`: what an operator needs to know of this computer before calling for help."""
+"""`doctor`: what an operator needs to know of this computer before calling for help."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,10 +6,10 @@ from typing import Annotated
 
 import hilcal
 from drivers.ur_link.services import SERVICES
+from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, argument, option
-from hilcal.cli.planning import read_cell
 from hilcal.cli.terminal import terminal
-from hilcal.config import CellConfig
+from hilcal.config import CellConfig, load_config
 from hilcal.doctor.computer import computer
 from hilcal.doctor.finding import Finding
 from hilcal.doctor.network import reachable
@@ -56,7 +56,8 @@ def _cell(path: Path | None) -> tuple[CellConfig | None, list[Finding]]:
     if path is None:
         return None, []
     try:
-        config, _ = read_cell(path)
+        config = load_config(path)
+        cell_from_config(config, path.absolute().parent)  # its robot's file, too
     except InputError as error:
         mend = "mend the file; hilcal config explains every key"
         return None, [Finding("cell", str(path), "problem", str(error), mend)]

@@ -1,4 +1,4 @@
-"""`effects`: what a model can have, and a file to begin an effect of one's own with."""
+"""`effects`, `config`, `study`: the catalogue, every key of a cell, the program's mathematics."""
 
 import keyword
 import re
@@ -10,8 +10,21 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from hilcal.cli.options import EffectsFrom, Json, argument, catalogue_with, option
+from drivers.geocom import Options as GeoComOptions
+from drivers.ur_link.options import UrOptions
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    OneWorker,
+    Scheduler,
+    argument,
+    catalogue_with,
+    check_seed,
+    one_by_default,
+    option,
+)
 from hilcal.cli.terminal import terminal
+from hilcal.config import reference
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME
@@ -21,7 +34,9 @@ from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present import text, text_config
+from hilcal.present.progress import counting
+from hilcal.toml import Section
 from hilcal.whole_file import replace_file
 
 OPTIONS_NOTE = (
@@ -148,3 +163,55 @@ def template_of(name: str) -> str:
     content = Path(str(template.__file__)).read_text(encoding="utf-8")
     names = {"template": name, "Template": class_name}
     return re.sub(r"\b[Tt]emplate\b", lambda found: names[found[0]], content)
+
+
+DRIVERS_OWN: dict[str, type[Section]] = {
+    "robot.options": UrOptions,
+    "tracker.options": GeoComOptions,
+}
+"""Keys of the drivers that come with the program, by section."""
+
+
+def config(
+    section: Annotated[str | None, argument("SECTION", "One of them, e.g. tracker.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Explain the sections and keys of CELL.toml: unit, default, example."""
+    t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
+    if section is None:
+        t.show(text_config.overview(known))
+        t.document(text_config.to_json(known))
+        return
+    found = reference.table(section, known)
+    t.show(text_config.section(found))
+    t.document(text_config.to_json((found,)))
+
+
+def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
+    """Write the page of the reference."""
+    replace_file(path, text_config.page(reference.tables(DRIVERS_OWN)))
+
+
+def scaling(
+    runs: Annotated[int, option("--runs", "Monte-Carlo runs.")] = 2000,
+    seed: Annotated[int, option("--seed", "Of the random numbers.")] = 1,
+    workers: OneWorker = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Show what the scalings none, gu and gc do to the same data."""
+    from hilcal.engine.engine import open_engine
+    from hilcal.study.scaling import check, experiments, scaling_study
+    from hilcal.study.scaling_table import table
+
+    t = terminal(as_json)
+    check(runs)
+    what = f"experiments of {runs} campaigns, each with every scaling"
+    with (
+        open_engine(*one_by_default(workers, scheduler)) as engine,
+        counting(t.progress, what, experiments()) as advance,
+    ):
+        rng = np.random.default_rng(check_seed(seed))
+        study = scaling_study(rng, runs, engine=engine, advance=advance)
+    t.show(table(study))
+    t.document(study.to_json())

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hilcal.cell import cell_from_config
-from hilcal.cli.asking import agreed, somebody_there
-from hilcal.cli.options import Json, argument, option
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.options import Json, argument, check_folder, check_new, option
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
 from hilcal.config.template import cell_text
@@ -24,7 +23,7 @@ from hilcal.measuring.connect import driver
 from hilcal.names import quoted
 from hilcal.present import text
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
-from hilcal.tables.units import LENGTHS
+from hilcal.tables.units import METRIC
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 
@@ -33,7 +32,7 @@ SIMULATED = "simulated"
 CLOCK = 20.0
 """How much faster than real time a rehearsal goes, as in the demo's cell."""
 UNITS: dict[str, dict[str, float]] = {
-    "m": {**LENGTHS, "cm": 1e-2},
+    "m": {**METRIC, "cm": 1e-2},
     "m/m": {"m/m": 1.0, "mm/m": 1e-3, "um/m": 1e-6, "µm/m": 1e-6, "μm/m": 1e-6},
     "kg": {"kg": 1.0, "g": 1e-3},
     "N": {"N": 1.0, "kN": 1e3},
@@ -369,10 +368,8 @@ def init(
         if name in _OPTIONS and value is not None
     }
     there = somebody_there(t) and not as_json
-    if not cell.absolute().parent.is_dir():
-        raise InputError(f"{cell}: no folder {cell.absolute().parent}; make it first")
-    if cell.exists() and not force and not (there and agreed(t, f"{cell} exists. Replace it?")):
-        raise InputError(f"{cell}: the file exists; choose another name or give --force")
+    check_folder(cell, str(cell))
+    check_new(cell, force or (there and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
     draft = Draft(cell.absolute().parent)
     if there:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
