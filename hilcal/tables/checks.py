@@ -163,13 +163,9 @@ def check_wrenches(table: Table, wrench: Floats, load: Ints, names: list[str], a
     loaded = unloaded[:, None] & (wrench != 0)
     limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
     heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
-    for bad, why in (
-        (loaded, "the load is 'none', so the wrench must be 0"),
-        (heavy, f"beyond 20 times the payload of {arm.name}; expected N and N·m"),
-    ):
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), 6)
-            raise InputError(f"{table.at(i, WRENCH[j])}: {wrench[i, j]:g}: {why}")
+    beyond = f"beyond 20 times the payload of {arm.name}; expected N and N·m"
+    table.refuse(loaded, WRENCH, lambda v: f"{v:g}: the load is 'none', so the wrench must be 0")
+    table.refuse(heavy, WRENCH, lambda v: f"{v:g}: {beyond}")
 
 
 def check_names(table: Table) -> None:

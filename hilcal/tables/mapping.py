@@ -6,7 +6,7 @@ TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import AfterValidator, Field, Strict, model_validator
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
@@ -16,6 +16,21 @@ from hilcal.tables.units import SECONDS, Angle, Length, Temperature
 from hilcal.toml import NonNegative, Positive, Section, load_section, suggest
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge=1)]
+
+
+def _columns(*valid: int) -> AfterValidator:
+    """Refuse another number of columns than the valid ones."""
+    *others, last = map(str, valid)
+
+    def counted(given: tuple[Column, ...]) -> tuple[Column, ...]:
+        if len(given) not in valid:
+            words = f"{', '.join(others)} or {last}"
+            raise ValueError(f"columns: {len(given)} given; it must be {words}")
+        return given
+
+    return AfterValidator(counted)
+
+
 Row = Annotated[int, Strict(), Field(ge=1)]
 _UNLOADED = (
     "none|0|no|no load|unloaded|empty|-|ohne|leer|keine|unbelastet|sans|sans charge|vide|"
@@ -211,7 +226,7 @@ class JointTemperatures(Section):
 class Wrench(Section):
     """[wrench]: what the load exerts on the tool at the load point, base axes; empty is 0."""
 
-    columns: tuple[Column, ...] = Field(
+    columns: Annotated[tuple[Column, ...], _columns(3, 6)] = Field(
         description="three columns: fx, fy, fz; or six with mx, my, mz"
     )
     unit: Literal["N", "kN", "kgf", "lbf"] = Field("N", description='"N", "kN", "kgf" or "lbf"')
@@ -219,12 +234,6 @@ class Wrench(Section):
     of: Literal["load", "reaction"] = Field(
         "load", description='"load": exerted on the tool; "reaction": exerted by the tool'
     )
-
-    @model_validator(mode="after")
-    def _number(self) -> "Wrench":
-        if len(self.columns) not in (3, 6):
-            raise ValueError(f"columns: {len(self.columns)} given; it must be 3 or 6")
-        return self
 
 
 class HungMass(Section):
@@ -332,31 +341,19 @@ class Std(Section):
 class Correlation(Section):
     """[correlation]: coefficients beside [std]."""
 
-    columns: tuple[Column, ...] = Field(
+    columns: Annotated[tuple[Column, ...], _columns(3, 15)] = Field(
         description="three columns (xy, xz, yz), or the 15 of the upper triangle row by row"
     )
-
-    @model_validator(mode="after")
-    def _number(self) -> "Correlation":
-        if len(self.columns) not in (3, 15):
-            raise ValueError(f"columns: {len(self.columns)} given; it must be 3 or 15")
-        return self
 
 
 class CovarianceColumns(Section):
     """[covariance]: the matrix, its upper triangle or all of it, row by row."""
 
-    columns: tuple[Column, ...] = Field(
+    columns: Annotated[tuple[Column, ...], _columns(6, 9, 21, 36)] = Field(
         description="6 (upper triangle) or 9 columns of the position's covariance, or 21 or 36"
     )
     unit: Length = Field(description=_LENGTH + "; the covariance is in its square")
     angle_unit: Angle = Field("rad", description=_ANGLE)
-
-    @model_validator(mode="after")
-    def _number(self) -> "CovarianceColumns":
-        if len(self.columns) not in (6, 9, 21, 36):
-            raise ValueError(f"columns: {len(self.columns)} given; it must be 6, 9, 21 or 36")
-        return self
 
 
 class Mapping(Section):

@@ -14,14 +14,19 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
-from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
+from hilcal.readings.covariance import INSTRUMENT, ROUNDING, TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
 from hilcal.tables.files import is_plain, package
 from hilcal.tables.grid import Table
-from hilcal.tables.table import instrument_covariance, stated_covariance, states_of
+from hilcal.tables.table import (
+    check_covers,
+    instrument_covariance,
+    measured_of,
+    stated_covariance,
+)
 from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -79,13 +84,7 @@ class ReadingStream:
             for k, name in enumerate(self.columns)
         }
         table = Table(str(self.path), rows, {}, number)
-        states = states_of(table, self.arm)
-        value = table.matrix(columns.POSITION)
-        checks.check_positions(table, value, states.q, self.arm)
-        if columns.ROTATION[0] in number:
-            rotation = table.matrix(columns.ROTATION)
-            checks.check_rotations(table, rotation)
-            value = np.hstack([value, rotation])
+        states, value = measured_of(table, self.arm)
         count = len(rows)
         alone, none = np.arange(count), np.zeros(count, dtype=np.int64)
         checks.check_wrenches(table, states.wrench, none, ["as recorded"], self.arm)
@@ -183,11 +182,7 @@ def _words(error: Exception) -> str:
 def _covers(path: Path, group: int) -> str:
     """What the covariances cover, as the first row says it."""
     word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
-    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
-        raise InputError(
-            f"{path}: row 1, column '{columns.COVERS}': {word!r} is unknown; valid: {INSTRUMENT}, "
-            f"{WHOLE}, each with {ROUNDING}"
-        )
+    check_covers(word, f"{path}: row 1, column '{columns.COVERS}'")
     return word
 
 

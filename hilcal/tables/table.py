@@ -116,15 +116,10 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    states = replace(states_of(table, arm), target=target)
+    states, value = measured_of(table, arm)
+    states = replace(states, target=target)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
-    value = table.matrix(columns.POSITION)
-    checks.check_positions(table, value, states.q, arm)
-    if columns.ROTATION[0] in table.number:
-        rotation = table.matrix(columns.ROTATION)
-        checks.check_rotations(table, rotation)
-        value = np.hstack([value, rotation])
     stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
@@ -227,12 +222,7 @@ def _covers(table: Table) -> tuple[str, bool]:
     """
     given = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(given):
-        if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
-            raise InputError(
-                f"{table.at(k, columns.COVERS)}: {word!r} is unknown; valid: {INSTRUMENT} (the "
-                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it), each "
-                f"with {ROUNDING} where the rounding of the positions is in it"
-            )
+        check_covers(word, table.at(k, columns.COVERS))
         if word != given[0]:
             raise InputError(
                 f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
@@ -241,8 +231,36 @@ def _covers(table: Table) -> tuple[str, bool]:
     return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
 
 
-def states_of(table: Table, arm: Arm) -> States:
-    """Return the states of a table's rows; raises as `read_table` does."""
+def check_covers(word: str, where: str) -> None:
+    """Refuse another word than those for what covariances cover.
+
+    Raises:
+        InputError: lists the valid ones.
+    """
+    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
+        raise InputError(
+            f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
+            f"{WHOLE} (the arm's repeatability is in it), each with {ROUNDING} where the rounding "
+            "of the positions is in it"
+        )
+
+
+def measured_of(table: Table, arm: Arm) -> tuple[States, Floats]:
+    """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
+
+    Raises:
+        InputError: a value that cannot be right.
+    """
+    states, value = _states(table, arm), table.matrix(columns.POSITION)
+    checks.check_positions(table, value, states.q, arm)
+    if columns.ROTATION[0] in table.number:
+        rotation = table.matrix(columns.ROTATION)
+        checks.check_rotations(table, rotation)
+        value = np.hstack([value, rotation])
+    return states, value
+
+
+def _states(table: Table, arm: Arm) -> States:
     table = with_following(table, arm)
     number, n = table.number, arm.n
     q = table.matrix(columns.joint_columns(n))

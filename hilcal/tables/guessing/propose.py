@@ -253,14 +253,12 @@ def guess_names(g: Guesser) -> None:
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few(g, n))
 
 
-def _pick(
-    g: Guesser, what: str, known: set[str], fits: Callable[[str], bool], meaning: str = "name"
-) -> None:
+def _pick(g: Guesser, what: str, known: set[str], fits: Callable[[str], bool]) -> None:
     for c in list(g.free.values()):
         if c.has(known) and not c.axis and not c.has(words.STD) and _is_name(g, c.name):
             if not fits(c.name):
                 continue
-            g.take(what, [c.name], meaning, column=c.name)
+            g.take(what, [c.name], "name", column=c.name)
             return
 
 
