@@ -113,13 +113,13 @@ def write_report(
             raise InputError(
                 "a comparison of two campaigns takes no --validation, --limit or --appendix"
             )
-        from hilcal.present.html import change
+        from hilcal.present.html.other_pages import comparison_page, comparison_screen
         from hilcal.transfer.compare import compare
 
         found = compare(run, later, asked.revision, say=say)
         names = ((run.path.name, _sha256(run.path)), (later.path.name, _sha256(later.path)))
-        html = change.page(found, names, asked.operator, utc_now(), hilcal.__version__)
-        first, verdict = change.first_screen(found, run.path.name), None
+        html = comparison_page(found, names, asked.operator, utc_now(), hilcal.__version__)
+        first, verdict = comparison_screen(found, run.path.name), None
     else:
         from hilcal.present.html.first_screen import first_screen
         from hilcal.present.html.page import page
@@ -194,9 +194,9 @@ def write_fleet_report(found: Fleet, directory: Path, path: Path) -> None:
     Raises:
         InputError: it cannot be written.
     """
-    from hilcal.present.html.fleet import page
+    from hilcal.present.html.other_pages import fleet_page
 
-    replace_file(path, page(found, directory.resolve().name, utc_now(), hilcal.__version__))
+    replace_file(path, fleet_page(found, directory.resolve().name, utc_now(), hilcal.__version__))
 
 
 def _scalings(last: Fit, say: Say) -> dict[Scaling, Fit]:

@@ -10,12 +10,12 @@ import numpy as np
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
 from hilcal.numbers import length
-from hilcal.present import text
+from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import READINGS_B, REPAIRS, Case, StudiedArm, case, studied_arm
@@ -79,9 +79,9 @@ def change(
 
 
 def _tell(t: Terminal, figures: Sequence[Figure], cases: list[dict[str, object]]) -> None:
-    out = text.table("what", "measured", "required", left=(0, 1, 2))
+    out = table("what", "measured", "required", left=(0, 1, 2))
     for f in figures:
-        out.add_row(f.what, f.measured, f.required)
+        out.add(f.what, f.measured, f.required)
     t.show(out)
     t.document({"cases": cases})
 

@@ -19,8 +19,8 @@ import typer
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.poses import BAND, ToolPoses, band
 from hilcal.cell import Cell
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline

@@ -29,9 +29,9 @@ from rich.console import Console
 from drivers.simulated.rehearsal import as_told
 from hilcal.calibration.improvement import Improvement
 from hilcal.cell import cell_from_config
-from hilcal.cli.calibrating_steps import Operator
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.calibrating import Operator
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.config.loads import Load
 from hilcal.effects.catalogue import installed

@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
-from hilcal.present import text
+from hilcal.present.document import table
 from hilcal.present.progress import counting
 from studies.random_descriptions import Outcome, draw, judge
 from studies.records import Figure, Keep, keep
@@ -40,9 +40,9 @@ def descriptions(
             exact[error] += outcome.exact
         if not outcome.right or outcome.named is False:
             missed.append(seed)
-    out = text.table("error of description", "visible", "named", "of these the very one")
+    out = table("error of description", "visible", "named", "of these the very one")
     for kind in sorted(seen):
-        out.add_row(kind, str(seen[kind]), str(named[kind]), str(exact[kind]))
+        out.add(kind, str(seen[kind]), str(named[kind]), str(exact[kind]))
     t.show(out)
     whole, found = sum(seen.values()), sum(named.values())
     figures = [

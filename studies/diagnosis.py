@@ -19,7 +19,7 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_prediction import full_prediction
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import Refinement, refine

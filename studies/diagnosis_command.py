@@ -7,8 +7,8 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.errors import InputError

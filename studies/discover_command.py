@@ -10,11 +10,11 @@ from typing import Annotated
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, Terminal, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.engine.engine import open_engine
-from hilcal.present import text
+from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.catalogue import configs_dir
@@ -73,7 +73,7 @@ def discover(
     if asked:
         done += _run(config, asked, cases, t, (jobs, scheduler))
     outcomes = [o for o in done if not o.impossible]
-    table = text.table(
+    rows = table(
         "hidden", "arm", "site", "variables", "correlation", "fresh error", "law found", left=(0, 6)
     )
     for o in outcomes:
@@ -81,10 +81,10 @@ def discover(
             right = [("no", "yes")[x] for x in (o.site, o.variables)]
             error = f"{o.before:.2f} → {o.after:.2f}"
             found = o.formula or f"({o.reason})"
-            table.add_row(
+            rows.add(
                 o.truth or "nothing", o.asked.robot, *right, f"{o.correlation:.3f}", error, found
             )
-    t.show(table)
+    t.show(rows)
     figures = list(claims(outcomes))
     for f in figures:
         t.show(f"{f.what}: {f.measured}; required {f.required}")

@@ -9,8 +9,8 @@ import numpy as np
 import typer
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.write_effect import effect_class
@@ -20,8 +20,8 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.library import read_table
 from hilcal.numbers import length, percent
+from hilcal.present.discovery import coefficient
 from hilcal.present.progress import counting
-from hilcal.present.text_discover import coefficient
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from studies.records import Figure, Keep, keep

@@ -18,8 +18,8 @@ import typer
 from scipy.stats import chi2
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
-from hilcal.present import text
+from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.robot.catalogue import configs_dir
 from studies.gross_errors import Counted, Spoilt, count
@@ -55,14 +55,14 @@ def gross_errors(
     ):
         counted = engine.map(_counted, every, advance=advance)
     figures = []
-    out = text.table("wrong", "size", "campaigns", "readings", "found", "false", "verdicts")
+    out = table("wrong", "size", "campaigns", "readings", "found", "false", "verdicts")
     for k, (share, size) in enumerate(kinds):
         mine = counted[k * campaigns : (k + 1) * campaigns]
         figures += _figures(mine, share, size)
         found, wrong = sum(c.found for c in mine), sum(c.wrong for c in mine)
         readings, false = sum(c.readings for c in mine), sum(c.false for c in mine)
         row = (len(mine), readings, f"{found} of {wrong}", false, _verdicts(mine))
-        out.add_row(f"{100 * share:.0f} %", f"{1e3 * size:g} mm", *(str(x) for x in row))
+        out.add(f"{100 * share:.0f} %", f"{1e3 * size:g} mm", *(str(x) for x in row))
     t.show(out)
     t.document({"campaigns": [_row(c) for c in counted]})
     keep(keep_file, "Gross errors", figures)

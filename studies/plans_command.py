@@ -13,8 +13,8 @@ from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.nominal_model import nominal_tracker_place
 from hilcal.engine.engine import open_engine

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from hilcal.cell import Cell
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.library import read_table

@@ -5,7 +5,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from hilcal.cli.engine import OneJob, Scheduler, one_by_default
+from hilcal.cli.options import OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.present.progress import counting

@@ -9,8 +9,8 @@ import numpy as np
 import typer
 
 from hilcal.cli.demo import CELL
-from hilcal.cli.engine import Jobs, Scheduler
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Jobs, Json, Scheduler
+from hilcal.cli.terminal import terminal
 from hilcal.config import load_config
 from hilcal.engine.engine import open_engine
 from hilcal.present.progress import counting

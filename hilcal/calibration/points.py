@@ -42,11 +42,12 @@ from hilcal.tables.columns import (
     known_columns,
     temperature_columns,
 )
-from hilcal.tables.csvfile import CsvTable, Dialect, read_columns
-from hilcal.tables.grid import SEPARATORS
+from hilcal.tables.files import open_grid
+from hilcal.tables.grid import Table
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import import_mapped
+from hilcal.tables.mapping import FileFormat
 from hilcal.tables.mapping import Mapping as TableMapping
 from hilcal.types import Floats, Ints
 
@@ -108,14 +109,15 @@ def read_points(
     if mapping is not None:
         return _mapped(path, arm, loads, mapping)
     groups = _groups(arm.n)
+    chosen: list[Sequence[str]] = []
     header: list[str] = []
 
-    def choose(given: list[str]) -> tuple[Sequence[str], Sequence[str]]:
+    def check(given: Sequence[str]) -> None:
         header.extend(given)
-        return _checked(path, given, groups, arm)
+        chosen.extend(_checked(path, given, groups, arm))
 
     try:
-        table = read_columns(path, choose, _dialect(path))
+        table = Table.of(open_grid(path, _form(path), check), *chosen)
     except _OtherNamesError as error:
         mapping, taken = _guessed(path, arm, error)
         return replace(_mapped(path, arm, loads, mapping), taken=taken)
@@ -226,20 +228,17 @@ def _nearest(
     return np.asarray(q[int(np.argmin(far))])
 
 
-def _dialect(path: Path) -> Dialect | None:
-    """Return how a table is written where it is no plain CSV file."""
+def _form(path: Path) -> FileFormat:
+    """Return how a table is written: as plain CSV, or with the separator and mark that it has."""
     try:
         with path.open(encoding="utf-8", errors="replace") as stream:
             header = stream.readline(limits.LINE)
     except OSError:
-        return None  # said by who reads it
+        return FileFormat()  # said by who reads it
     if not any(mark in header for mark in (";", "\t", "|")):
-        return None
+        return FileFormat()
     how = sniff(path).how
-    separator = str(how.get("separator", ","))
-    if separator == "," and "decimal" not in how:
-        return None
-    return Dialect(SEPARATORS.get(separator, separator), str(how.get("decimal", ".")))
+    return FileFormat(**{key: how[key] for key in ("separator", "decimal") if key in how})
 
 
 def _guessed(path: Path, arm: Arm, unknown: InputError) -> tuple[TableMapping, str]:
@@ -308,7 +307,7 @@ def _groups(n: int) -> dict[str, tuple[str, ...]]:
 
 
 def _checked(
-    path: Path, header: list[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
+    path: Path, header: Sequence[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Check a header; returns its text and its number columns.
 
@@ -346,7 +345,7 @@ def _checked(
     return text, [name for name in header if name in known]
 
 
-def _load(table: CsvTable, row: int, loads: Mapping[str, Floats]) -> Floats:
+def _load(table: Table, row: int, loads: Mapping[str, Floats]) -> Floats:
     """(6,) wrench of a named load.
 
     Raises:

@@ -15,9 +15,16 @@ from typing import Annotated
 import typer
 
 from hilcal import __version__
-from hilcal.cli.commands import COMMANDS, Command, load
+from hilcal.cli.commands import (
+    COMMANDS,
+    EXIT_CODES,
+    EXIT_CODES_OF_RUN,
+    Command,
+    Group,
+    InOrderOfWork,
+    load,
+)
 from hilcal.cli.failing import Failures, Watched
-from hilcal.cli.help import EXIT_CODES, EXIT_CODES_OF_RUN, Group, InOrderOfWork
 from hilcal.errors import DeviceError, HilcalError, StoppedError
 from hilcal.store.command_line import typed
 

@@ -7,18 +7,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.asking import somebody_there
-from hilcal.cli.calibrating_steps import Operator
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.plan_output import POSES
-from hilcal.cli.planning import CellFile, read_cell
-from hilcal.cli.prior import Prior, PriorOptions
-from hilcal.cli.terminal import Json, Terminal, terminal
-from hilcal.cli.viewing import View, followed
+from hilcal.cli.fits import PriorOptions
+from hilcal.cli.options import (
+    POSES,
+    CellFile,
+    EffectsFrom,
+    Json,
+    Prior,
+    View,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.planning import answers_of, read_cell, refuse_unready
+from hilcal.cli.refining import chapter_of, rows_of
+from hilcal.cli.rehearsing import lasting_cell, to_the_end
+from hilcal.cli.running import measure
+from hilcal.cli.showing import followed
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
 from hilcal.effects.catalogue import Catalogue
@@ -32,16 +39,29 @@ from hilcal.errors import (
 )
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
-from hilcal.present import text_calibrate
+from hilcal.present.calibration import (
+    decision_report,
+    improvement_report,
+    limit_failure,
+    standing,
+    step_heading,
+    validation_lines,
+)
+from hilcal.present.diagnosis import key, revisions_table, verdict_line
+from hilcal.present.fit import prior_lines
+from hilcal.present.live_viewer import LiveViewer
+from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
+from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
 from hilcal.readings.whitening import Mode
+from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.new_campaign import may_write
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
-from hilcal.tables.quantities import parse_duration, parse_length
+from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
@@ -55,58 +75,51 @@ def calibrate(
     cell: CellFile,
     output: Annotated[
         Path,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RUN.hilcal",
-            help="The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
+        option(
+            "-o --output RUN.hilcal",
+            "The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
         ),
     ],
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what RUN.hilcal holds, after any stop.")
+        bool, option("--resume", "Go on with what RUN.hilcal holds, after any stop.")
     ] = False,
     goal: Annotated[
         str | None,
-        typer.Option(
-            "--goal",
-            metavar="LENGTH",
-            help='The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: '
-            "it is measured on until 95 % of points are predicted to be within it after "
+        option(
+            "--goal LENGTH",
+            'The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: it '
+            "is measured on until 95 % of points are predicted to be within it after "
             "compensation, as far as that can be had.",
         ),
     ] = None,
     limit: Annotated[
         str | None,
-        typer.Option(
-            "--limit",
-            metavar="LENGTH",
-            help="The largest error allowed at the corrected targets, as measured; exit 5 where it "
+        option(
+            "--limit LENGTH",
+            "The largest error allowed at the corrected targets, as measured; exit 5 where it "
             "is not kept.",
         ),
     ] = None,
     max_time: Annotated[
         str | None,
-        typer.Option(
-            "--max-time",
-            metavar="TIME",
-            help=f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
+        option(
+            "--max-time TIME",
+            f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
         ),
     ] = None,
     poses: Annotated[
-        int | None, typer.Option("--poses", help=f"Size of the plan, {POSES} unless given.")
+        int | None, option("--poses", f"Size of the plan, {POSES} unless given.")
     ] = None,
     validation: Annotated[
         int | None,
-        typer.Option(
-            "--validation", help=f"Poses of the validation campaign, {VALIDATION} unless given."
-        ),
+        option("--validation", f"Poses of the validation campaign, {VALIDATION} unless given."),
     ] = None,
     prior: Prior = None,
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="In one simulated cell, from the first to the last.")
+        bool, option("--rehearse", "In one simulated cell, from the first to the last.")
     ] = False,
     yes: Annotated[
-        bool, typer.Option("--yes", "-y", help="Do not ask before the arm moves; for scripts.")
+        bool, option("--yes -y", "Do not ask before the arm moves; for scripts.")
     ] = False,
     view: View = False,
     effects_from: EffectsFrom = None,
@@ -147,8 +160,8 @@ def calibrate(
         with working(t.progress) as say:
             found = p.compare(say)
     limit_m = p.settings.limit_m
-    t.show(text_calibrate.heading(Step("compare", output)))
-    t.show(text_calibrate.improvement_report(found, limit_m))
+    t.show(step_heading(Step("compare", output)))
+    t.show(improvement_report(found, limit_m))
     files = p.files
     t.show(
         f"\nThe calibration is in {output}, its test in {files.validation.name} and "
@@ -159,7 +172,7 @@ def calibrate(
     t.command(shlex.join(["hilcal", "report", str(output), "--operator", "NAME"]))
     failed: HilcalError | None = None
     if limit_m is not None and found.over(limit_m):
-        words = text_calibrate.failure(found, limit_m)
+        words = limit_failure(found, limit_m)
         undecided = limit_m < found.everything.noise_m
         failed = CannotAnswerError(words) if undecided else LimitError(words)
     t.document({**_document(p), "improvement": found.to_dict(), "limit_m": limit_m}, failed)
@@ -264,14 +277,13 @@ def _procedure(
         raise InputError(f"{output}: its calibration is {what}")
     if not resume:
         raise InputError(
-            f"{output}: a calibration is there already, {text_calibrate.standing(p.next())}; go on "
-            f"with: {told.on}"
+            f"{output}: a calibration is there already, {standing(p.next())}; go on with: {told.on}"
         )
     _refuse_goal(p.settings.readings, asked, path)
     p = replace(p, settings=replace(p.settings, **asked))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
-    told.t.notice(f"{output}: a calibration, {text_calibrate.standing(p.next())}")
+    told.t.notice(f"{output}: a calibration, {standing(p.next())}")
     return p
 
 
@@ -307,3 +319,122 @@ def _document(p: Procedure) -> dict[str, object]:
         "decisions": decisions,
         "validation": {k: v for k, v in validated.items() if k not in ("kind", "utc")},
     }
+
+
+class Operator:
+    """Does one step after the other, and asks before the arm moves."""
+
+    def __init__(
+        self,
+        t: Terminal,
+        p: Procedure,
+        stack: ExitStack,
+        rehearse: bool,
+        yes: bool,
+        viewer: LiveViewer | None = None,
+    ) -> None:
+        """Nothing is connected yet."""
+        self._viewer = viewer
+        self._t, self._p, self._stack = t, p, stack
+        self._rehearse, self._yes = rehearse, yes
+        self._clock = p.config.simulation.clock if rehearse else 1.0
+        self._simulated: CellConfig | None = None
+        self._ready = False
+
+    def to_the_end(self) -> None:
+        """Do all steps that are left but the comparison.
+
+        Raises:
+            StoppedError: somebody does not want the arm to move.
+        """
+        while (step := self._p.next()).kind not in ("done", "compare"):
+            self._t.show(step_heading(step, self._clock))
+            if step.moves:
+                self._moving(step)
+            else:
+                self._computing(step)
+
+    def _moving(self, step: Step) -> None:
+        """Ask, and measure what is missing of a plan."""
+        self._check()
+        if not self._yes and somebody_there(self._t):
+            what = "The simulated arm will move." if self._rehearse else "The arm will move."
+            if not agreed(self._t, f"Measure now? {what}"):
+                raise StoppedError("not measured, nothing has moved")
+        config = self._config()
+
+        def work(campaign: CampaignFile, epoch: float | None) -> None:
+            measure(self._t, config, self._p.cell, campaign, epoch=epoch, viewer=self._viewer)
+
+        def whole() -> None:
+            self._p.measure(step, work)
+
+        if self._rehearse:
+            to_the_end(self._t, whole, lambda: _count(step.path))
+        else:
+            whole()
+
+    def _config(self) -> CellConfig:
+        """Return the configuration that leads to the devices; starts simulated ones."""
+        if not self._rehearse:
+            return self._p.config
+        if self._simulated is None:
+            with working(self._t.progress) as say:
+                say("starting the simulated devices")
+                self._simulated = self._stack.enter_context(lasting_cell(self._p))
+        return self._simulated
+
+    def _check(self) -> None:
+        """Ask every device once whether it is ready; nothing moves."""
+        if self._ready or self._rehearse:
+            return
+        answers = answers_of(self._t, self._p.config)
+        for a in answers:
+            name = "no answer" if a.report is None else a.report.name
+            self._t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
+        refuse_unready(answers)
+        self._ready = True
+
+    def _computing(self, step: Step) -> None:
+        """Do a step in which nothing moves, and say what came of it."""
+        p, t = self._p, self._t
+        if step.kind == "plan":
+            with working(t.progress) as say:
+                made = p.plan(say)
+            t.show(plan_facts(made.summary))
+            p.begin(made.plan, p.config)
+            return
+        viewer = self._viewer
+        with working(t.progress) as say:
+            if step.kind == "refine" and viewer is not None:
+                found: object = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
+            else:
+                found = p.compute(step, say)
+        self._say(step.kind, found)
+
+    def _say(self, kind: str, found: Any) -> None:
+        t = self._t
+        if kind == "refine":
+            _say_refined(t, self._p, found)
+        elif kind == "decide":
+            decided: Decision = found
+            of = self._p.settings
+            report = decision_report(decided, of.goal_m, of.readings, self._clock)
+            t.show(report)
+        elif kind == "validate":
+            t.show(validation_lines(found))
+
+
+def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
+    """Show the revisions and the verdict."""
+    with CampaignFile.open(p.run, read_only=True) as campaign:
+        refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
+    rows = rows_of(refined["revisions"], found.steps)
+    t.show(revisions_table([r.shown for r in rows]))
+    t.show([key(), verdict_line(found.diagnosis), ""])
+    t.show(prior_lines(found.fit))
+
+
+def _count(path: Path) -> int:
+    with CampaignFile.open(path, read_only=True) as campaign:
+        return campaign.n_readings

@@ -1,18 +1,19 @@
-"""`info`, `accept` and `repair`: what a campaign holds, and which revisions of it are used."""
+"""`info`, `accept`, `repair` and `fleet`: what campaigns hold, and which revisions are used."""
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
-from hilcal.cli.terminal import Json, Run, terminal
+from hilcal.cli.options import Json, Record, Run, Scheduler, Workers, argument, option
+from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.text_info import info_report, to_json
+from hilcal.present.campaign import info_json, info_report
+from hilcal.present.fit import model_name
+from hilcal.present.progress import counting
+from hilcal.present.registration import covariance_words
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
@@ -29,16 +30,16 @@ def info(run: Run, as_json: Json = False) -> None:
         parts = covariance_parts(file.about(COVERS), found.config)
         noise = NoiseEstimate.from_json(file.about(NOISE))
     t.show(info_report(found, run.name, covariance_words(parts, noise)))
-    t.document(to_json(found, str(run), parts))
+    t.document(info_json(found, str(run), parts))
 
 
 def accept(
     run: Run,
     number: Annotated[
-        int | None, typer.Argument(metavar="N", help="The revision; the latest one if left out.")
+        int | None, argument("N", "The revision; the latest one if left out.")
     ] = None,
     release: Annotated[
-        bool, typer.Option("--release", help="Accept none: the latest one is used again.")
+        bool, option("--release", "Accept none: the latest one is used again.")
     ] = False,
     as_json: Json = False,
 ) -> None:
@@ -73,10 +74,8 @@ def repair(
     run: Run,
     robot: Annotated[
         Path | None,
-        typer.Option(
-            "--robot",
-            metavar="FILE",
-            help="URDF or DH table of its robot, for a campaign that does not hold it.",
+        option(
+            "--robot FILE", "URDF or DH table of its robot, for a campaign that does not hold it."
         ),
     ] = None,
     as_json: Json = False,
@@ -103,4 +102,51 @@ def repair(
 
 
 def _named(record: RevisionRecord) -> str:
-    return f"revision {record.number} ({text.model_name(record.effects)})"
+    return f"revision {record.number} ({model_name(record.effects)})"
+
+
+def fleet(
+    directory: Annotated[Path, argument("DIR", "With campaign files, in folders below as well.")],
+    out: Annotated[Path, option("-o PRIOR.json", "What to expect of another arm.")],
+    report: Annotated[Path | None, option("--report F.html", "Write it as one HTML page.")] = None,
+    record: Record = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
+    # loads all that is fitted and shown
+    from hilcal.cli.fits import check_record
+    from hilcal.cli.showing import opening
+    from hilcal.engine.engine import open_engine
+    from hilcal.identification.posterior_document import write
+    from hilcal.present.fleet import fleet_report
+    from hilcal.transfer.document import to_json
+    from hilcal.transfer.fleet import fleet as pool_fleet
+    from hilcal.transfer.members import entries
+    from hilcal.write_report import write_fleet_report
+
+    t = terminal(as_json)
+    check_record(record)
+    entries(directory)  # refused before workers are started
+    with open_engine(workers, scheduler) as engine:
+        found = pool_fleet(directory, engine, partial(counting, t.progress))
+    t.show(fleet_report(found))
+    written = {}
+    for of in found.types:
+        path = out if len(found.types) == 1 else out.with_stem(f"{out.stem}-{of.type}")
+        write(of.prior, path)
+        written[of.type] = str(path)
+        t.show(f"\n{path}: what to expect of another {of.type}, for --prior {quoted(path)}")
+    document = to_json(found, written)
+    if report is not None:
+        write_fleet_report(found, directory, report)
+        t.show(f"{report}: the report")
+        document["report"] = str(report)
+    if record is not None:
+        from hilcal.present.viewer.fleet_stream import record_fleet  # loads the viewer's library
+
+        record_fleet(found, record)
+        t.notice(f"recorded {record}; open it with: {opening(record)}")
+        document["recording"] = str(record)
+    t.document(document)

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
+from typer.core import TyperGroup
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -52,14 +54,14 @@ COMMANDS = {
         "Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain.",
     ),
     "simulate": Command(
-        "simulating:simulate",
+        "rehearsing:simulate",
         "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
     ),
     "init": Command(
-        "beginning:init", "Write a commented CELL.toml: asks at a terminal, else takes the options."
+        "init:init", "Write a commented CELL.toml: asks at a terminal, else takes the options."
     ),
     "config": Command(
-        "configuring:config", "Explain the sections and keys of CELL.toml: unit, default, example."
+        "looking_up:config", "Explain the sections and keys of CELL.toml: unit, default, example."
     ),
     "check": Command(
         "planning:check", "Connect to every device and report its state; nothing moves."
@@ -99,19 +101,19 @@ COMMANDS = {
         "Search a law for what no effect explains, and write it as an effect.",
     ),
     "next": Command(
-        "next:next_",
+        "planning:next_",
         "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
     ),
     "bootstrap": Command(
-        "bootstrapping:bootstrap",
+        "fitting:bootstrap",
         "Draw the poses again, refit, and compare the scatter with the stated uncertainties.",
     ),
     "fleet": Command(
-        "fleeting:fleet",
+        "campaigns:fleet",
         "Pool many campaigns: a prior for other arms, arms unlike their type, drift.",
     ),
     "validate": Command(
-        "validating:validate", "Predict readings of another campaign with the model."
+        "comparing:validate", "Predict readings of another campaign with the model."
     ),
     "compensate": Command(
         "compensating:compensate",
@@ -122,27 +124,70 @@ COMMANDS = {
         "Choose the revision that every command uses from now on, whatever is added later.",
     ),
     "report": Command(
-        "reporting:report",
+        "showing:report",
         "Write the whole story as one HTML page, a certificate first; it prints on six pages.",
     ),
-    "view": Command("viewing:view", "Tell the story of the revisions in rerun."),
+    "view": Command("showing:view", "Tell the story of the revisions in rerun."),
     "workbench": Command(
-        "working:workbench",
+        "showing:workbench",
         "Compare, add, remove, change the cell, measure next on one page of this machine alone.",
     ),
     "export": Command(
         "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."
     ),
     "effects": Command(
-        "effects:effects",
+        "looking_up:effects",
         "List the effects that a model can have; `new` begins one of your own.",
-        (("new", "effects:new"),),
+        (("new", "looking_up:new"),),
     ),
     "doctor": Command(
-        "doctoring:doctor",
+        "doctor:doctor",
         "Look at packages, ports, permissions, network, clock and disk of this computer.",
     ),
     "study": Command(
-        "", "Studies of the program's own mathematics.", (("scaling", "study_scaling:scaling"),)
+        "", "Studies of the program's own mathematics.", (("scaling", "looking_up:scaling"),)
     ),
 }
+
+
+EXIT_CODES = (
+    "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 the data cannot answer the question; "
+    "5 a limit is not kept; 130 interrupted with Ctrl-C."
+)
+"""Of every command."""
+
+EXIT_CODES_OF_RUN = (
+    "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 a goal is not met; 130 interrupted "
+    "with Ctrl-C. Whenever it ends early the arm is stopped, the readings so far are safe, and "
+    "the line that goes on is printed."
+)
+
+
+class Group(TyperGroup):
+    """A group whose help gives the whole summary of each command, wrapped between words."""
+
+    sections: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  (replaced, never changed)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write the commands, under headings where there are any."""
+        names = self.list_commands(ctx)
+        listed = {name for section in self.sections.values() for name in section}
+        rest = tuple(name for name in names if name not in listed)
+        widest = max(map(len, names))
+        for title, section in {**self.sections, "Commands": rest}.items():
+            rows = [
+                (name.ljust(widest), self._summary(ctx, name)) for name in section if name in names
+            ]
+            if rows:
+                with formatter.section(title):
+                    formatter.write_dl(rows)
+
+    def _summary(self, ctx: Any, name: str) -> str:
+        command = self.get_command(ctx, name)
+        return str(getattr(command, "help", None) or "").strip().split("\n\n")[0]
+
+
+class InOrderOfWork(Group):
+    """The group of all commands of hilcal."""
+
+    sections = SECTIONS

@@ -1,40 +1,58 @@
-"""`compare`: model against measurement, of one campaign or of a later one of the same arm."""
+"""`compare` and `validate`: the model against what was measured, fitted and never fitted."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import called, finish, fit_of, titles
-from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.cli.fits import called, finish, fit_of, record_of, titles
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError, LimitError
 from hilcal.identification.fit import all_left_out
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import linearise
-from hilcal.present import text, text_change
+from hilcal.present.comparison import comparison_json, comparison_report, next_command
+from hilcal.present.document import heading
+from hilcal.present.fit import (
+    errors,
+    follows,
+    misses,
+    model_name,
+    where_table,
+    worst_poses,
+    worst_table,
+)
 from hilcal.present.progress import working
+from hilcal.present.validation import (
+    extrapolation_json,
+    opening,
+    shares_json,
+    shares_report,
+    validation_failure,
+    validation_report,
+)
+from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
+from hilcal.validation import validate as validate_campaign
 
 
 def compare(
     run: Run,
     later: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="[LATER.hilcal]",
-            help="A later campaign of the same arm, of 15 readings or more: what has changed?",
+        argument(
+            "[LATER.hilcal]",
+            "A later campaign of the same arm, of 15 readings or more: what has changed?",
         ),
     ] = None,
     same_setup: Annotated[
         bool,
-        typer.Option(
+        option(
             "--same-setup",
-            help="With LATER: tracker and base stand as they did; else the tracker's place is "
+            "With LATER: tracker and base stand as they did; else the tracker's place is "
             "estimated from the later readings.",
         ),
     ] = False,
@@ -59,13 +77,13 @@ def compare(
         found = compare_campaigns(
             o, there, revision, same_setup=True if same_setup else None, say=say
         )
-    name = text.model_name(titles(found.fit.model, found.fit.readings))
-    t.show(text.heading(f"{run.name}: {called(found.number)} ({name})"))
-    t.show(text_change.comparison_report(found, run.name, later.name))
-    command = text_change.next_command(found, str(run), str(later))
+    name = model_name(titles(found.fit.model, found.fit.readings))
+    t.show(heading(f"{run.name}: {called(found.number)} ({name})"))
+    t.show(comparison_report(found, run.name, later.name))
+    command = next_command(found, str(run), str(later))
     if command is not None:
         t.command(command)
-    t.document(text_change.to_json(found, str(run), str(later)))
+    t.document(comparison_json(found, str(run), str(later)))
 
 
 def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
@@ -80,12 +98,12 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
         if left_out:  # a background follows the fitted poses more closely than others
             raw, w = all_left_out(found)
             e = replace(e, raw=raw, whitening=w)
-        worst = text.worst_poses(e)
-    name = text.model_name(titles(found.model, found.readings))
-    t.show(text.heading(f"{called(number)}: {name}"))
-    t.show([text.misses(found), text.follows(places), "", text.errors(found), ""])
-    t.show([*text.where_table(places), ""])
-    t.show(text.worst_table(worst, left_out))
+        worst = worst_poses(e)
+    name = model_name(titles(found.model, found.readings))
+    t.show(heading(f"{called(number)}: {name}"))
+    t.show([misses(found), follows(places), "", errors(found), ""])
+    t.show([*where_table(places), ""])
+    t.show(worst_table(worst, left_out))
     t.document(
         {
             "revision": number,
@@ -100,4 +118,69 @@ def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> 
             ],
             "worst": [asdict(w) for w in worst],
         }
+    )
+
+
+OVER = 5.0
+"""Errors in units of the noise from which another place of the tracker is suspected; a guess."""
+
+
+def validate(
+    run: Run,
+    other: Annotated[Path, argument("OTHER.hilcal", "A campaign that was never fitted.")],
+    register: Annotated[
+        bool, option("--register", "The tracker was set up anew: fit its place first.")
+    ] = False,
+    limit: Annotated[
+        str | None,
+        option(
+            "--limit LENGTH",
+            'The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it is not kept.',
+        ),
+    ] = None,
+    revision: Revision = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Predict readings of another campaign with the model."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        Campaign.open(other, read_only=True) as unseen,
+        working(t.progress) as say,
+    ):
+        record = record_of(t, o, say, revision)
+        done = validate_campaign(o, unseen, record, limit_m, register=register, say=say)
+        name = model_name(titles(done.model, o.fitted_readings(record)))
+    judged, found, beyond, shares = done.judged, done.prediction, done.beyond, done.shares
+    t.show(heading(f"{called(judged.number)}: {name}"))
+    t.show(opening(judged, found))
+    t.show(validation_report(judged, found, beyond))
+    t.show(shares_report(shares))
+    if found.error.rms_sigma > OVER and not register:
+        t.show(
+            "Was the tracker set up anew for these readings? Then --register fits its place first."
+        )
+    failed: HilcalError | None = None
+    if shares.passed is False:
+        words = validation_failure(shares, judged)
+        failed = CannotAnswerError(words) if shares.undecided else LimitError(words)
+    t.document(
+        {
+            "revision": judged.number,
+            "model": list(done.model.named),
+            "readings": judged.mode,
+            "registered": register,
+            "n_readings": judged.readings,
+            "n_fitted": judged.fitted,
+            "never_fitted": judged.unseen,
+            "n_measurements": len(found.raw),
+            "error": found.error.to_json(),
+            "variance_factor": found.variance_factor,
+            "noise_floor_m": found.noise_floor,
+            **extrapolation_json(beyond),
+            **shares_json(shares),
+        },
+        failed,
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 
 from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
@@ -22,13 +21,27 @@ from hilcal.calibration.urscript import (
     with_joints,
 )
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Revision, Terminal, terminal
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Revision,
+    argument,
+    catalogue_with,
+    check_new,
+    option,
+)
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
-from hilcal.present import text_compensate
+from hilcal.present.calibration import (
+    compensation_json,
+    compensation_report,
+    fates,
+    refusals,
+    waypoints_table,
+)
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.tables.columns import joint_columns
@@ -61,66 +74,46 @@ class _Task:
 
 def compensate(
     model: Annotated[
-        Path,
-        typer.Argument(
-            metavar="RUN.hilcal", help="A campaign with a revision, or a calibration (JSON)."
-        ),
+        Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
     ],
     points: Annotated[
-        Path,
-        typer.Argument(
-            metavar="POINTS", help="Where to go: a table (CSV) or a UR program (.script)."
-        ),
+        Path, argument("POINTS", "Where to go: a table (CSV) or a UR program (.script).")
     ],
     output: Annotated[
-        list[Path] | None,
-        typer.Option(
-            "-o", "--output", metavar="F", help="Write CSV, JSON or a UR program; repeatable."
-        ),
+        list[Path] | None, option("-o --output F", "Write CSV, JSON or a UR program; repeatable.")
     ] = None,
     load: Annotated[
-        str | None,
-        typer.Option("--load", metavar="NAME", help="The load at every point, of [[loads]]."),
+        str | None, option("--load NAME", "The load at every point, of [[loads]].")
     ] = None,
     wrench: Annotated[
         str | None,
-        typer.Option(
-            "--wrench",
-            metavar='"FX FY FZ MX MY MZ"',
-            help="Force and moment at the load point, base axes, N and N·m.",
+        option(
+            '--wrench "FX FY FZ MX MY MZ"',
+            "Force and moment at the load point, base axes, N and N·m.",
         ),
     ] = None,
     tool: Annotated[
         str | None,
-        typer.Option(
-            "--tool",
-            metavar='"X Y Z RX RY RZ"',
-            help="The tool on the flange, m and rad; the tracked target unless given.",
+        option(
+            '--tool "X Y Z RX RY RZ"',
+            "The tool on the flange, m and rad; the tracked target unless given.",
         ),
     ] = None,
     near: Annotated[
-        str | None,
-        typer.Option(
-            "--near", metavar='"Q1 Q2 .. QN"', help="Joint values near the first pose, degrees."
-        ),
+        str | None, option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees.")
     ] = None,
     outside: Annotated[
-        bool,
-        typer.Option("--allow-outside", help="Also points outside of what was measured."),
+        bool, option("--allow-outside", "Also points outside of what was measured.")
     ] = False,
     leave: Annotated[
-        bool,
-        typer.Option(
-            "--leave", help="Keep waypoints of a program that cannot be corrected as they are."
-        ),
+        bool, option("--leave", "Keep waypoints of a program that cannot be corrected as they are.")
     ] = False,
     revision: Revision = None,
     effects_from: EffectsFrom = None,
     kind: Annotated[
-        str,
-        typer.Option("--format", metavar="FORMAT", help="table, or a mapping, as for import."),
+        str, option("--format FORMAT", "table, or a mapping, as for import.")
     ] = "table",
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
     as_json: Json = False,
 ) -> None:
     """Find the joint values that put the tool where it was asked to be, under a load."""
@@ -150,22 +143,22 @@ def compensate(
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    refused = text_compensate.refusals(found, outside)
+    refused = refusals(found, outside)
     refused = ["; ".join(filter(None, both)) for both in zip(uncertain, refused, strict=True)]
-    fates = text_compensate.fates(task.waypoints, refused)
+    become = fates(task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
     if not leave or not kept:
         _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         found = calibration.compensate(q, acting, tool=task.tool)
-    document = text_compensate.document(calibration, task.points.names, found)
-    if fates:
-        document["waypoints"] = [asdict(fate) for fate in fates]
+    document = compensation_json(calibration, task.points.names, found)
+    if become:
+        document["waypoints"] = [asdict(fate) for fate in become]
     for path in output or ():
         _write(path, task, found, document)
-    t.show(text_compensate.report(calibration, task.points.names, q, found))
-    t.show(text_compensate.waypoints(fates))
+    t.show(compensation_report(calibration, task.points.names, q, found))
+    t.show(waypoints_table(become))
     _say_written(t, output or [])
     t.document({**document, "written": [str(path) for path in output or ()]})
 
@@ -303,8 +296,7 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools
 def _check_output(path: Path, force: bool) -> None:
     if path.suffix not in WRITTEN:
         raise InputError(f"{path}: unknown kind of file; valid: {', '.join(WRITTEN)}")
-    if path.exists() and not force:
-        raise InputError(f"{path}: the file exists; choose another name or give --force")
+    check_new(path, force)
 
 
 def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> None:

@@ -3,13 +3,19 @@
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_options, fit_of, wanted_effects
-from hilcal.cli.terminal import Json, Revision, Run, terminal
+from hilcal.cli.fits import check_options, fit_of, wanted_effects
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Revision,
+    Run,
+    catalogue_with,
+    check_folder,
+    option,
+)
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.discovery import discover as search
 from hilcal.discovery.discovery import rival_sources
@@ -20,31 +26,28 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.names import quoted
-from hilcal.present import text
+from hilcal.present.discovery import discovery_json, discovery_report, silence
+from hilcal.present.fit import model_name
 from hilcal.present.progress import working
-from hilcal.present.text_discover import discovery_report, silence, to_json
 from hilcal.whole_file import replace_file
 
 
 def discover(
     run: Run,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", metavar="F.py", help="The effect, to be edited.")
-    ],
+    output: Annotated[Path, option("-o --output F.py", "The effect, to be edited.")],
     against: Annotated[
         str | None,
-        typer.Option(
-            "--against",
-            metavar="MODEL",
-            help="Beside this model instead of the revision in use: effects A,B; baseline; or the "
+        option(
+            "--against MODEL",
+            "Beside this model instead of the revision in use: effects A,B; baseline; or the "
             "file of an exported calibration, whose effects are fitted to this run.",
         ),
     ] = None,
     alternatives: Annotated[
         bool,
-        typer.Option(
+        option(
             "--alternatives",
-            help="Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
+            "Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
             "plans what separates them.",
         ),
     ] = False,
@@ -63,8 +66,7 @@ def discover(
         )
     if wanted is not None and revision is not None:
         raise InputError("--against and --revision: give one of them")
-    if not output.absolute().parent.is_dir():
-        raise InputError(f"-o {output}: no folder {output.absolute().parent}; make it first")
+    check_folder(output, f"-o {output}")
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number: int | None = None
         if wanted is None:
@@ -76,10 +78,10 @@ def discover(
                 if wanted
                 else baseline(o.cell, o.readings, o.mode(), catalogue)
             )
-            say(f"fitting {text.model_name(model.named)}")
+            say(f"fitting {model_name(model.named)}")
             found = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(found, say, name)
-    document = {"revision": number, **to_json(d), "written": None}
+    document = {"revision": number, **discovery_json(d), "written": None}
     t.show(discovery_report(d))
     if not d.laws:
         t.document(document, CannotAnswerError(silence(d)))

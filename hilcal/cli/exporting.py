@@ -8,80 +8,73 @@ from typing import Annotated
 
 import numpy as np
 import tomli_w
-import typer
 
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected, corrected
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.terminal import Json, Revision, Run, Terminal, terminal
+from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, check_new, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.identification.residual_table import residual_table
 from hilcal.numbers import length
 from hilcal.present.progress import Say, working
-from hilcal.present.text_registration import base_line
+from hilcal.present.registration import base_line
 from hilcal.readings.covariance import INSTRUMENT
 from hilcal.store.robot_file import ROBOT_FILE
-from hilcal.tables.revision_table import revision_table
-from hilcal.tables.tabular import check_suffix, write_columns
+from hilcal.tables.write import check_suffix, revision_table, write_columns
 from hilcal.whole_file import replace_file
 
 MANY = 10.0
 """m; a distance along a joint's axis beyond which it is said that it cancels with others."""
 
 
-def _file(metavar: str, words: str) -> typer.models.OptionInfo:
-    found: typer.models.OptionInfo = typer.Option(metavar=metavar, help=words)
-    return found
-
-
 def export(
     run: Run,
     readings: Annotated[
-        Path | None, _file("F.csv|F.parquet", "The readings as stored, to be imported again.")
+        Path | None, option("F.csv|F.parquet", "The readings as stored, to be imported again.")
     ] = None,
     table: Annotated[
         Path | None,
-        _file("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
+        option("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
     ] = None,
     cell: Annotated[
-        Path | None, _file("CELL.toml", "The cell's configuration, for --readings.")
+        Path | None, option("CELL.toml", "The cell's configuration, for --readings.")
     ] = None,
     residuals: Annotated[
         Path | None,
-        _file("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
+        option("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
     ] = None,
     revisions: Annotated[
-        Path | None, _file("F.csv|F.parquet", "All revisions: model, errors, verdict.")
+        Path | None, option("F.csv|F.parquet", "All revisions: model, errors, verdict.")
     ] = None,
     parameters: Annotated[
         Path | None,
-        _file("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
+        option("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
     ] = None,
     calibration: Annotated[
-        Path | None, _file("F.json", "The identified arm, ready for compensate on any machine.")
+        Path | None, option("F.json", "The identified arm, ready for compensate on any machine.")
     ] = None,
-    urdf: Annotated[Path | None, _file("F.urdf", "The arm with its corrected geometry.")] = None,
-    dh: Annotated[Path | None, _file("F.toml|F.csv", "The same as a DH table.")] = None,
+    urdf: Annotated[Path | None, option("F.urdf", "The arm with its corrected geometry.")] = None,
+    dh: Annotated[Path | None, option("F.toml|F.csv", "The same as a DH table.")] = None,
     modified: Annotated[
-        bool, typer.Option("--dh-modified", help="Rows of --dh as Craig writes them.")
+        bool, option("--dh-modified", "Rows of --dh as Craig writes them.")
     ] = False,
     ur_kinematics: Annotated[
-        Path | None, _file("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
+        Path | None, option("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
     ] = None,
     ur_hash: Annotated[
         str | None,
-        _file(
+        option(
             "calib_N", "The connected arm's hash, so that the driver takes the file for its own."
         ),
     ] = None,
     frames: Annotated[
-        Path | None, _file("F.json", "Tool and base as fitted, and as a controller takes them.")
+        Path | None, option("F.json", "Tool and base as fitted, and as a controller takes them.")
     ] = None,
     revision: Revision = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace existing files.")] = False,
+    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
@@ -145,24 +138,23 @@ def _check(
     for path in tables:
         if path is not None:
             check_suffix(path)
-    for given, option, valid in (
+    for given, name, valid in (
         (parameters, "--parameters", (".json", ".csv")),
         (geometry.dh, "--dh", (".toml", ".csv")),
     ):
         if given is not None and given.suffix.lower() not in valid:
-            raise InputError(f"{option} {given}: unknown kind of file; valid: {' or '.join(valid)}")
-    for what, option, needs in (
+            raise InputError(f"{name} {given}: unknown kind of file; valid: {' or '.join(valid)}")
+    for what, name, needs in (
         (geometry.modified and geometry.dh is None, "--dh-modified", "--dh"),
         (geometry.ur_hash and geometry.ur_kinematics is None, "--ur-hash", "--ur-kinematics"),
     ):
         if what:
-            raise InputError(f"{option} is about {needs}; give it, too")
+            raise InputError(f"{name} is about {needs}; give it, too")
     twice = [path for path in wanted if wanted.count(path) > 1]
     if twice:
         raise InputError(f"{twice[0]}: two things cannot be written to one file")
     for path in wanted:
-        if path.exists() and not force:
-            raise InputError(f"{path}: the file exists; choose another name or give --force")
+        check_new(path, force)
 
 
 def _write_data(

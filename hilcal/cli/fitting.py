@@ -1,69 +1,85 @@
-"""`identify`: fit a model to the readings."""
+"""`identify` and `bootstrap`: fit a model to the readings, and draw them again."""
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal import numbers
+from hilcal.calibration.streamed import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.engine import Scheduler, Workers
-from hilcal.cli.files import (
+from hilcal.cell import Cell
+from hilcal.cli.fits import (
+    PriorOptions,
     check_options,
     chosen,
     finish,
+    fit_of,
     mode_of_option,
     scalings,
     titles,
     wanted_effects,
 )
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.streaming import identify_stream
-from hilcal.cli.terminal import Details, Json, Run, terminal
+from hilcal.cli.options import (
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Prior,
+    PriorOf,
+    Readings,
+    Revision,
+    Run,
+    Scheduler,
+    Workers,
+    catalogue_with,
+    check_workers,
+    option,
+)
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
+from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.options import Options
 from hilcal.effects.written import write_effect
+from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.bootstrap import DRAWS, check_draws
+from hilcal.identification.bootstrap import bootstrap as draw_again
+from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.other_arm import other_arm_of
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.progress import working
-from hilcal.present.text_prior import prior_lines
-from hilcal.present.text_registration import other_arm_line
-from hilcal.present.text_scalings import scalings_table
+from hilcal.present.bootstrap import bootstrap_json, bootstrap_report
+from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
+from hilcal.present.progress import counting, working
+from hilcal.present.registration import covariance_words, other_arm_line
+from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
-from hilcal.tables.tabular import is_parquet
-
-Readings = Annotated[
-    str | None,
-    typer.Option("--readings", metavar="KIND", help="deflection or absolute."),
-]
+from hilcal.stream.document import to_json as stream_json
+from hilcal.stream.fit import fit_stream
+from hilcal.tables.files import is_parquet
+from hilcal.tables.parquet_stream import open_stream
 
 
 def identify(
     run: Run,
     effects: Annotated[
         str | None,
-        typer.Option(
-            "--effects",
-            metavar="A,B",
-            help="Effects to fit, besides unknown frames; with options: creep(joints=each).",
+        option(
+            "--effects A,B",
+            "Effects to fit, besides unknown frames; with options: creep(joints=each).",
         ),
     ] = None,
-    scaling: Annotated[
-        str, typer.Option("--scaling", metavar="S", help="none, gu, gc or all, side by side.")
-    ] = "gc",
+    scaling: Annotated[str, option("--scaling S", "none, gu, gc or all, side by side.")] = "gc",
     readings: Readings = None,
     fit_validation: Annotated[
         bool,
-        typer.Option(
+        option(
             "--fit-validation",
-            help="Release a validation campaign for fitting; its file says so for good.",
+            "Release a validation campaign for fitting; its file says so for good.",
         ),
     ] = False,
     prior: Prior = None,
@@ -71,15 +87,9 @@ def identify(
     drift: Drift = None,
     effects_from: EffectsFrom = None,
     cell: Annotated[
-        Path | None,
-        typer.Option(
-            "--cell", metavar="CELL.toml", help="The cell of a stream, READINGS.parquet as RUN."
-        ),
+        Path | None, option("--cell CELL.toml", "The cell of a stream, READINGS.parquet as RUN.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", metavar="F.json", help="Of a stream: write its calibration."),
-    ] = None,
+    out: Annotated[Path | None, option("-o F.json", "Of a stream: write its calibration.")] = None,
     workers: Workers = None,
     scheduler: Scheduler = None,
     details: Details = False,
@@ -98,9 +108,7 @@ def identify(
                 f"{run}: the readings of a stream are absolute, and their scaling is gc; leave out "
                 "--scaling, --readings and --fit-validation"
             )
-        if effects_from and (scheduler is not None or workers not in (None, 1)):
-            raise InputError("--effects-from: other processes do not have its effects; --workers 1")
-        count = 1 if effects_from else workers
+        count = check_workers(workers, scheduler, effects_from)
         identify_stream(t, run, cell, named, catalogue, known, out, count, scheduler)
         return
     if any(option is not None for option in (cell, out, workers, scheduler)):
@@ -124,13 +132,13 @@ def identify(
                 model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
             fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
-                say(f"fitting {text.model_name(titles(model, o.readings))}, scaling {s}")
+                say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
                 fits[s] = with_serial_noise(fit(model, fitted, mode, s))
                 finish(fits[s], say)
             kept = fits[wanted[-1]]
             before = len(o.file.revisions())
             number = o.append(kept)
-    t.show(text.fit_report(kept, details))
+    t.show(fit_report(kept, details))
     t.show(prior_lines(kept))
     if details or o.noise:
         t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
@@ -162,3 +170,61 @@ def options_line(found: Fit) -> list[str]:
 def options_json(found: Fit) -> dict[str, dict[str, object]]:
     """Return all options of the effects, by name."""
     return {e.name: dict(e.options) for e in found.model.effects}
+
+
+def identify_stream(
+    t: Terminal,
+    path: Path,
+    cell_path: Path | None,
+    effects: Mapping[str, Options] | None,
+    catalogue: Catalogue,
+    prior: CarriedPrior | None,
+    out: Path | None,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    """Fit a model to a stream, print it, and write its calibration."""
+    if cell_path is None:
+        raise InputError(f"{path}: a table has no cell; give --cell CELL.toml as well")
+    cell = Cell.load(cell_path)
+    config = cell.configured()
+    stream = open_stream(path, cell.arm, tracker_noise(config.tracker), config.tracker.station_m)
+    with open_engine(workers, scheduler) as engine:
+        shown = partial(counting, t.progress)
+        found = fit_stream(stream, cell, engine, effects, catalogue, prior, shown)
+    t.show(stream_report(found))
+    document = stream_json(found)
+    if out is not None:
+        source = {"stream": path.name, "readings": found.readings}
+        calibration_of_stream(found, source).save(out)
+        t.show(f"\n{out}: the calibration, for compensate and hc.Calibration")
+        document["calibration"] = str(out)
+    t.document(document)
+
+
+def bootstrap(
+    run: Run,
+    revision: Revision = None,
+    draws: Annotated[int, option("--draws N", "Campaigns drawn.")] = DRAWS,
+    seed: Annotated[int, option("--seed", "Of the draws.")] = 0,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    check_draws(draws, seed)
+    count = check_workers(workers, scheduler, effects_from)
+    with (
+        Campaign.open(run, catalogue, read_only=True) as o,
+        open_engine(count, scheduler) as engine,
+    ):
+        with working(t.progress) as say:
+            number, fit = fit_of(t, o, say, revision)
+            say("computing standard uncertainties")
+            _ = fit.uncertainty
+        with counting(t.progress, "draws", draws) as advance:
+            found = draw_again(fit, engine, draws, seed, advance)
+    t.show(bootstrap_report(found))
+    t.document({"revision": number, "seed": seed, **bootstrap_json(found)})

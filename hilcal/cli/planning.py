@@ -1,39 +1,86 @@
-"""`plan`: choose poses, loads and order; `check`: who answers, and may this plan be run."""
+"""`plan`, `next`: choose poses, loads and order; `check`: who answers, and may a plan be run."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import typer
+import numpy as np
 
+from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import check_record, fit_of
-from hilcal.cli.plan_output import POSES, Csv, Output, Poses, Quick, Seed, generator, write
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Details, Json, Record, Revision, Terminal, terminal
+from hilcal.cli.fits import PriorOptions, check_record, effect_names, fit_of, fitted_with
+from hilcal.cli.options import (
+    POSES,
+    CellFile,
+    Csv,
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Output,
+    PlanFile,
+    Poses,
+    Prior,
+    PriorOf,
+    Quick,
+    Record,
+    Revision,
+    Run,
+    Seed,
+    catalogue_with,
+    check_seed,
+    option,
+)
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.checked_plan import CheckedPlan, checked, refusal
 from hilcal.design.choice import CRITERIA, canonical
+from hilcal.design.next import Next, PairPower
 from hilcal.design.nominal_model import check_effects
 from hilcal.design.planner import Planned, Request, make
 from hilcal.design.summary import about, remarks, summarise
+from hilcal.diagnosis.doubt import MOST
+from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import plain
 from hilcal.measuring.connect import ConnectionResult, connect
 from hilcal.measuring.dry_run import DryRun, dry_run
-from hilcal.present import text_run
+from hilcal.names import quoted
+from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
-from hilcal.present.text_plan import plan_report, plan_screen
+from hilcal.present.running import check_report
+from hilcal.procedure.next_plan import doubt_to_settle, next_plan
+from hilcal.procedure.separate import Doubt, without
 from hilcal.store.plan import Plan, load_plan
+from hilcal.tables.write import plan_csv
+from hilcal.whole_file import replace_file
 
-CellFile = Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell.")]
-PlanFile = Annotated[
-    Path | None, typer.Option("--plan", metavar="PLAN", help="The plan, see hilcal plan.")
-]
+
+def write(
+    t: Terminal,
+    cell: Cell,
+    config: CellConfig,
+    made: CheckedPlan,
+    output: Path,
+    csv: Path | None,
+    record: Path | None,
+    powers: tuple[PairPower, ...] = (),
+) -> None:
+    """Write a plan: as a file, and where asked as a table and as a recording."""
+    made.save(output)
+    if csv is not None:
+        pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+        replace_file(csv, plan_csv(made.plan, pulls))
+    if record is not None:
+        from hilcal.present.viewer.plan_stream import record_plan
+
+        with working(t.progress) as say:
+            say(f"recording {record}")
+            record_plan(cell, config, made.plan, made.summary, record, powers)
 
 
 def plan(
@@ -42,19 +89,17 @@ def plan(
     poses: Poses = POSES,
     readings: Annotated[
         int | None,
-        typer.Option(
+        option(
             "--readings",
-            help="Or so many readings, repeats not counted, at as many poses and under those loads "
+            "Or so many readings, repeats not counted, at as many poses and under those loads "
             "that tell most.",
         ),
     ] = None,
     criterion: Annotated[
-        str | None,
-        typer.Option("--criterion", metavar="|".join(CRITERIA), help="The optimality criterion."),
+        str | None, option(f"--criterion {'|'.join(CRITERIA)}", "The optimality criterion.")
     ] = None,
     after: Annotated[
-        Path | None,
-        typer.Option("--after", metavar="RUN.hilcal", help="Plan on from what it knows already."),
+        Path | None, option("--after RUN.hilcal", "Plan on from what it knows already.")
     ] = None,
     revision: Revision = None,
     prior: Prior = None,
@@ -63,9 +108,9 @@ def plan(
     seed: Seed = 0,
     unloaded_first: Annotated[
         bool,
-        typer.Option(
+        option(
             "--unloaded-first",
-            help="All unloaded readings before the loads: for run --until; a drift costs more.",
+            "All unloaded readings before the loads: for run --until; a drift costs more.",
         ),
     ] = False,
     quick: Quick = False,
@@ -88,7 +133,7 @@ def plan(
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
         known = None if after is None else _known(t, after, revision, catalogue, say)
-        rng = generator(seed)
+        rng = np.random.default_rng(check_seed(seed))
         chosen = make(numbers, config, wanted, rng, known, say, catalogue, carried)
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
@@ -138,7 +183,7 @@ def check(
         rig, answers = connect(config)
         if rig is not None:
             rig.close()
-    t.show(text_run.check_report(answers, dry))
+    t.show(check_report(answers, dry))
     failed: HilcalError | None = None
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
@@ -152,6 +197,16 @@ def check(
         },
         failed,
     )
+
+
+def answers_of(t: Terminal, config: CellConfig) -> tuple[ConnectionResult, ...]:
+    """Return what every device says of itself; nothing moves."""
+    with working(t.progress) as say:
+        say("connecting to every device")
+        rig, answers = connect(config)
+        if rig is not None:
+            rig.close()
+    return answers
 
 
 def dry_checked(t: Terminal, cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
@@ -176,14 +231,15 @@ def make_plan(
     say: Say = lambda words: None,
 ) -> Plan:
     """Return a plan of so many poses, each read unloaded and under every load that it bears."""
-    return _with_origin(make(cell, config, Request(poses), generator(seed), None, say, catalogue))
+    rng = np.random.default_rng(check_seed(seed))
+    return _with_origin(make(cell, config, Request(poses), rng, None, say, catalogue))
 
 
 def make_checked(
     cell: Cell, config: CellConfig, poses: int, seed: int, catalogue: Catalogue, say: Say
 ) -> CheckedPlan:
     """Return the same plan with its dry run, its summary, and what other numbers of poses give."""
-    rng = generator(seed)
+    rng = np.random.default_rng(check_seed(seed))
     chosen = make(cell, config, Request(poses), rng, None, say, catalogue)
     summary = summarise(chosen, config, rng, say, compare=False)
     say("checking every motion in a dry run")
@@ -217,3 +273,115 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
     """
     if lines := [problem for answer in answers for problem in answer.problems]:
         raise DeviceError("; ".join(lines))
+
+
+def next_(
+    run: Run,
+    output: Output,
+    poses: Annotated[
+        int | None,
+        option(
+            "--poses",
+            "As many readings as so many poses take under every load, 20 unless given; new "
+            "poses, where a misfit depends on the pose alone.",
+        ),
+    ] = None,
+    suspects: Annotated[
+        str | None, option("--suspects A,B", "Separate these, whatever is diagnosed.")
+    ] = None,
+    cell: Annotated[
+        Path | None, option("--cell CELL.toml", "The cell, where it has other loads now.")
+    ] = None,
+    seed: Seed = 0,
+    quick: Quick = False,
+    csv: Csv = None,
+    revision: Revision = None,
+    prior: Prior = None,
+    prior_of: PriorOf = "arm",
+    drift: Drift = None,
+    record: Record = None,
+    effects_from: EffectsFrom = None,
+    details: Details = False,
+    as_json: Json = False,
+) -> None:
+    """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    check_record(record)
+    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
+    rng = np.random.default_rng(check_seed(seed))
+    if poses is not None and poses < 1:
+        raise InputError(f"--poses {poses}; valid: a whole number from 1")
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        given = None if cell is None else read_cell(cell)
+        doubt = _without_suspects(t, o, revision, _named(suspects, catalogue), say, carried)
+        compare = (details or as_json) and not quick
+        n = next_plan(o, doubt, poses, rng, say, cell=given, compare=compare)
+        config, numbers = (o.config, o.cell) if given is None else given
+    found, made, effects = n.found, n.made, doubt.suspects
+    write(t, numbers, config, made, output, csv, record, found.powers)
+    t.show(f"In doubt: {words_of.names(effects, 'or')}.\n")
+    report = next_report if doubt.alone is None else poses_report
+    t.show(report(found, made.summary.poses, made.summary.readings, details))
+    t.show(plan_report(made.summary) if details else brief_plan(made.summary))
+    t.show(f"The plan is in {output}. Measure it into the same campaign with:")
+    t.show(
+        f"  hilcal run {quoted(cell or 'CELL.toml')} -o {quoted(run)} --append "
+        f"--plan {quoted(output)}"
+    )
+    t.document(
+        {
+            **made.to_dict(),
+            "plan": str(output),
+            "suspects": list(effects),
+            **separates(found),
+        }
+    )
+
+
+def separates(found: Next) -> dict[str, object]:
+    """Return what a JSON document says of pairs; powers are those with the planned readings."""
+    return {
+        "separates": [[t.effect, t.rival, t.then] for t in found.powers],
+        "separates_now": [[t.effect, t.rival, t.now] for t in found.powers],
+        "inseparable": [[t.effect, t.rival] for t in found.powers if t.not_separable],
+        "difference": found.shares,
+        "notes": list(found.notes),
+    }
+
+
+def _without_suspects(
+    t: Terminal,
+    o: Campaign,
+    revision: int | None,
+    named: tuple[str, ...] | None,
+    say: Say,
+    prior: CarriedPrior | None,
+) -> Doubt:
+    """Return the effects to separate, and a fit whose model does not hold them.
+
+    Raises:
+        InputError: the revision is not in scaling gc; a prior that is not one of these readings.
+        CannotAnswerError: nothing is in doubt; says what else to do.
+    """
+    number, newest = fit_of(t, o, say, revision)
+    o.require_gc(number, newest.scaling, "next")
+    if prior is not None:
+        say("fitting with the prior")
+        newest = fitted_with(prior, o, newest)
+    if named is not None:
+        return Doubt(without(newest, named, say), named, None)
+    say("diagnosing" if number is None else f"diagnosing revision {number}")
+    return doubt_to_settle(o, diagnose(newest, o.history(number), say), say)
+
+
+def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
+    """Split and check --suspects."""
+    if text is None:
+        return None
+    try:
+        names = effect_names(text, catalogue) or ()
+    except InputError as error:
+        raise InputError(str(error).replace("--effects", "--suspects")) from None
+    if not 2 <= len(names) <= MOST:
+        raise InputError(f"--suspects has {len(names)} names; valid: 2 to {MOST}")
+    return names

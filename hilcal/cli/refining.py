@@ -6,13 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-import typer
-
 from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.files import (
+from hilcal.cli.fits import (
+    PriorOptions,
     check_options,
     check_record,
     finish,
@@ -22,10 +20,25 @@ from hilcal.cli.files import (
     stored_fit,
     wanted_effects,
 )
-from hilcal.cli.fitting import Readings, options_json, options_line
-from hilcal.cli.prior import Drift, Prior, PriorOf, PriorOptions
-from hilcal.cli.terminal import Details, Json, Record, Revision, Run, terminal
-from hilcal.cli.viewing import View, followed
+from hilcal.cli.fitting import options_json, options_line
+from hilcal.cli.options import (
+    Details,
+    Drift,
+    EffectsFrom,
+    Json,
+    Prior,
+    PriorOf,
+    Readings,
+    Record,
+    Revision,
+    Run,
+    View,
+    argument,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.showing import followed
+from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
 from hilcal.discovery.proposal import LawSearch
@@ -40,16 +53,23 @@ from hilcal.identification.fit_document import prior_to_json
 from hilcal.identification.frames_document import fit_to_json
 from hilcal.identification.other_arm import other_arm_of
 from hilcal.identification.weight import weight_note
-from hilcal.present import text, text_refine
 from hilcal.present.build_story import Chapter
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.diagnosis_document import suspect_json, to_json
+from hilcal.present.diagnosis import (
+    addition_lines,
+    curves,
+    diagnosis_report,
+    fell,
+    key,
+    revisions_table,
+    rose,
+    verdict_line,
+)
+from hilcal.present.diagnosis_json import suspect_json, to_json
+from hilcal.present.discovery import laws_json, refined_laws
+from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
-from hilcal.present.text_discover import laws_json, refined_laws
-from hilcal.present.text_prior import prior_lines
-from hilcal.present.text_registration import fitted_lines, other_arm_line
-from hilcal.present.text_unknown import curves
-from hilcal.present.verdict_words import message
+from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
+from hilcal.present.verdict import message
 from hilcal.refinement import Step as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.purpose import refuse_fitting
@@ -73,6 +93,14 @@ class Row:
         return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
 
 
+def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[Row]:
+    """Return the steps of a refinement as they are listed, by the numbers of their revisions."""
+    return [
+        Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        for number, s in zip(numbers, steps, strict=True)
+    ]
+
+
 def diagnose(
     run: Run,
     revision: Revision = None,
@@ -87,17 +115,14 @@ def diagnose(
         say("diagnosing" if number is None else f"diagnosing revision {number}")
         d = judge(found, o.history(number), say)
         finish(found, say)
-    t.show(text_refine.diagnosis_report(d))
+    t.show(diagnosis_report(d))
     t.document({"revision": number, **to_json(d)})
 
 
 def add(
     run: Run,
     effect: Annotated[
-        str,
-        typer.Argument(
-            metavar="EFFECT", help='See hilcal effects; with options: "creep(joints=each)".'
-        ),
+        str, argument("EFFECT", 'See hilcal effects; with options: "creep(joints=each)".')
     ],
     revision: Revision = None,
     record: Record = None,
@@ -116,7 +141,7 @@ def add(
 
 def remove(
     run: Run,
-    effect: Annotated[str, typer.Argument(metavar="EFFECT", help="One of the model.")],
+    effect: Annotated[str, argument("EFFECT", "One of the model.")],
     revision: Revision = None,
     record: Record = None,
     view: View = False,
@@ -161,15 +186,11 @@ def _change(
             Row(number, before, verdict, stored.added, stored.removed),
             Row(c.number, c.fit, d.verdict, c.added, c.removed),
         ]
-        t.show([text_refine.revisions_table([r.shown for r in rows]), text_refine.key()])
+        t.show([revisions_table([r.shown for r in rows]), key()])
         named = write_effect(effect, options or {})
-        t.show(
-            text_refine.fell(before, c.fit, named)
-            if adds
-            else text_refine.rose(before, c.fit, effect)
-        )
-        t.show([] if c.expected is None else text_refine.addition_lines(c.expected))
-        t.show(["", text_refine.verdict_line(d)])
+        t.show(fell(before, c.fit, named) if adds else rose(before, c.fit, effect))
+        t.show([] if c.expected is None else addition_lines(c.expected))
+        t.show(["", verdict_line(d)])
         if record is not None:
             with working(t.progress) as say:
                 chapters = o.chapters(say, c.number)
@@ -188,32 +209,29 @@ def _change(
 def refine(
     run: Run,
     effects: Annotated[
-        str | None,
-        typer.Option("--effects", metavar="A,B", help="Effects to start from, as for identify."),
+        str | None, option("--effects A,B", "Effects to start from, as for identify.")
     ] = None,
     readings: Readings = None,
     from_latest: Annotated[
-        bool, typer.Option("--from-latest", help="Start from the latest revision.")
+        bool, option("--from-latest", "Start from the latest revision.")
     ] = False,
-    revision: Annotated[
-        int | None, typer.Option("--revision", metavar="N", help="Start from this revision.")
-    ] = None,
+    revision: Annotated[int | None, option("--revision N", "Start from this revision.")] = None,
     prior: Prior = None,
     prior_of: PriorOf = "arm",
     drift: Drift = None,
     discover: Annotated[
         bool,
-        typer.Option(
+        option(
             "--discover",
-            help="Where no effect explains the misfit, search a law and add it; its effect is "
+            "Where no effect explains the misfit, search a law and add it; its effect is "
             "written beside the campaign: found.py.",
         ),
     ] = False,
     background: Annotated[
         bool,
-        typer.Option(
+        option(
             "--background/--no-background",
-            help="Where named effects leave more than noise, also fit all others of the catalogue, "
+            "Where named effects leave more than noise, also fit all others of the catalogue, "
             "as a background that predicts.",
         ),
     ] = True,
@@ -274,17 +292,14 @@ def refine(
             ]
             before = len(o.file.revisions())
             numbered = (*begun, *o.append_records(records, *begun))
-            rows: list[Row] = [
-                Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
-                for number, s in zip(numbered, found.steps, strict=True)
-            ]
-        t.show(text_refine.revisions_table([r.shown for r in rows]))
-        t.show(text_refine.key())
+            rows = rows_of(numbered, found.steps)
+        t.show(revisions_table([r.shown for r in rows]))
+        t.show(key())
         t.show(options_line(rows[-1].fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
-        t.show(text.set_aside(found.fit, details))
-        t.show(text_refine.verdict_line(found.diagnosis))
+        t.show(set_aside(found.fit, details))
+        t.show(verdict_line(found.diagnosis))
         if numbered[-1] <= before:
             t.show(f"Revision {numbered[-1]} is this model already; nothing was stored.")
         t.show([*fitted_lines(found.fit)][: None if details else 1])
@@ -304,7 +319,7 @@ def refine(
             t.show(refined_laws(laws))
         last = found.diagnosis
         if last.verdict != "adequate" and not last.dependences:
-            t.show(text.follows(last.misfit_breakdown))
+            t.show(follows(last.misfit_breakdown))
         t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
         steps = zip(rows, found.steps, strict=True)
         chapters = [chapter_of(r.number, s) for r, s in steps]

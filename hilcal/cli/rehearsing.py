@@ -1,34 +1,51 @@
-"""A campaign in a simulated cell: on its devices over real wires, or by drawing of lots alone."""
+"""Simulated cells: `simulate`, and campaigns on their devices or by drawing of lots alone."""
 
+import shlex
+import signal
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 
 from drivers.simulated.on_the_wire import case_of_plan, read_plan, simulated_cell
-from drivers.simulated.rehearsal import Rehearsal, SimulationCase, as_told
+from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, SimulationCase, as_told
 from hilcal.cell import cell_from_config
-from hilcal.cli.planning import make_plan
+from hilcal.cli.options import (
+    POSES,
+    CellFile,
+    EffectsFrom,
+    PlanFile,
+    catalogue_with,
+    check_seed,
+    option,
+)
+from hilcal.cli.planning import make_plan, read_cell
 from hilcal.cli.running import measure
-from hilcal.cli.terminal import Terminal
+from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.config import CellConfig
+from hilcal.config.write import to_toml
 from hilcal.design.checked_plan import refuse
 from hilcal.effects.catalogue import Catalogue
-from hilcal.errors import DeviceError
+from hilcal.errors import DeviceError, InputError
 from hilcal.identification.full_covariance import campaign_readings
 from hilcal.measuring.dry_run import dry_run
+from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.progress import Say, counting, working
-from hilcal.present.text_demo import NEWCOMER
-from hilcal.procedure.procedure import Measure
+from hilcal.procedure.procedure import Measure, Procedure
+from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.store.appended import with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan
+from hilcal.store.plan import Plan, load_plan
+from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, create_run
+from hilcal.whole_file import replace_file
 
 TRIES = 4
 BREAK = 600.0
@@ -221,3 +238,111 @@ def _rehearsal(secret: SimulationCase, config: CellConfig, readings: Readings) -
         strength_sigma=secret.strength_sigma,
         readings=readings,
     )
+
+
+NEXT_SEED = 1000
+"""Between the seeds of two starts: each device takes the seed and a few that follow."""
+
+
+@contextmanager
+def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
+    """Run the simulated devices of a calibration, whose campaign file is there.
+
+    What is true follows from the cell, its first plan and the seed, which do not change. The
+    world's time has gone on since its first start; the devices' noise is another each time.
+    """
+    with CampaignFile.open(p.run) as campaign:
+        plan, log = RunLog(campaign).plans[0], ProcedureLog(campaign)
+        starts = [entry for entry in log.entries() if entry["kind"] == WORLD]
+        now = time.time()
+        log.append(WORLD, {"wall_s": now})
+    choice, seed = p.settings.hide or NOTHING, p.settings.seed
+    secret = case_of_plan(p.config, plan, choice, seed, p.catalogue)
+    passed = now - starts[0]["wall_s"] if starts else 0.0
+    begun = max(passed, 0.0) * p.config.simulation.clock
+    own = seed + NEXT_SEED * len(starts)
+    with simulated_cell(secret, own, p.base_dir, begun=begun) as there:
+        yield there.config
+
+
+FASTEST = 200.0
+"""Clock of a simulated world, as `[simulation] clock` allows."""
+
+
+def simulate(
+    cell: CellFile,
+    output: Annotated[Path, option("-o --output DIR", "Where the devices meet; gets a cell.toml.")],
+    plan: PlanFile = None,
+    hide: Annotated[str | None, option("--hide EFFECT", "An effect, random or nothing.")] = None,
+    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
+    person: Annotated[
+        bool,
+        option(
+            "--person",
+            "`run` asks you for each load, as in a real cell; without it nobody is asked.",
+        ),
+    ] = False,
+    clock: Annotated[
+        float | None,
+        option(
+            "--clock N", "The simulated world goes so many times faster than real time, e.g. 20."
+        ),
+    ] = None,
+    effects_from: EffectsFrom = None,
+) -> None:
+    """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
+    t, catalogue = terminal(False), catalogue_with(effects_from)
+    config, numbers = read_cell(cell)
+    number = check_seed(config.simulation.seed if seed is None else seed)
+    if clock is not None:
+        if not 1.0 <= clock <= FASTEST:
+            raise InputError(f"--clock {clock:g}; valid: a number from 1 to {FASTEST:g}")
+        simulation = config.simulation.model_copy(update={"clock": clock})
+        config = config.model_copy(update={"simulation": simulation})
+    base_dir = cell.absolute().parent
+    choice = hide or config.simulation.hide or NOTHING
+    as_told(config, choice, catalogue)  # refuses what cannot be hidden before anything is planned
+    with working(t.progress) as say:
+        if plan is None:
+            say("planning a campaign, to know how strong an effect has to be")
+            made = make_plan(numbers, config, POSES, number, catalogue, say)
+        else:
+            made = load_plan(plan)
+        say("preparing the simulated cell")
+        secret = case_of_plan(config, made, choice, number, catalogue)
+    if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
+        what = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
+        t.notice(
+            f"warning: deflections are planned and fitted, and {what} in them; set readings = "
+            f'"absolute" in [planning] of {cell} for a campaign that shows it'
+        )
+    with told_to_end(signal.SIGTERM, signal.SIGINT, signal.SIGHUP) as wait, ExitStack() as stack:
+        with working(t.progress) as say:
+            say("starting the devices")
+            there = stack.enter_context(simulated_cell(secret, number, base_dir, output))
+        target = output / "cell.toml"
+        told = with_person(there.config) if person else there.config
+        replace_file(target, to_toml(_placed(told, base_dir)))
+        t.show(f"The devices run. Their cell is {target}; go on in another terminal with:")
+        t.command(shlex.join(("hilcal", "check", str(target))))
+        which = () if plan is None else ("--plan", str(plan))
+        t.command(shlex.join(("hilcal", "run", str(target), *which, "-o", "run.hilcal")))
+        t.show("Ctrl-C ends them.")
+        wait()
+    t.show("The devices have ended.")
+
+
+def with_person(config: CellConfig) -> CellConfig:
+    """Return the configuration of a simulated cell whose loads are left to a person."""
+    options = {**config.operator.options, "person": True}
+    operator = config.operator.model_copy(update={"options": options})
+    return config.model_copy(update={"operator": operator})
+
+
+def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
+    """Return the configuration with a robot's file named by its whole path."""
+    path = base_dir / config.robot.model
+    if not path.suffix:
+        return config
+    robot = config.robot.model_copy(update={"model": str(path.absolute())})
+    return config.model_copy(update={"robot": robot})

@@ -10,23 +10,20 @@ from pathlib import Path
 from types import FrameType
 from typing import Annotated
 
-import typer
-
 from hilcal.cell import Cell
-from hilcal.cli.asking import agreed, somebody_there
-from hilcal.cli.effects_from import EffectsFrom, catalogue_with
-from hilcal.cli.plan_output import POSES
-from hilcal.cli.planning import (
+from hilcal.cli.options import (
+    POSES,
     CellFile,
+    EffectsFrom,
+    Json,
     PlanFile,
-    answer_json,
-    dry_checked,
-    make_checked,
-    read_cell,
-    refuse_unready,
+    View,
+    catalogue_with,
+    option,
 )
-from hilcal.cli.terminal import Json, Terminal, terminal
-from hilcal.cli.viewing import View, followed
+from hilcal.cli.planning import answer_json, dry_checked, make_checked, read_cell, refuse_unready
+from hilcal.cli.showing import followed
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.goal_rule import GoalRule
@@ -47,11 +44,10 @@ from hilcal.measuring.rig import Rig
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
-from hilcal.present.goal_words import full_words, missed_words
-from hilcal.present.live_run import watching
 from hilcal.present.live_viewer import LiveViewer, Several
+from hilcal.present.plan import plan_facts
 from hilcal.present.progress import Say, working
-from hilcal.present.text_plan import plan_facts
+from hilcal.present.running import full_words, missed_words, watching
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
@@ -59,37 +55,28 @@ from hilcal.store.run_log import RunLog, check_same_cell, create_run
 
 def run(
     cell: CellFile,
-    output: Annotated[
-        Path,
-        typer.Option("-o", "--output", metavar="RUN.hilcal", help="The campaign file."),
-    ],
+    output: Annotated[Path, option("-o --output RUN.hilcal", "The campaign file.")],
     plan: PlanFile = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with what is missing in RUN.hilcal.")
+        bool, option("--resume", "Go on with what is missing in RUN.hilcal.")
     ] = False,
     append: Annotated[
-        bool,
-        typer.Option("--append", help="Measure a further plan into RUN.hilcal, see hilcal next."),
+        bool, option("--append", "Measure a further plan into RUN.hilcal, see hilcal next.")
     ] = False,
     rehearse: Annotated[
-        bool, typer.Option("--rehearse", help="On simulated devices, started for this run.")
+        bool, option("--rehearse", "On simulated devices, started for this run.")
     ] = False,
     until: Annotated[
         str | None,
-        typer.Option(
-            "--until",
-            metavar="GOAL",
-            help='End as soon as a goal is met, e.g. "joint std < 2 %" or '
-            '"deflection std < 20 um": '
+        option(
+            "--until GOAL",
+            'End as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std < 20 um": '
             "the arm goes home, and the load is taken off. Exit 4 where all readings do not do; "
             "they are kept.",
         ),
     ] = None,
     yes: Annotated[
-        bool,
-        typer.Option(
-            "--yes", "-y", help="Without --plan: do not ask whether to measure what was planned."
-        ),
+        bool, option("--yes -y", "Without --plan: do not ask whether to measure what was planned.")
     ] = False,
     view: View = False,
     effects_from: EffectsFrom = None,

@@ -1,61 +1,56 @@
-"""`import`: tables in."""
+"""`import`: tables in; with `--preview` a proposal how a table is to be read."""
 
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
-from rich.padding import Padding
 
 from hilcal.cell import Cell
-from hilcal.cli.previewing import show_preview
-from hilcal.cli.terminal import Json, terminal
+from hilcal.cli.options import Json, argument, check_new, option
+from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import description_words, frames_document
 from hilcal.identification.gate import examine
 from hilcal.identification.other_arm import other_arm
 from hilcal.identification.registration import Registration, register
+from hilcal.identification.table_preview import preview_table
 from hilcal.import_campaign import import_campaign
-from hilcal.present import text
-from hilcal.present.covariance_words import covariance_words
+from hilcal.present.document import Words, heading
+from hilcal.present.fit import target_words
+from hilcal.present.preparing import import_preview
 from hilcal.present.progress import working
-from hilcal.present.text_registration import other_arm_line, registration_lines
+from hilcal.present.registration import covariance_words, other_arm_line, registration_lines
 from hilcal.readings.readings import Readings
+from hilcal.tables.guessing.proposal import Proposal
+from hilcal.whole_file import replace_file
 
 
 def import_(
-    table: Annotated[Path, typer.Argument(metavar="TABLE", help="What was measured.")],
+    table: Annotated[Path, argument("TABLE", "What was measured.")],
     config: Annotated[
-        Path | None,
-        typer.Option("--config", metavar="CELL.toml", help="The cell it was measured in."),
+        Path | None, option("--config CELL.toml", "The cell it was measured in.")
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RUN.hilcal",
-            help="The campaign file to make; with --preview, the mapping file.",
+        option(
+            "-o --output RUN.hilcal", "The campaign file to make; with --preview, the mapping file."
         ),
     ] = None,
     kind: Annotated[
         str,
-        typer.Option(
-            "--format",
-            metavar="FORMAT",
-            help="table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
+        option(
+            "--format FORMAT",
+            "table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
         ),
     ] = "table",
     second: Annotated[
-        Path | None,
-        typer.Option("--second", metavar="TABLE", help="The second file, e.g. of the joints."),
+        Path | None, option("--second TABLE", "The second file, e.g. of the joints.")
     ] = None,
     preview: Annotated[
-        bool,
-        typer.Option("--preview", help="Show how the table could be read; make no campaign."),
+        bool, option("--preview", "Show how the table could be read; make no campaign.")
     ] = False,
-    force: Annotated[bool, typer.Option("--force", help="Replace an existing file.")] = False,
+    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
     as_json: Json = False,
 ) -> None:
     """Make a campaign file from a table of readings."""
@@ -74,7 +69,7 @@ def import_(
     notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
-    t.show(text.heading(f"{len(readings)} readings of {poses} poses"))
+    t.show(heading(f"{len(readings)} readings of {poses} poses"))
     t.show(
         f"  robot {settings.robot.model}; each reading is a "
         f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
@@ -82,20 +77,20 @@ def import_(
     )
     targets = _targets(cell, readings)
     if targets:
-        t.show("  targets: " + "; ".join(text.target_words(**x) for x in targets))
-    t.show(Padding(note, (0, 0, 0, 2)) for note in notes)
+        t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
+    t.show(Words(note, indent=2) for note in notes)
     registered = _registered(cell, readings)
     wrong = None if registered is None else examine(registered, readings)
     if registered is not None and not (wrong is not None and wrong.refused):
-        t.show(Padding(line, (0, 0, 0, 2)) for line in registration_lines(registered))
+        t.show(Words(line, indent=2) for line in registration_lines(registered))
     refused = wrong is not None and wrong.refused
     other = None if registered is None or refused else other_arm(registered, readings)
     if other is not None:
-        t.show(Padding(f"Note: {other_arm_line(other)}", (0, 0, 0, 2)))
+        t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
     if wrong is not None:
         said = description_words.words(wrong, cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
-        t.show(Padding(f"{begin}: {said}.", (0, 0, 0, 2)))
+        t.show(Words(f"{begin}: {said}.", indent=2))
     t.document(
         {
             "campaign": str(output),
@@ -135,3 +130,54 @@ def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
         {"name": name, "n_readings": int(count[k]), "known": known[k]}
         for k, name in enumerate(readings.target_names)
     ]
+
+
+def show_preview(
+    t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
+    force: bool,
+) -> None:  # fmt: skip
+    """Print what a table seems to hold; write the mapping file where one is asked for.
+
+    Raises:
+        InputError: a file that cannot be read, or an output that exists.
+    """
+    if output is not None and output.suffix != ".toml":
+        raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
+    if output is not None:
+        check_new(output, force)
+    found = preview_table(table, None if config is None else Cell.load(config), second)
+    proposal, outcome = found.proposal, found.outcome
+    t.show(import_preview(proposal, found.rows, table.name))
+    if outcome:
+        t.show(heading("with this mapping:"))
+        t.show(Words(words, indent=2) for words in outcome)
+    if output is not None:
+        if second is not None:
+            _relative_second(proposal, output)
+        replace_file(output, proposal.to_toml(table.name))
+        t.notice(f"{output}: the mapping; import with --format {output}")
+    else:
+        t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
+    t.document(
+        {
+            "mapping": proposal.sections,
+            "understood": [
+                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+                for u in proposal.understood
+            ],
+            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
+            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
+            "missing": proposal.lacking,
+            "outcome": outcome,
+            "written": None if output is None else str(output),
+        }
+    )
+
+
+def _relative_second(proposal: Proposal, output: Path) -> None:
+    """Write the second file's path relative to the mapping file."""
+    section = proposal.sections["second_file"]
+    section["path"] = str(Path(section["path"]).absolute())
+    here = output.absolute().parent
+    if Path(section["path"]).is_relative_to(here):
+        section["path"] = str(Path(section["path"]).relative_to(here))

@@ -1,13 +1,16 @@
-"""Where output goes: tables or one JSON document on stdout, everything else on stderr."""
+"""The terminal: tables or one JSON document on stdout, all else on stderr; questions, signals."""
 
+import contextlib
 import json
+import signal
 import sys
-from collections.abc import Iterable, Mapping
+import termios
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Annotated, TextIO
+from typing import TextIO
 
-import typer
 from rich.console import Console, RenderableType
 
 from hilcal.cli.failing import error_document
@@ -16,21 +19,6 @@ from hilcal.identification.fit_document import plain
 from hilcal.present.progress import SafeConsole
 
 WIDTH = 100
-
-Json = Annotated[
-    bool, typer.Option("--json", help="One JSON document on stdout; words and progress on stderr.")
-]
-Run = Annotated[Path, typer.Argument(metavar="RUN.hilcal", help="The campaign file.")]
-Revision = Annotated[
-    int | None,
-    typer.Option(
-        "--revision", metavar="N", help="This revision, not the accepted or the latest one."
-    ),
-]
-Details = Annotated[bool, typer.Option("--details", help="Print everything, not one screen of it.")]
-Record = Annotated[
-    Path | None, typer.Option("--record", metavar="F.rrd", help="Write a recording for rerun.")
-]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,3 +91,62 @@ def console(*, stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else WIDTH
     return SafeConsole(file=stream, width=width)
+
+
+YES, NO = ("y", "yes"), ("n", "no", "q")
+
+
+def somebody_there(t: Terminal) -> bool:
+    """Whether a person sees questions and can answer them."""
+    try:
+        return t.progress.is_terminal and sys.stdin.isatty()
+    except (AttributeError, ValueError):  # no standard input, or a closed one
+        return False
+
+
+def agreed(t: Terminal, question: str) -> bool:
+    """Ask until the answer is yes or no; the end of the input is no.
+
+    What was typed before the question is dropped.
+    """
+    with contextlib.suppress(termios.error, OSError, ValueError):
+        termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+    while True:
+        t.progress.print(
+            f"{question} y = yes, n = no: ", end="", markup=False, highlight=False, style="bold"
+        )
+        answer = sys.stdin.readline()
+        if not answer:
+            t.notice("")
+            return False
+        answer = answer.strip().lower()
+        if answer in YES:
+            return True
+        if answer in NO:
+            return False
+        t.notice(f"{answer!r} is no answer. Type y or n, and press Enter.")
+
+
+POLL = 0.2
+"""How long a plea to end may stay unheard where a signal does not wake the sleeper, s."""
+
+
+@contextmanager
+def told_to_end(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
+    """Catch signals; what is yielded waits for the first of them.
+
+    A handler runs between two instructions of the very thread that waits, so it must take no lock:
+    `threading.Event.set` would wait for ever where the thread is just inside `Event.wait`.
+    """
+    asked: list[int] = []
+
+    def wait() -> None:
+        while not asked:
+            time.sleep(POLL)
+
+    before = [signal.signal(kind, lambda number, _: asked.append(number)) for kind in kinds]
+    try:
+        yield wait
+    finally:
+        for kind, handler in zip(kinds, before, strict=True):
+            signal.signal(kind, handler)

@@ -10,7 +10,7 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.measuring.progress import GoalStatus
-from hilcal.tables.quantities import LENGTHS
+from hilcal.tables.units import METRIC
 
 JOINTS = JointCompliance.name
 """The effect that "joint" and "j3" are short for."""
@@ -154,16 +154,16 @@ def parse_goal(text: str) -> Goal:
     if not unit:
         raise _wrong(text, "the unit is missing")
     if what in POSITIONS:
-        if unit not in LENGTHS:
-            raise _wrong(text, f"a {what} is in {', '.join(list(LENGTHS)[:3])}, not {unit}")
-        return Goal(text, what, number * LENGTHS[unit], False, "m")
+        if unit not in METRIC:
+            raise _wrong(text, f"a {what} is in {', '.join(list(METRIC)[:3])}, not {unit}")
+        return Goal(text, what, number * METRIC[unit], False, "m")
     if what == "joint":
         what = JOINTS
     elif re.fullmatch(r"j\d+", what):
         what = f"{JOINTS}.{what}"
     if unit == "%":
         return Goal(text, what, number / 100, True, "")
-    for base, prefixes in (("m", LENGTHS), ("rad", _ANGLES)):
+    for base, prefixes in (("m", METRIC), ("rad", _ANGLES)):
         if unit in prefixes:
             return Goal(text, what, number * prefixes[unit], False, base)
     return Goal(text, what, number, False, unit)

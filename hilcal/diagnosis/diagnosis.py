@@ -1,7 +1,7 @@
 """The judgement of a fit: one frozen value that commands, `refine`, plans, studies and files carry.
 
-It holds data only; `hilcal.present.verdict_words` writes its sentence, and
-`hilcal.present.diagnosis_document` its JSON.
+It holds data only; `hilcal.present.verdict` writes its sentence, and
+`hilcal.present.diagnosis_json` its JSON.
 """
 
 from dataclasses import dataclass
@@ -170,6 +170,6 @@ class Diagnosis:
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
         # The one import upwards: words are written in `report`, and a script has only this value.
-        from hilcal.present.diagnosis_document import to_json
+        from hilcal.present.diagnosis_json import to_json
 
         return to_json(self)

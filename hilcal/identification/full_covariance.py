@@ -21,7 +21,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.tables.stated_noise import rounding_variance, with_rounding
+from hilcal.tables.uncertainty import rounding_variance, with_rounding
 from hilcal.types import Floats
 
 CovarianceParts = Literal[

@@ -44,8 +44,7 @@ from hilcal.model.model import Model
 from hilcal.readings.covariance import INSTRUMENT, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import usual_mode
-from hilcal.tables.imported import ImportResult
-from hilcal.tables.table import FROM_TRACKER
+from hilcal.tables.table import FROM_TRACKER, ImportResult
 from hilcal.types import Floats
 
 SPREAD = 3.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2, with_outliers
 from hilcal.readings.readings import Readings
-from hilcal.tables.tabular import Column
+from hilcal.tables.write import Column
 from hilcal.types import Floats, Ints
 
 ELEMENTS = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")

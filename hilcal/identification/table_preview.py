@@ -16,8 +16,7 @@ from hilcal.identification.gate import examine
 from hilcal.identification.registration import register
 from hilcal.robot.arm import Arm
 from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
-from hilcal.tables.guessing.guesser import FAR, GUESSED, SIDE_BY_SIDE, TURN
-from hilcal.tables.guessing.proposal import Proposal, Understood
+from hilcal.tables.guessing.proposal import FAR, GUESSED, SIDE_BY_SIDE, TURN, Proposal, Understood
 from hilcal.tables.guessing.propose import Proposed, propose
 from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping

@@ -1,7 +1,6 @@
-"""From fits and diagnoses to the `Story` that the viewer draws."""
+"""From fits and diagnoses to the `Story` that charts and viewer draw."""
 
 import itertools
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,43 +10,38 @@ import numpy as np
 from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect, candidates
+from hilcal.diagnosis.effect_ranking import Suspect, candidates
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.drawn_law import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
-from hilcal.identification.fit_document import finite
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
-from hilcal.present.story import (
-    Regressor,
-    Story,
-    StoryCurve,
-    StoryLaw,
-    StoryLimit,
-    StoryParameter,
-    StoryRevision,
-    StoryRival,
-    StorySuspect,
+from hilcal.present.diagnosis import (
+    diagnosis_report,
+    moves,
+    revision_cells,
+    shown_suspects,
+    suspects_table,
 )
-from hilcal.present.text_discover import coefficient
-from hilcal.present.text_seen import own_units
-from hilcal.present.verdict_words import message
-from hilcal.readings.whitening import Mode
+from hilcal.present.discovery import coefficient
+from hilcal.present.document import Block
+from hilcal.present.fit import errors, misses, model_name, parameters
+from hilcal.present.story import Curve, Mode, Story, StoryRevision
+from hilcal.present.verdict import message
 from hilcal.store.revision import change
 from hilcal.types import Floats, Ints
 
-CERTAIN = 0.005
 MOST_NUMBER = 10**9
-NEAR = 0.99  # component from which a direction is called an axis
 UNDIAGNOSED = "not diagnosed"
 LITTLE = 0.2
 """Share of the predictable misfit that the first suspect must explain for its own chart to be
 shown, not those of the variables; a guess."""
 LEAST_CARRIED = 0.02
 """Share of the misfit below which a variable is not shown; a guess."""
+MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,114 +151,100 @@ def _turn(axes: Floats, vectors: Floats) -> Floats:
 
 
 def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> StoryRevision:
-    residual = _turn(axes, e.raw[:, :3])
-    d = c.diagnosis
-    shown = () if d is None else _shown(d)
-    curves = () if d is None else _curves(d)
+    residual, d = _turn(axes, e.raw[:, :3]), c.diagnosis
+    changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
+    verdict = UNDIAGNOSED if d is None else d.verdict
     return StoryRevision(
         revision=c.number,
-        change=change(c.added, c.removed, c.fit.readings.arm_scatter is not None),
-        model=c.fit.model.named,
-        verdict=UNDIAGNOSED if d is None else d.verdict,
+        change=changed,
+        verdict=verdict,
         message="run hilcal diagnose for a verdict" if d is None else message(d),
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
         error_fit=c.fit.error.to_json(),
         error_holdout=c.fit.holdout.to_json(),
-        variance_factor=c.fit.variance_factor,
-        suspects=tuple(
-            StorySuspect(s.effect, s.share, s.holdout_share, s.score.p_value, s.same_as)
-            for s in shown
-        ),
-        parameters=story_parameters(c.fit),
-        regressor=regressor(c.fit, shown[0]) if shown and not curves else None,
-        curves=curves,
-        rivals=()
-        if d is None
-        else tuple(StoryRival(r.effect, r.unlike, r.times) for r in d.separability),
-        limits=() if d is None else _limits(d),
-        tested=0 if d is None else d.tested,
-        level=FALSE_ALARM,
-        laws=story_laws(c.fit),
+        cells=revision_cells(c.number, changed, c.fit, verdict),
+        panels=_panels(c),
+        follows=None if d is None else _follows(d),
+        laws=laws(c.fit),
     )
 
 
-def story_laws(fit: Fit) -> tuple[StoryLaw, ...]:
+def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
+    d = c.diagnosis
+    verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
+    details: list[Block] = [misses(c.fit)]
+    if d is not None:
+        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
+        if d.significant:
+            verdict.append(suspects_table(d, MOST_SUSPECTS))
+        details = list(diagnosis_report(d))
+        if (drawn := _follows(d)) is not None:
+            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
+    return {
+        "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
+        "details": (*details, errors(c.fit)),
+        "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
+    }
+
+
+def _follows(d: Diagnosis) -> Curve | None:
+    known = 0.0 if d.lead is None else d.lead.holdout_share
+    explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
+    carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
+    if carried and d.verdict != "adequate" and not explained:
+        return curve(carried[0])
+    suspects = [] if d.lead is None else shown_suspects(d)
+    return regressor(d.fit, suspects[0]) if suspects else None
+
+
+def laws(fit: Fit) -> tuple[Curve, ...]:
     """Return the curves of laws from files, in units for people; see `drawn_laws`."""
-    found, out = story_parameters(fit), []
+    out = []
     for law in drawn_laws(fit):
-        mine = [p for p in found if p.name.startswith(f"{law.name}.") and p.value is not None]
         told = [
-            f"{name} = {coefficient(Coefficient(name, p.value or 0.0, p.std or 0.0, p.unit))}"
-            for name, p in zip([p.name.partition(".")[2] for p in mine], mine, strict=True)
+            f"{p.name.partition('.')[2]} = "
+            + coefficient(Coefficient(p.name, p.value or 0.0, p.std or 0.0, p.unit))
+            for p in fit.parameters
+            if p.name.startswith(f"{law.name}.") and p.value is not None
         ]
+        acts, coefficients = ", ".join(law.acts_on), ", ".join(told)
+        facts = (("law", law.formula), ("acts on", acts), ("coefficients", coefficients))
         for c in law.curves:
             x, y, error, _ = c.binned
-            to_people = 180.0 / np.pi if c.quantity_unit == "rad" else 1.0
-            x_unit = "°" if c.quantity_unit == "rad" else c.quantity_unit
+            x_unit, x_factor = numbers.angle_or(c.quantity_unit)
             y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
             out.append(
-                StoryLaw(
+                Curve(
                     law.name,
-                    law.formula,
-                    ", ".join(law.acts_on),
-                    ", ".join(told),
-                    to_people * x,
+                    f"{law.formula}: where it is right, the readings lie on it.",
+                    x_factor * x,
                     factor * y,
-                    factor * error,
-                    np.vstack([to_people * c.line[0], factor * c.line[1]]),
-                    c.quantity if x_unit == "1" else f"{c.quantity} [{x_unit}]",
+                    c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]",
                     f"{c.of} of {c.site} [{y_unit}]",
+                    factor * error,
+                    line=np.vstack([x_factor * c.line[0], factor * c.line[1]]),
+                    facts=facts,
                 )
             )
     return tuple(out)
 
 
-def _shown(d: Diagnosis) -> tuple[Suspect, ...]:
-    """Suspects worth showing: those that pass the test, then those that nearly do, each best first.
-
-    None where nothing is wrong.
-    """
-    if d.lead is None:
-        return ()
-    return tuple(s for s in d.suspects if s.passes or s.score.p_value < CERTAIN)
-
-
-def _curves(d: Diagnosis) -> tuple[StoryCurve, ...]:
-    """Variables that carry the misfit, where the lead explains little of what is predictable."""
-    known = 0.0 if d.lead is None else d.lead.holdout_share
-    explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
-    if d.verdict == "adequate" or explained:
-        return ()
-    carried = (v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined)
-    return tuple(curve(v) for v in carried)
-
-
-def curve(d: Dependence) -> StoryCurve:
+def curve(d: Dependence) -> Curve:
     """Return a dependence in units for people."""
     x_unit, x_factor = _unit_of(d)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
-    return StoryCurve(
-        variable=d.variable,
-        share=d.share,
-        x=x_factor * d.x,
-        y=y_factor * d.y,
-        error=y_factor * d.error,
-        x_label=f"{d.variable} [{x_unit}]" if x_unit else d.variable,
-        y_label=f"error of {_moved(d)} [{y_unit}]",
-        names=d.labels,
+    return Curve(
+        d.variable,
+        f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}.",
+        x_factor * d.x,
+        y_factor * d.y,
+        f"{d.variable} [{x_unit}]" if x_unit else d.variable,
+        f"error of {moves(d)} [{y_unit}]",
+        y_factor * d.error,
+        d.labels,
     )
-
-
-def _moved(d: Dependence) -> str:
-    """What errs with a variable; a direction is in base axes."""
-    if d.y_unit == "rad":
-        return d.moves
-    main = int(np.argmax(np.abs(d.direction)))
-    if d.direction[main] > NEAR:
-        return f"{d.moves} along base {'xyz'[main]}"
-    return f"{d.moves} along ({', '.join(f'{v:.2f}' for v in d.direction)})"
 
 
 def _unit_of(d: Dependence) -> tuple[str, float]:
@@ -277,35 +257,7 @@ def _unit_of(d: Dependence) -> tuple[str, float]:
     return d.unit, 1.0
 
 
-def _limits(d: Diagnosis) -> tuple[StoryLimit, ...]:
-    """What could have been seen of the effects that were not found, the best visible first."""
-    rest = [
-        (s.least.displacement_m if s.shown else math.inf, s) for s in d.suspects if not s.passes
-    ]
-    return tuple(
-        StoryLimit(s.effect, least, own_units(s.least) if s.shown else "")
-        for least, s in sorted(rest, key=lambda of: of[0])
-    )
-
-
-def story_parameters(fit: Fit) -> tuple[StoryParameter, ...]:
-    """Parameters that are not held at zero."""
-    u, estimated = fit.uncertainty, fit.solution.estimated
-    parameters = [(e.name, p) for e in fit.model.effects for p in e.parameters]
-    return tuple(
-        StoryParameter(
-            name=f"{effect}.{p.name}",
-            value=float(fit.theta[k]) if u.identifiable[k] else None,
-            std=finite(u.std[k]) if u.identifiable[k] else None,
-            unit=p.unit,
-            identifiable=bool(u.identifiable[k]),
-        )
-        for k, (effect, p) in enumerate(parameters)
-        if estimated[k]
-    )
-
-
-def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
+def regressor(fit: Fit, suspect: Suspect) -> Curve | None:
     """Residual against what the suspect would explain, both along the suspect's own direction.
 
     With X the suspect's columns, freed of what the fitted model can do, and s its estimated
@@ -334,9 +286,11 @@ def regressor(fit: Fit, suspect: Suspect) -> Regressor | None:
     main = np.linalg.svd(c, full_matrices=False)[2][0]
     side = np.where(c @ main < 0, -1.0, 1.0)[seen]
     along = np.sum(fit.raw[seen, :3] * c[seen], axis=1) / size[seen]
-    return Regressor(
-        x=1e6 * side * size[seen],
-        y=1e6 * side * along,
-        x_label=f"what {suspect.effect} would explain [µm]",
-        y_label="residual along it [µm]",
+    return Curve(
+        suspect.effect,
+        f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
+        1e6 * side * size[seen],
+        1e6 * side * along,
+        f"what {suspect.effect} would explain [µm]",
+        "residual along it [µm]",
     )

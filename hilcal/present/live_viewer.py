@@ -17,16 +17,52 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
 from hilcal.cell import Cell
 from hilcal.measuring.progress import ArmAt
 from hilcal.present.build_story import Chapter, build_story
-from hilcal.present.live_messages import Measuring, Revised
 from hilcal.present.progress import Say
-from hilcal.store.plan import Step
+from hilcal.present.story import Story
+from hilcal.robot.arm import Arm
+from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
+from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measuring:
+    """A campaign begins, or goes on, to be measured.
+
+    Attributes:
+        name: of the campaign.
+        arm: the arm.
+        targets: (T, 3) tracked targets, flange axes, m.
+        plan: the whole plan.
+        earlier: what earlier sessions stored, each with its time of day, s.
+        names: of the targets, where there are several.
+    """
+
+    name: str
+    arm: Arm
+    targets: Floats
+    plan: Plan
+    earlier: tuple[tuple[float, Step], ...] = ()
+    names: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Revised:
+    """A revision has been fitted and judged.
+
+    Attributes:
+        story: the readings, and this revision alone.
+    """
+
+    story: Story
+
 
 PORT = 9877
 """Not 9876: there a viewer listens itself, and one that finds it taken opens no window."""

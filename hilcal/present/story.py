@@ -1,180 +1,95 @@
-"""The story that a viewer tells: readings, and one model revision after another."""
+"""A campaign as it is drawn: its readings, and one model revision after another, in base axes."""
 
-import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from scipy import stats
 
-from hilcal.errors import InputError
+from hilcal.present.document import Block
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
-ERROR_KEYS = ("rms_m", "mean_m", "max_m", "rms_sigma")
+LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
+LIMITS = (0.99, 0.9999)
+"""Quantiles of χ²(3) from which a reading is doubtful, and outside: noise does that once in 100,
+and in 10,000 readings."""
+REVISION_HEADS = (
+    *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
+    *("variance\nfactor", "verdict"),
+)
+"""Of a table of revisions."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoryParameter:
-    """One parameter of a fit; `value` and `std` in `unit`, None where not identifiable."""
-
-    name: str
-    value: float | None
-    std: float | None
-    unit: str
-    identifiable: bool
+def levels(norm2: Floats) -> Ints:
+    """Level (N,) of squared Mahalanobis distances (N,), 3 dof, into `LEVEL_NAMES`."""
+    return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
-@dataclass(frozen=True, slots=True)
-class StorySuspect:
-    """One missing effect that would explain part of the misfit.
-
-    Attributes:
-        effect: its name.
-        share: share of the misfit that it explains on the fitted readings, 0..1.
-        holdout_share: the same on readings left out; may be negative.
-        p_value: of the joint test on the whitened residual.
-        same_as: effects that the readings do not separate from it.
-    """
-
-    effect: str
-    share: float
-    holdout_share: float
-    p_value: float
-    same_as: tuple[str, ...] = ()
+def worst_and_even(badness: Floats, most: int) -> Ints:
+    """Return at most `most` indices, growing: the worst fifth, the others chosen evenly."""
+    if len(badness) <= most:
+        return np.arange(len(badness))
+    worst = np.argsort(-badness, kind="stable")[: max(1, most // 5)]
+    rest = np.setdiff1d(np.arange(len(badness)), worst)
+    even = rest[np.linspace(0, len(rest) - 1, most - len(worst)).round().astype(np.int64)]
+    return np.sort(np.concatenate([worst, np.unique(even)]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Regressor:
-    """A residual component against what the leading suspect says that it depends on.
+class Curve:
+    """Something over a variable that it may follow; units as the labels name them.
 
     Attributes:
-        x: (K,) regressor, in the units that `x_label` names.
-        y: (K,) residual, in the units that `y_label` names.
-    """
-
-    x: Floats
-    y: Floats
-    x_label: str
-    y_label: str
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoryCurve:
-    """How the misfit depends on one recorded variable; units as the labels name them.
-
-    Attributes:
-        variable: e.g. "joint 4 angle".
-        share: share of the misfit on poses left out that is lost without the variable.
-        x: (K,) centres of bins of the variable.
-        y: (K,) mean error in each bin.
-        error: (K,) its standard uncertainty.
+        title: the variable, the suspect or the law.
+        says: a sentence on it.
+        x: (K,) of the variable: of single readings, or centres of bins.
+        y: (K,) residual, or its mean in the bin.
         x_label: the variable with its unit.
-        y_label: what errs, with its unit.
-        names: (K,) names of the bins, where x only counts them; else empty.
+        y_label: what errs or moves, with its unit.
+        error: (K,) standard uncertainty of the means; None of single readings.
+        names: (K,) of the bins, where x only counts them; else empty.
+        line: (2, L) the variable, and the law; None without one.
+        facts: what a law is, in names and words.
     """
 
-    variable: str
-    share: float
+    title: str
+    says: str
     x: Floats
     y: Floats
-    error: Floats
     x_label: str
     y_label: str
+    error: Floats | None = None
     names: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoryLaw:
-    """A law of the model that the catalogue does not have; units as the labels name them.
-
-    Attributes:
-        name: of its effect.
-        formula: it.
-        acts_on: where it acts.
-        coefficients: with their standard uncertainties, in words.
-        x: (K,) mean of a quantity that it depends on, in bins of readings.
-        y: (K,) what the readings of the bin say by themselves.
-        error: (K,) its standard uncertainty.
-        line: (2, L) the same quantity, and the law.
-        x_label: the quantity with its unit.
-        y_label: what the law moves, with its unit.
-    """
-
-    name: str
-    formula: str
-    acts_on: str
-    coefficients: str
-    x: Floats
-    y: Floats
-    error: Floats
-    line: Floats
-    x_label: str
-    y_label: str
-
-
-@dataclass(frozen=True, slots=True)
-class StoryLimit:
-    """The smallest strength at which an effect that was not found would have been named.
-
-    Attributes:
-        effect: its name.
-        displacement_m: rms displacement of the target, m; infinite where no strength would do.
-        parameters: rms of the parameters that make it, in words.
-    """
-
-    effect: str
-    displacement_m: float
-    parameters: str
-
-
-@dataclass(frozen=True, slots=True)
-class StoryRival:
-    """An effect that the readings do not separate from the leading suspect.
-
-    Attributes:
-        effect: its name.
-        unlike: share of what the suspect does that the rival cannot imitate.
-        times: how many times as many readings would separate them; infinite where none would.
-    """
-
-    effect: str
-    unlike: float
-    times: float
+    line: Floats | None = None
+    facts: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoryRevision:
-    """One fitted model revision.
+    """One fitted model revision of N readings.
 
     Attributes:
         revision: its number, growing along the story.
         change: what it changed, e.g. "+ hysteresis"; empty for the first.
-        model: names of all effects in it.
-        verdict: one of the verdicts of `diagnose`.
+        verdict: one of the verdicts of `diagnose`, or `UNDIAGNOSED`.
         message: the verdict in words.
         residual: (N, 3) measured - predicted, base axes, m.
         predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
         whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
-        error_fit: error of the fitted readings, keys `ERROR_KEYS`.
+        error_fit: error of the fitted readings, keys "rms_m", "mean_m", "max_m", "rms_sigma".
         error_holdout: error of whole poses left out, same keys.
-        variance_factor: whitened residual sum of squares by degrees of freedom.
-        suspects: missing effects, best first.
-        parameters: the fit's parameters.
-        regressor: what the leading suspect would bend straight; None when there is none.
-        curves: variables that carry the misfit, largest share first, where the leading suspect
-            explains little of it or there is none; else empty.
-        rivals: effects that the readings do not separate from the leading suspect.
-        limits: from which strength the effects that were not found would have been named.
-        tested: how many effects were tested; 0 where it was not diagnosed.
-        level: chance of naming any of them where none is missing.
+        cells: of its row in a table of revisions.
+        panels: "verdict", "details" and "parameters" in words and tables.
+        follows: what the residual follows: the variable that carries most of it, where the first
+            suspect explains little of that, else the first suspect; None where there is neither.
         laws: of the model, which the catalogue does not have; one entry per curve.
     """
 
     revision: int
     change: str
-    model: tuple[str, ...]
     verdict: str
     message: str
     residual: Floats
@@ -182,16 +97,15 @@ class StoryRevision:
     whitened_norm2: Floats
     error_fit: Mapping[str, float]
     error_holdout: Mapping[str, float]
-    variance_factor: float
-    suspects: tuple[StorySuspect, ...] = ()
-    parameters: tuple[StoryParameter, ...] = ()
-    regressor: Regressor | None = None
-    curves: tuple[StoryCurve, ...] = ()
-    rivals: tuple[StoryRival, ...] = ()
-    limits: tuple[StoryLimit, ...] = ()
-    tested: int = 0
-    level: float = 1.0
-    laws: tuple[StoryLaw, ...] = ()
+    cells: tuple[str, ...] = ()
+    panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
+    follows: Curve | None = None
+    laws: tuple[Curve, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """What it changed, or its model where it is the first."""
+        return self.change or (self.cells[1] if self.cells else "first model")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,55 +153,3 @@ class Story:
     def __len__(self) -> int:
         """Return the number of readings N."""
         return len(self.pose)
-
-
-def check(story: Story) -> None:
-    """Check shapes, finiteness and the order of revisions.
-
-    Raises:
-        InputError: names the first field that is wrong and the shape that it should have.
-    """
-    n = len(story)
-    if n == 0:
-        raise InputError("story.pose: no readings; at least one is needed")
-    if not story.revisions:
-        raise InputError("story.revisions: empty; at least one fitted revision is needed")
-    if len(story.load_names) != n:
-        raise InputError(f"story.load_names: {len(story.load_names)} names for {n} readings")
-    if len(story.pose_names) not in (0, n):
-        raise InputError(f"story.pose_names: {len(story.pose_names)} names for {n} readings")
-    _array("story.q", story.q, (n, story.arm.n))
-    _array("story.anchor", story.anchor, (n, 3))
-    _array("story.measured", story.measured, (n, 3))
-    _array("story.covariance", story.covariance, (n, 3, 3))
-    if not (np.isfinite(story.noise_floor_m) and story.noise_floor_m >= 0):
-        raise InputError(f"story.noise_floor_m: {story.noise_floor_m}; must be finite and >= 0")
-    numbers = [r.revision for r in story.revisions]
-    if any(b <= a for a, b in itertools.pairwise(numbers)):
-        raise InputError(f"story.revisions: numbers {numbers} do not grow")
-    for r in story.revisions:
-        where = f"revision {r.revision}"
-        _array(f"{where}: residual", r.residual, (n, 3))
-        _array(f"{where}: predicted", r.predicted, (n, 3))
-        _array(f"{where}: whitened_norm2", r.whitened_norm2, (n,))
-        for name, error in (("error_fit", r.error_fit), ("error_holdout", r.error_holdout)):
-            missing = [k for k in ERROR_KEYS if k not in error]
-            if missing:
-                raise InputError(
-                    f"{where}: {name} lacks {', '.join(missing)}; needs {', '.join(ERROR_KEYS)}"
-                )
-        if r.regressor is not None and r.regressor.x.shape != r.regressor.y.shape:
-            raise InputError(f"{where}: regressor x and y differ in length")
-        for c in r.curves:
-            for name, value in (("x", c.x), ("y", c.y), ("error", c.error)):
-                _array(f"{where}: {name} of the curve of {c.variable}", value, (len(c.x),))
-            if len(c.x) == 0 or len(c.names) not in (0, len(c.x)):
-                raise InputError(f"{where}: the curve of {c.variable} lacks points or their names")
-
-
-def _array(name: str, value: Floats, shape: tuple[int, ...]) -> None:
-    if value.shape != shape:
-        raise InputError(f"{name}: shape {value.shape}, should be {shape}")
-    if not np.isfinite(value).all():
-        row = int(np.argwhere(~np.isfinite(value))[0][0])
-        raise InputError(f"{name}: not finite in row {row}")

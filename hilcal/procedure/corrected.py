@@ -16,7 +16,7 @@ from hilcal.design.feasible import REASONS, Space
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
-from hilcal.present.text_compensate import refusals
+from hilcal.present.calibration import refusals
 from hilcal.procedure.expected import expected_states
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
 from hilcal.readings.readings import Readings, States

@@ -9,7 +9,7 @@ from hilcal.readings.covariance import smallest_correlation
 from hilcal.readings.readings import SAME_POSE
 from hilcal.robot.arm import Arm
 from hilcal.tables.columns import POSITION, ROTATION, WRENCH
-from hilcal.tables.csvfile import CsvTable
+from hilcal.tables.grid import Table
 from hilcal.types import Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
@@ -20,7 +20,7 @@ _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
 _G = 9.80665
 
 
-def check_joints(table: CsvTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
+def check_joints(table: Table, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
     """Refuse commanded joints beyond the arm's limits; (N, n), rad.
 
     Raises:
@@ -38,7 +38,7 @@ def check_joints(table: CsvTable, names: tuple[str, ...], q: Floats, arm: Arm) -
     )
 
 
-def check_actual_joints(table: CsvTable, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
+def check_actual_joints(table: Table, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
     """Refuse encoder readings that are not near the commanded joints; (N, n), rad.
 
     Raises:
@@ -53,7 +53,7 @@ def check_actual_joints(table: CsvTable, names: tuple[str, ...], actual: Floats,
         )
 
 
-def check_positions(table: CsvTable, position: Floats, q: Floats, arm: Arm) -> None:
+def check_positions(table: Table, position: Floats, q: Floats, arm: Arm) -> None:
     """Refuse positions (N, 3) that cannot be metres.
 
     No reading is further than 100 m from its instrument; all lie within a few reaches of each
@@ -94,7 +94,7 @@ def _looks_like(position: Floats, distance: float) -> str:
     return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
 
 
-def check_rotations(table: CsvTable, rotation: Floats) -> None:
+def check_rotations(table: Table, rotation: Floats) -> None:
     """Refuse rotation vectors (N, 3) of more than a turn.
 
     Raises:
@@ -109,7 +109,7 @@ def check_rotations(table: CsvTable, rotation: Floats) -> None:
         )
 
 
-def check_covariances(table: CsvTable, covariance: Floats) -> None:
+def check_covariances(table: Table, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
@@ -153,7 +153,7 @@ def check_covariances(table: CsvTable, covariance: Floats) -> None:
         )
 
 
-def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
+def check_wrenches(table: Table, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
     """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm.
 
     Raises:
@@ -163,16 +163,12 @@ def check_wrenches(table: CsvTable, wrench: Floats, load: Ints, names: list[str]
     loaded = unloaded[:, None] & (wrench != 0)
     limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
     heavy = (np.abs(wrench) > limit) & (arm.payload > 0)
-    for bad, why in (
-        (loaded, "the load is 'none', so the wrench must be 0"),
-        (heavy, f"beyond 20 times the payload of {arm.name}; expected N and N·m"),
-    ):
-        if bad.any():
-            i, j = divmod(int(np.argmax(bad)), 6)
-            raise InputError(f"{table.at(i, WRENCH[j])}: {wrench[i, j]:g}: {why}")
+    beyond = f"beyond 20 times the payload of {arm.name}; expected N and N·m"
+    table.refuse(loaded, WRENCH, lambda v: f"{v:g}: the load is 'none', so the wrench must be 0")
+    table.refuse(heavy, WRENCH, lambda v: f"{v:g}: {beyond}")
 
 
-def check_names(table: CsvTable) -> None:
+def check_names(table: Table) -> None:
     """Refuse empty poses and loads, and other spellings of `none`.
 
     Raises:
@@ -189,7 +185,7 @@ def check_names(table: CsvTable) -> None:
         raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
 
 
-def check_same_pose(table: CsvTable, pose: Ints, names: list[str], q: Floats) -> None:
+def check_same_pose(table: Table, pose: Ints, names: list[str], q: Floats) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows.
 
     Raises:

@@ -1,10 +1,15 @@
-"""Names of the exchange table's columns, and what to say about a wrong header."""
+"""Columns of the exchange table: names, what a wrong header lacks, joints that mimic others."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from dataclasses import replace
 from difflib import get_close_matches
 
+import numpy as np
+
 from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
+from hilcal.tables.grid import Table
 
 POSITION = ("x_m", "y_m", "z_m")
 ROTATION = ("rx_rad", "ry_rad", "rz_rad")
@@ -13,6 +18,9 @@ TEXT = ("pose", "load")
 TARGET = "target"
 COVERS = "covers"
 OWN_PREFIX = "x_"
+AGREES = 2e-3
+"""How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
+which tables round. A choice."""
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -150,3 +158,45 @@ def covariance_size(path: str, header: Sequence[str]) -> int | None:
             f"{path}: column '{extra[0]}' needs the rotation vector {', '.join(ROTATION)}"
         )
     return m
+
+
+def following_columns(arm: Arm) -> tuple[str, ...]:
+    """Columns of joints that a table may leave out."""
+    names = (joint_columns(arm.n), actual_columns(arm.n))
+    return tuple(n for group in names for n, own in zip(group, arm.own, strict=True) if not own)
+
+
+def own_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]:
+    """Return the names of all joints' columns, or of those with a value of their own."""
+    if count == len(names):
+        return names
+    return tuple(name for name, own in zip(names, arm.own, strict=True) if own)
+
+
+def with_following(table: Table, arm: Arm) -> Table:
+    """Return the table with the values of mimic joints as they follow from the others.
+
+    Raises:
+        InputError: a value is given and is another one.
+    """
+    if arm.own.all():
+        return table
+    number = dict(table.number)
+    for names in (joint_columns(arm.n), actual_columns(arm.n)):
+        own = [name for name, is_own in zip(names, arm.own, strict=True) if is_own]
+        if not set(own) <= number.keys():
+            continue
+        nothing = np.full(len(number[own[0]]), np.nan)
+        q = np.stack([number.get(name, nothing) for name in names], axis=1)
+        full = arm.complete(q)
+        for k in np.flatnonzero(~arm.own):
+            off = np.abs(q[:, k] - full[:, k]) > AGREES  # False where there is no value
+            if off.any():
+                i = int(np.argmax(off))
+                raise InputError(
+                    f"{table.at(i, names[k])}: {q[i, k]:g} rad, but by the arm's description "
+                    f"{arm.joint_names[k]} follows to {full[i, k]:g} rad; leave the column out, or "
+                    "correct <mimic> in the URDF"
+                )
+            number[names[k]] = full[:, k]
+    return replace(table, number=number)

@@ -1,40 +1,31 @@
-"""A table as a file holds it: named columns of cells, and how cells become numbers.
+"""A table as a file holds it, named columns of cells, and the columns that were understood.
 
-Delimited text of any dialect is read here, spreadsheets, MAT and Parquet files in
-`hilcal.tables.sheets`; what the columns mean is said by a mapping (`hilcal.tables.mapping`).
+Files become a `Grid` in `hilcal.tables.files`; what its columns mean is said by their names (the
+exchange table) or by a mapping, and makes a `Table` of numbers and texts of it.
 """
 
-import csv
-import io
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from datetime import datetime
-from pathlib import Path
 
 import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names, from_csv
-from hilcal.tables.mapping_sections import FileFormat
+from hilcal.tables.mapping import FileFormat
+from hilcal.toml import suggest
 from hilcal.types import Bools, Floats, Ints
 
 Cell = str | float | datetime | None
+Check = Callable[[Sequence[str]], object]
+"""Refuses a header that is not what it should be, before anything else is found wrong."""
 
 BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
 """What stands for a missing number, in small letters."""
 
-SEPARATORS = {"tab": "\t", "blanks": " "}
-"""Separators that have a name in a mapping file."""
-
 _PLAIN = str.maketrans({"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2019": "'"})
 """Signs that programs write in place of minus, blank and apostrophe."""
-
-BYTE_ORDER_MARKS = (
-    (b"\xef\xbb\xbf", "utf-8-sig"),
-    (b"\xff\xfe", "utf-16"),
-    (b"\xfe\xff", "utf-16"),
-)
 
 _SHOWN = 12
 """Columns that a message lists; the rest are counted."""
@@ -65,9 +56,9 @@ class Grid:
         limits.check_cells(self.path, len(self.rows), len(self.names))
         check_names(self.names, f"{self.path}: column")
 
-    def at(self, index: int, column: str) -> str:
+    def at(self, index: int, column: str | int) -> str:
         """Where a cell is, for messages."""
-        return f"{self.path}: row {self.rows[index]}, column '{column}'"
+        return f"{self.path}: row {self.rows[index]}, column '{self.name(column)}'"
 
     def name(self, column: str | int) -> str:
         """Return the name of a column that a mapping gives by name or by number, from 1.
@@ -83,8 +74,6 @@ class Grid:
                 )
             return self.names[column - 1]
         if column not in self.names:
-            from hilcal.toml import suggest
-
             more = len(self.names) - _SHOWN
             rest = f" and {more} more" if more > 0 else ""
             raise InputError(
@@ -107,41 +96,94 @@ class Grid:
         Raises:
             InputError: no such column, or a text that no name may be.
         """
-        name = self.name(column)
-        cells = (_text(c) for c in self.cells(column))
-        return [from_csv(check_name(c, self.at(k, name))) for k, c in enumerate(cells)]
+        cells = (text_of(c) for c in self.cells(column))
+        return [from_csv(check_name(c, self.at(k, column))) for k, c in enumerate(cells)]
 
-    def numbers(self, column: str | int) -> Floats:
+    def numbers(self, column: str | int, *, complete: bool = False) -> Floats:
         """(N,) numbers of a column, NaN where a value is missing.
+
+        Args:
+            column: its name or number.
+            complete: whether no value may be missing.
 
         Raises:
             InputError: no such column, or a cell that is neither a number nor missing.
         """
         cells, how = self.cells(column), self.formats[self.names.index(self.name(column))]
         values = np.fromiter((number(c, how) for c in cells), dtype=float, count=len(cells))
-        bad = np.isinf(values)
+        bad = ~np.isfinite(values) if complete else np.isinf(values)
         if bad.any():
             k = int(np.argmax(bad))
-            raise InputError(f"{self.at(k, self.name(column))}: {_complaint(cells[k], how)}")
+            raise InputError(f"{self.at(k, column)}: {_complaint(cells[k], how, complete)}")
         for mark in how.missing:
             if isinstance(mark, float | int):
                 values[values == mark] = np.nan
         return values
 
-    def rows_with(self, keep: Bools) -> "Grid":
-        """Return the chosen rows."""
-        at = np.flatnonzero(keep)
-        return Grid(
-            self.path,
-            self.names,
-            self.rows[keep],
-            tuple([c[int(k)] for k in at] for c in self.columns),
-            self.formats,
-            self.units,
-        )
+    def rows_with(self, keep: Bools | Ints) -> "Grid":
+        """Return the chosen rows, by a mask or by their numbers from 0, also several times."""
+        at = np.arange(len(self.rows))[keep].tolist()
+        columns = tuple([c[k] for k in at] for c in self.columns)
+        return replace(self, rows=self.rows[at], columns=columns)
+
+    def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
+        """Return the table with a further column, written as another one is."""
+        how = self.formats[self.names.index(self.name(like))]
+        names, columns = (*self.names, name), (*self.columns, cells)
+        return replace(self, names=names, columns=columns, formats=(*self.formats, how))
 
 
-def _text(cell: Cell) -> str:
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """Columns that were understood, in SI units where they are numbers.
+
+    Attributes:
+        path: the file's name, for messages.
+        rows: (N,) row of each record as an editor or a spreadsheet counts.
+        text: text columns by name, N cells each, without blanks around.
+        number: (N,) number columns by name.
+        alias: what the file itself calls a column, where it is another name than here.
+    """
+
+    path: str
+    rows: Ints
+    text: dict[str, list[str]]
+    number: dict[str, Floats]
+    alias: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, grid: Grid, text: Sequence[str], number: Sequence[str]) -> "Table":
+        """Return the columns of these names; each of their cells has a value.
+
+        Raises:
+            InputError: a cell that is no number; names row and column.
+        """
+        numbers = {name: grid.numbers(name, complete=True) for name in number}
+        return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
+
+    def at(self, index: int, column: str | None = None) -> str:
+        """Where a record (and a cell) is, for messages."""
+        where = f"{self.path}: row {self.rows[index]}"
+        return where if column is None else f"{where}, column '{self.alias.get(column, column)}'"
+
+    def matrix(self, names: Sequence[str]) -> Floats:
+        """(N, k) number columns side by side."""
+        return np.stack([self.number[name] for name in names], axis=1)
+
+    def refuse(self, bad: Bools, names: Sequence[str], what: Callable[[float], str]) -> None:
+        """Raise for the first true cell of an (N, k) mask over number columns.
+
+        Raises:
+            InputError: a cell is marked; `what` makes from its value the reason.
+        """
+        if bad.any():
+            i, j = divmod(int(np.argmax(bad)), bad.shape[1])
+            value = float(self.number[names[j]][i])
+            raise InputError(f"{self.at(i, names[j])}: {what(value)}")
+
+
+def text_of(cell: Cell) -> str:
+    """Return a cell as text; whole numbers without a decimal point, nothing for an empty one."""
     if cell is None:
         return ""
     if isinstance(cell, float | np.floating | np.integer):
@@ -179,139 +221,19 @@ def _finite(value: float) -> float:
     return value if np.isfinite(value) else float("inf")
 
 
-def _complaint(cell: Cell, how: FileFormat) -> str:
-    shown = str(cell).strip()
+def _complaint(cell: Cell, how: FileFormat, complete: bool) -> str:
+    shown = "" if cell is None else str(cell).strip()
     shown = shown if len(shown) <= 40 else shown[:37] + "..."
-    return (
-        f"'{shown}' is not a number with '{how.decimal}' as decimal mark; cells without a value "
-        f"are left empty, or listed in [file] missing"
-    )
-
-
-def decoded(path: str, content: bytes, encoding: str | None) -> str:
-    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1.
-
-    Raises:
-        InputError: not text in the encoding that is stated.
-    """
-    for mark, name in (
-        (b"\xef\xbb\xbf", "utf-8-sig"),
-        (b"\xff\xfe", "utf-16"),
-        (b"\xfe\xff", "utf-16"),
-    ):
-        if content.startswith(mark):
-            return _decode(path, content, name)
-    if encoding is not None:
-        return _decode(path, content, encoding)
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError:
-        return content.decode("latin-1")
-
-
-def _decode(path: str, content: bytes, encoding: str) -> str:
-    try:
-        return content.decode(encoding)
-    except UnicodeError as e:
-        raise InputError(
-            f"{path}: not {encoding} text; valid in [file] encoding: utf-8, latin-1, utf-16"
-        ) from e
-
-
-def read_text(path: str, content: bytes, how: FileFormat) -> Grid:
-    """Read delimited text.
-
-    Raises:
-        InputError: not text, no readings, a row of another length.
-    """
-    text = decoded(path, content, how.encoding)
-    if "\x00" in text:
-        raise InputError(f"{path}: binary data; expected text, XLSX, MAT or Parquet")
-    return table(path, list(records(path, text, how)), how)
-
-
-def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[str]]]:
-    """Rows of cells that are neither blank nor comments, with their numbers from 1.
-
-    Raises:
-        InputError: quotes that are not closed.
-    """
-    separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
-    if how.separator == "blanks":
-        text = text.replace("\t", " ")
-    if how.comment is not None and how.header_row:
-        text = _header_uncommented(text, how.header_row, how.comment)
-    lines = limits.Lines(path, io.StringIO(text, newline=None))
-    reader = csv.reader(
-        lines, delimiter=separator, skipinitialspace=how.separator == "blanks", strict=True
-    )
-    try:
-        for cells in reader:
-            lines.row(len(cells))
-            stripped = [c.strip() for c in cells]
-            while how.separator == "blanks" and stripped and not stripped[-1]:
-                stripped.pop()
-            comment = how.comment is not None and bool(stripped)
-            if any(stripped) and not (comment and stripped[0].startswith(how.comment or "")):
-                yield reader.line_num, stripped
-    except csv.Error as e:
-        raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
-
-
-def _header_uncommented(text: str, row: int, comment: str) -> str:
-    """Take the comment's mark off the header, as numpy.savetxt writes it."""
-    lines = text.splitlines(keepends=True)
-    if row <= len(lines) and lines[row - 1].lstrip().startswith(comment):
-        lines[row - 1] = lines[row - 1].lstrip()[len(comment) :].lstrip()
-    return "".join(lines)
-
-
-def table(path: str, found: Sequence[tuple[int, Sequence[Cell]]], how: FileFormat) -> Grid:
-    """Make a grid of rows of cells: header, units, and rows of one length.
-
-    Cells that a row has beyond the header must be empty, as trailing separators leave them.
-
-    Raises:
-        InputError: the header's row is not there, no readings, a row of another length.
-    """
-    by_row = dict(found)
-    if how.header_row and how.header_row not in by_row:
-        raise InputError(
-            f"{path}: row {how.header_row} holds no header; set [file] header_row to its row, 0 "
-            f"where there is none"
+    if not complete:
+        return (
+            f"'{shown}' is not a number with '{how.decimal}' as decimal mark; cells without a "
+            "value are left empty, or listed in [file] missing"
         )
-    titles = by_row[how.header_row] if how.header_row else []
-    header = [" ".join(_text(c).split()) for c in titles]
-    skipped = {how.units_row, *how.skip_rows}
-    body = [(row, c) for row, c in found if row > how.header_row and row not in skipped]
-    if not body:
-        raise InputError(f"{path}: no readings below row {how.header_row}")
-    width = len(header) or max(_length(c) for _, c in body)
-    while header and not header[-1] and all(_length(c) < width for _, c in body):
-        header.pop()
-        width -= 1
-    for row, cells in body:
-        if _length(cells) > width or (how.header_row and len(cells) < width):
-            raise InputError(
-                f"{path}: row {row} has {_length(cells)} cells, "
-                f"{'the header' if header else 'others'} {width}; rows that are no readings are "
-                f"listed in [file] skip_rows, or begin with [file] comment"
-            )
-    limits.check_cells(path, len(body), width)
-    names = unique(header or [str(k + 1) for k in range(width)])
-    padded = [[*cells[:width], *[None] * (width - len(cells))] for _, cells in body]
-    columns = tuple(list(column) for column in zip(*padded, strict=True))
-    units = {}
-    if how.units_row is not None and how.units_row in by_row:
-        units = {n: _text(c) for n, c in zip(names, by_row[how.units_row], strict=False)}
-    rows = np.array([row for row, _ in body], dtype=np.int64)
-    return Grid(path, names, rows, columns, (how,) * len(names), units)
-
-
-def _length(cells: Sequence[Cell]) -> int:
-    """Cells up to the last one that is not empty."""
-    filled = [k for k, c in enumerate(cells, start=1) if c is not None and c != ""]
-    return filled[-1] if filled else 0
+    if not shown:
+        return "the cell is empty; expected a number"
+    finite = " finite" * (shown.lower().lstrip("+-") in ("nan", "inf", "infinity"))
+    mark = "" if how.decimal == "." else f" with '{how.decimal}' as decimal mark"
+    return f"'{shown}' is not a{finite} number{mark}"
 
 
 def unique(names: Sequence[str]) -> tuple[str, ...]:
@@ -369,31 +291,14 @@ def joined(
                 f"{first.path}: no row of column '{first.name(match[0])}' is in column "
                 f"'{second.name(match[1])}' of {second.path}"
             )
-    kept = first.rows_with(at >= 0)
-    taken = at[at >= 0]
+    kept, other = first.rows_with(at >= 0), second.rows_with(at[at >= 0])
     names = unique([*first.names, *second.names])
-    columns = [[c[int(k)] for k in taken] for c in second.columns]
     renamed = dict(zip(second.names, names[len(first.names) :], strict=True))
-    grid = Grid(
-        first.path,
-        names,
-        kept.rows,
-        (*kept.columns, *columns),
-        (*first.formats, *second.formats),
-        first.units | {renamed[name]: unit for name, unit in second.units.items()},
+    grid = replace(
+        kept,
+        names=names,
+        columns=(*kept.columns, *other.columns),
+        formats=(*first.formats, *second.formats),
+        units=first.units | {renamed[name]: unit for name, unit in second.units.items()},
     )
     return grid, int(np.sum(at < 0))
-
-
-def content_of(path: str | Path) -> bytes:
-    """Read a file.
-
-    Raises:
-        InputError: no such file, or it cannot be read.
-    """
-    try:
-        return limits.read_bytes(Path(path), limits.TABLE)
-    except FileNotFoundError as e:
-        raise InputError(f"{path}: no such file") from e
-    except OSError as e:
-        raise InputError(f"{path}: cannot be read ({e.strerror})") from e

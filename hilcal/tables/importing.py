@@ -12,17 +12,15 @@ from hilcal.readings.covariance import WHOLE, tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
-from hilcal.tables.imported import ImportResult
-from hilcal.tables.ipa_ur10 import read_ipa_ur10
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping, find_mapping, mapping_names
-from hilcal.tables.stated_noise import rounding_variance
-from hilcal.tables.table import FROM_TRACKER, import_table
+from hilcal.tables.table import FROM_TRACKER, ImportResult, import_table
+from hilcal.tables.uncertainty import rounding_variance
 from hilcal.toml import suggest
 from hilcal.types import Bools
 
-FORMATS = ("table", "ipa-ur10")
-"""Formats that are read without a mapping."""
+TABLE = "table"
+"""The exchange table: the format that is read without a mapping."""
 
 
 def import_readings(
@@ -36,7 +34,7 @@ def import_readings(
 
     Args:
         path: the table.
-        form: "table" (the exchange table), "ipa-ur10", the name of a mapping that comes with the
+        form: "table" (the exchange table), the name of a mapping that comes with the
             program, the path of a mapping file, or a mapping.
         config: the cell: its tracker's noise and place, its gravity, and whether tables include
             the arm's scatter.
@@ -52,9 +50,7 @@ def import_readings(
     targets = [target.name for target in config.tool.targets]
     if mapping is None and second is not None:
         raise InputError(f"--second {second}: only for a --format with a section [second_file]")
-    if form == "ipa-ur10":
-        result = read_ipa_ur10(path, arm)
-    elif mapping is None:
+    if mapping is None:
         result = import_table(path, arm, noise, station, targets)
     else:
         gravity = config.robot.gravity_m_s2
@@ -72,9 +68,9 @@ def import_readings(
 
 
 def _mapping(form: str | Path) -> Mapping | None:
-    if str(form) in FORMATS:
+    if str(form) == TABLE:
         return None
-    names = (*FORMATS, *mapping_names())
+    names = (TABLE, *mapping_names())
     if str(form) not in names and Path(form).suffix.lower() != ".toml":
         raise InputError(
             f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "

@@ -1,32 +1,26 @@
 """Readings from a table of any kind, by a mapping that says what its columns hold."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.covariance import TrackerNoise
-from hilcal.readings.readings import SAME_POSE
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.readings.readings import SAME_POSE, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
-from hilcal.tables.clock import seconds
-from hilcal.tables.csvfile import CsvTable
-from hilcal.tables.following import own_columns
-from hilcal.tables.grid import Grid
-from hilcal.tables.guessing.guess_values import nines
-from hilcal.tables.imported import ImportResult
-from hilcal.tables.mapping import Mapping
-from hilcal.tables.mapping_sections import Column
+from hilcal.tables.columns import own_columns
+from hilcal.tables.files import open_tables
+from hilcal.tables.grid import Cell, Grid, Table
+from hilcal.tables.mapping import Column, Joints, Mapping, Name, Position, Std, Time
 from hilcal.tables.orientation import defect, rotations
-from hilcal.tables.sheets import open_tables
-from hilcal.tables.stated import stated_covariance
-from hilcal.tables.stated_noise import check_joint_rounding, rounding_variance
-from hilcal.tables.table import readings_of
-from hilcal.tables.wide import one_target_per_row
-from hilcal.types import Bools, Floats
+from hilcal.tables.table import ImportResult, readings_of
+from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
+from hilcal.types import Bools, Floats, Ints
 
 MOST_LOST = 0.5
 """Share of rows without a value beyond which the mapping is taken for wrong; a choice."""
@@ -37,6 +31,25 @@ MOST_TURN = 2 * np.pi + 1e-3
 """rad; a larger angle of an orientation is in another unit."""
 MOVED = 0.01
 """rad; a joint commanded by more is sent to another pose; a choice."""
+STILL = 1e-4
+"""rad; a joint commanded by less did not move far enough to arrive from another side."""
+SIGMAS = 4.0
+"""Standard deviations within which two readings are the same; a choice."""
+REPEATED = 2e-4
+"""rad; rows whose joints differ by less repeat a pose; a choice."""
+REPEATS_TO = 4e-4
+"""m; ten times what an arm repeats to: positions of one pose that differ by more are not all right.
+A choice."""
+TOOL = 0.5
+"""m; the longest tool, beside the arm's reach a lever of its joints; a choice."""
+EPOCH = 1e8
+"""s; times beyond three years are counted from an epoch, not from the campaign's start."""
+TARGET = "target of [position]"
+_DAY = 86400.0
+_EXPECTED = {
+    "iso": "a date and time like 2024-05-31T12:00:00",
+    "excel": "days since 1899-12-30",
+}
 _LISTED = 8
 
 
@@ -56,7 +69,7 @@ def import_mapped(
         path: text, XLSX, MAT or Parquet.
         mapping: what its columns hold.
         arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the table states none.
+        noise: gives the covariances where neither table nor mapping state them.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
         second: the second file, where the mapping does not name it.
@@ -70,69 +83,134 @@ def import_mapped(
         InputError: anything that cannot be right, by file, row and column.
     """
     grid, lost = open_tables(path, mapping, second)
-    result = readings_of_grid(grid, mapping, arm, noise, station, gravity, targets)
-    if not lost:
-        return result
-    note = f"{lost} rows left out: they have no partner in the second file"
-    return ImportResult(result.readings, (note, *result.notes))
-
-
-@dataclass(slots=True, eq=False)
-class _Found:
-    """Number columns by the exchange table's names, SI units, NaN where a value is missing."""
-
-    number: dict[str, Floats] = field(default_factory=dict)
-    alias: dict[str, str] = field(default_factory=dict)
-
-    def add(self, grid: Grid, name: str, column: Column, values: Floats) -> None:
-        self.number[name] = values
-        self.alias[name] = grid.name(column)
-
-
-def readings_of_grid(
-    grid: Grid,
-    mapping: Mapping,
-    arm: Arm,
-    noise: TrackerNoise | None,
-    station: Floats | Sequence[float] | None,
-    gravity: Sequence[float],
-    targets: Sequence[str] = (),
-) -> ImportResult:
-    """Make readings of a table that is open; see `import_mapped`.
-
-    Raises:
-        InputError: anything that cannot be right.
-    """
+    notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
     grid, mapping = one_target_per_row(grid, mapping)
+    if mapping.air is not None and mapping.air.optional and mapping.air.column not in grid.names:
+        notes.append(f"no air temperature: the file has no column {mapping.air.column}")
+        mapping = mapping.model_copy(update={"air": None})
     raw = _raw(grid, mapping, arm)
+    side = None
+    if mapping.approach is not None and mapping.approach.by_order:
+        joints = _block(raw, grid, mapping.joints.columns)
+        side = approach_by_order(units.ANGLES[mapping.joints.unit] * joints)
+        notes.append(
+            f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
+            "last side, the first row counts as +1"
+        )
     nowhere = _nowhere(grid, mapping, raw)
-    keep, notes = _complete(grid, raw)
-    notes += nowhere
+    keep, left_out = _complete(grid, raw)
+    notes += left_out + nowhere
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
-    found = _Found()
-    angles, q = _motion(grid, mapping, raw, found, arm)
-    _surroundings(grid, mapping, raw, found)
-    wrench = _wrench(grid, mapping, np.asarray(gravity), found)
-    text = {"load": _loads(grid, mapping, wrench)}
-    text["pose"] = _poses(grid, mapping, q)
+    table = Table(grid.path, grid.rows, {}, {})
+    for names, named, convert in _quantities(mapping, arm):
+        for name, column in zip(names, named, strict=True):
+            _put(table, grid, name, column, convert(raw[grid.name(column)]))
+    if side is not None:
+        table.number.update(zip(columns.approach_columns(arm.n), side[keep].T, strict=True))
+    angles = _rotations(grid, mapping, raw, table)
+    for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
+        if time is not None:
+            _put(table, grid, name, time.column, seconds(grid, time))
+    q = units.ANGLES[mapping.joints.unit] * _block(raw, grid, mapping.joints.columns)
+    wrench = _wrench(grid, mapping, np.asarray(gravity), table)
+    table.text["load"] = _loads(grid, mapping, wrench)
+    table.text["pose"] = _poses(grid, mapping, q)
     if mapping.joints.reported:
-        _as_commanded(found, text["pose"], q, arm)
+        _as_commanded(table, q, arm)
     if mapping.target is not None:
-        text["target"] = grid.text(mapping.target.column)
-    table = CsvTable(grid.path, grid.names, grid.rows, text, found.number, found.alias)
+        table.text["target"] = grid.text(mapping.target.column)
     position = table.matrix(columns.POSITION)
-    covariance = stated_covariance(table, grid, mapping, position, angles, noise, station)
+    noise = noise if mapping.instrument is None else mapping.instrument.noise()
+    covariance, told = mapped_covariance(table, grid, mapping, position, angles, noise, station)
     unit = units.LENGTHS[mapping.position.unit]
     rounding = rounding_variance(_block(raw, grid, mapping.position.columns), unit)
-    result = readings_of(table, arm, noise, station, covariance.value, targets, rounding)
-    joint_unit = units.ANGLES[mapping.joints.unit]
-    rounded = check_joint_rounding(
-        q / joint_unit, joint_unit, mapping.joints.unit, result.readings.covariance, arm.reach
-    )
-    notes += _stale(grid, position, q)
-    told = covariance.notes or result.notes[:1]
-    return ImportResult(result.readings, (*notes, *told, *result.notes[1:], *rounded))
+    result = readings_of(table, arm, noise, station, covariance, targets, rounding)
+    readings = result.readings
+    if mapping.rows is not None and mapping.rows.plausible_only:
+        scatter = readings.covariance
+        if noise is not None and mapping.std is not None and mapping.std.add_instrument:
+            origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
+            scatter = scatter - tracker_covariance(position, noise, origin, readings.m)
+        readings, left_out = _plausible(readings, scatter, grid.rows, arm.reach + TOOL)
+        notes += left_out
+    else:
+        notes += _stale(grid, position, q)
+    notes += [*(told or result.notes[:1]), *result.notes[1:]]
+    unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
+    notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
+    return ImportResult(readings, tuple(notes))
+
+
+def one_target_per_row(grid: Grid, mapping: Mapping) -> tuple[Grid, Mapping]:
+    """Return the table with a row for each target, and the mapping that reads it.
+
+    Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
+    repeated. Nothing changes where the mapping has no `targets`.
+
+    Raises:
+        InputError: no such column.
+    """
+    targets, rows = mapping.position.targets, range(len(grid.rows))
+    if not targets:
+        return grid, mapping
+    count = len(targets)
+    tall = grid.rows_with(np.repeat(np.arange(len(rows)), count))
+    tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
+    update: dict[str, object] = {"target": Name(column=TARGET)}
+    sections: dict[str, Position | Std] = {"position": mapping.position}
+    if mapping.std is not None and len(mapping.std.columns) == 3 * count:
+        sections |= {"std": mapping.std}
+    for key, section in sections.items():
+        axes = []
+        for axis in range(3):
+            sources = [grid.name(section.columns[3 * k + axis]) for k in range(count)]
+            cells = [grid.cells(name) for name in sources]
+            axes.append("/".join(sources))
+            tall = tall.with_column(axes[-1], [c[i] for i in rows for c in cells], sources[0])
+        update[key] = section.model_copy(update={"columns": tuple(axes)})
+    return tall, mapping.model_copy(update=update)
+
+
+def _put(table: Table, grid: Grid, name: str, column: Column, values: Floats) -> None:
+    """Add a column, and what the file calls it."""
+    table.number[name] = values
+    table.alias[name] = grid.name(column)
+
+
+def _quantities(
+    mapping: Mapping, arm: Arm
+) -> Iterator[tuple[Sequence[str], Sequence[Column], Callable[[Floats], Floats]]]:
+    """Columns of numbers: names in the exchange table, in the file, and what makes SI of them."""
+
+    def times(size: float) -> Callable[[Floats], Floats]:
+        return lambda values: size * values
+
+    def of_joints(section: Joints, names: tuple[str, ...]) -> Sequence[str]:
+        return own_columns(names, len(section.columns), arm)
+
+    m = mapping
+    yield columns.POSITION, m.position.columns, times(units.LENGTHS[m.position.unit])
+    names, size = of_joints(m.joints, columns.joint_columns(arm.n)), units.ANGLES[m.joints.unit]
+    yield names, m.joints.columns, times(size)
+    if (s := m.actual_joints) is not None:
+        names = of_joints(s, columns.actual_columns(arm.n))
+        yield names, s.columns, times(units.ANGLES[s.unit])
+    if m.cycle is not None:
+        yield ("cycle",), (m.cycle.column,), times(1.0)
+    if m.approach is not None and m.approach.columns:
+        yield columns.approach_columns(arm.n), m.approach.columns, times(1.0)
+    if m.air is not None:
+        yield ("air_degC",), (m.air.column,), _celsius(m.air.unit)
+    if (w := m.joint_temperatures) is not None:
+        yield columns.temperature_columns(arm.n), w.columns, _celsius(w.unit)
+
+
+def _celsius(unit: str) -> Callable[[Floats], Floats]:
+    """Return what makes °C of temperatures in °C, °F or K."""
+    if unit == "K":
+        return lambda value: value - 273.15
+    return lambda value: (value - 32) / 1.8 if unit == "degF" else value
 
 
 def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
@@ -141,7 +219,7 @@ def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
     per_joint = ("joints", "actual_joints", "approach", "joint_temperatures")
     for name in (*per_joint, "position", "orientation"):
         section = getattr(mapping, name)
-        if section is None:
+        if section is None or not section.columns:
             continue
         count = {arm.n, int(arm.own.sum())} if name in per_joint[:2] else {arm.n}
         if name in per_joint and len(section.columns) not in count:
@@ -174,6 +252,16 @@ def _nowhere(grid: Grid, mapping: Mapping, raw: dict[str, Floats]) -> list[str]:
     return notes
 
 
+def nines(position: Floats) -> list[float]:
+    """Return numbers of four nines or more, which stand for a missing value."""
+    found = set()
+    for v in np.unique(position[np.isfinite(position)]):
+        digits = f"{abs(v):.0f}"
+        if len(digits) >= 4 and set(digits) == {"9"} and float(digits) == abs(v):
+            found.add(float(v))
+    return sorted(found)
+
+
 def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
     """Rows that have a value in every column that is used, and a note on the others."""
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
@@ -188,11 +276,11 @@ def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
             f"{grid.at(first, column)}: no value, and {count} of {len(bad)} rows lack one in some "
             f"column that the mapping uses; choose other columns"
         )
-    listed = ", ".join(map(str, grid.rows[bad][:_LISTED].tolist()))
-    more = ", ..." if count > _LISTED else ""
     lacking = [c for c, lost in zip(raw, np.any(missing, axis=0), strict=True) if lost]
     named = ", ".join(lacking[:4]) + (", ..." if len(lacking) > 4 else "")
-    return ~bad, [f"{count} of {len(bad)} rows left out ({listed}{more}): no value in {named}"]
+    return ~bad, [
+        f"{count} of {len(bad)} rows left out ({_listed(grid.rows[bad])}): no value in {named}"
+    ]
 
 
 def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
@@ -202,10 +290,9 @@ def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
     rows = grid.rows[1:][same & moved]
     if not len(rows):
         return []
-    listed = ", ".join(map(str, rows[:_LISTED].tolist())) + (", ..." if len(rows) > _LISTED else "")
     return [
-        f"rows {listed} read exactly the position of the row before though the joints moved: was "
-        f"it measured again? [file] skip_rows leaves rows out"
+        f"rows {_listed(rows)} read exactly the position of the row before though the joints "
+        f"moved: was it measured again? [file] skip_rows leaves rows out"
     ]
 
 
@@ -213,72 +300,32 @@ def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Float
     return np.stack([raw[grid.name(name)] for name in names], axis=1)
 
 
-def _motion(
-    grid: Grid, mapping: Mapping, raw: dict[str, Floats], found: _Found, arm: Arm
-) -> tuple[Floats | None, Floats]:
-    """Position, orientation and joints; returns the orientation's numbers and the joints, rad."""
-    for name, column in zip(columns.POSITION, mapping.position.columns, strict=True):
-        values = units.LENGTHS[mapping.position.unit] * raw[grid.name(column)]
-        found.add(grid, name, column, values)
-    angles = None
-    if (o := mapping.orientation) is not None:
-        angles = _block(raw, grid, o.columns)
-        far = defect(o.convention, angles) > UNIT_LENGTH
-        if far.any():
-            i = int(np.argmax(far))
-            what = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
-            raise InputError(f"{grid.at(i, grid.name(o.columns[0]))}: not {what}")
-        unit = units.ANGLES[o.unit]
-        turn = np.abs(unit * angles) > MOST_TURN
-        if angles.shape[1] == 3 and turn.any():
-            i, k = divmod(int(np.argmax(turn)), 3)
-            seems = " (looks like degrees)" if o.unit == "rad" else ""
-            raise InputError(
-                f"{grid.at(i, grid.name(o.columns[k]))}: {angles[i, k]:g} {o.unit} is more than a "
-                f"turn{seems}; see [orientation] unit"
-            )
-        vector = se3.rotation_vector(rotations(o.convention, angles, unit))
-        for k, name in enumerate(columns.ROTATION):
-            found.add(grid, name, o.columns[k], vector[:, k])
-    joints = mapping.joints
-    q = units.ANGLES[joints.unit] * _block(raw, grid, joints.columns)
-    names = own_columns(columns.joint_columns(arm.n), len(joints.columns), arm)
-    for k, name in enumerate(names):
-        found.add(grid, name, joints.columns[k], q[:, k])
-    if (actual := mapping.actual_joints) is not None:
-        names = own_columns(columns.actual_columns(arm.n), len(actual.columns), arm)
-        for name, column in zip(names, actual.columns, strict=True):
-            found.add(grid, name, column, units.ANGLES[actual.unit] * raw[grid.name(column)])
-    return angles, q
+def _rotations(grid: Grid, mapping: Mapping, raw: dict[str, Floats], table: Table) -> Floats | None:
+    """Add rotation vectors; returns the orientation's numbers (N, k) in the file's unit."""
+    o = mapping.orientation
+    if o is None:
+        return None
+    angles = _block(raw, grid, o.columns)
+    far = defect(o.convention, angles) > UNIT_LENGTH
+    if far.any():
+        what = "a quaternion of length 1" if angles.shape[1] == 4 else "a rotation matrix"
+        raise InputError(f"{grid.at(int(np.argmax(far)), o.columns[0])}: not {what}")
+    unit = units.ANGLES[o.unit]
+    turn = np.abs(unit * angles) > MOST_TURN
+    if angles.shape[1] == 3 and turn.any():
+        i, k = divmod(int(np.argmax(turn)), 3)
+        seems = " (looks like degrees)" if o.unit == "rad" else ""
+        raise InputError(
+            f"{grid.at(i, o.columns[k])}: {angles[i, k]:g} {o.unit} is more than a turn{seems}; "
+            "see [orientation] unit"
+        )
+    vector = se3.rotation_vector(rotations(o.convention, angles, unit))
+    for k, name in enumerate(columns.ROTATION):
+        _put(table, grid, name, o.columns[k], vector[:, k])
+    return angles
 
 
-def _surroundings(grid: Grid, mapping: Mapping, raw: dict[str, Floats], found: _Found) -> None:
-    """Cycle, approach, temperatures and times."""
-    if mapping.cycle is not None:
-        found.add(grid, "cycle", mapping.cycle.column, raw[grid.name(mapping.cycle.column)])
-    if (approach := mapping.approach) is not None:
-        n = len(approach.columns)
-        for name, column in zip(columns.approach_columns(n), approach.columns, strict=True):
-            found.add(grid, name, column, raw[grid.name(column)])
-    if (air := mapping.air) is not None:
-        found.add(grid, "air_degC", air.column, celsius(raw[grid.name(air.column)], air.unit))
-    if (warm := mapping.joint_temperatures) is not None:
-        n = len(warm.columns)
-        for name, column in zip(columns.temperature_columns(n), warm.columns, strict=True):
-            found.add(grid, name, column, celsius(raw[grid.name(column)], warm.unit))
-    for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
-        if time is not None:
-            found.add(grid, name, time.column, seconds(grid, time))
-
-
-def celsius(value: Floats, unit: str) -> Floats:
-    """Temperatures in °C of those in °C, °F or K."""
-    if unit == "K":
-        return value - 273.15
-    return (value - 32) / 1.8 if unit == "degF" else value
-
-
-def _wrench(grid: Grid, mapping: Mapping, gravity: Floats, found: _Found) -> Floats:
+def _wrench(grid: Grid, mapping: Mapping, gravity: Floats, table: Table) -> Floats:
     """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
@@ -286,18 +333,18 @@ def _wrench(grid: Grid, mapping: Mapping, gravity: Floats, found: _Found) -> Flo
         sign = -1.0 if w.of == "reaction" else 1.0
         for k, column in enumerate(w.columns):
             wrench[:, k] = sign * scale[k] * np.nan_to_num(grid.numbers(column))
-            found.alias[columns.WRENCH[k]] = grid.name(column)
+            table.alias[columns.WRENCH[k]] = grid.name(column)
     if (hung := mapping.hung_mass) is not None:
         mass = units.MASSES[hung.unit] * np.nan_to_num(grid.numbers(hung.column))
         bad = mass < 0
         if bad.any():
             i = int(np.argmax(bad))
-            raise InputError(f"{grid.at(i, grid.name(hung.column))}: a mass is 0 or more")
+            raise InputError(f"{grid.at(i, hung.column)}: a mass is 0 or more")
         wrench[:, :3] = mass[:, None] * gravity
-        found.alias |= dict.fromkeys(columns.WRENCH, grid.name(hung.column))
+        table.alias.update(dict.fromkeys(columns.WRENCH, grid.name(hung.column)))
     wrench += 0.0  # no negative zeros
     if wrench.any():
-        found.number |= {name: wrench[:, k] for k, name in enumerate(columns.WRENCH)}
+        table.number.update(zip(columns.WRENCH, wrench.T, strict=True))
     return wrench
 
 
@@ -314,27 +361,29 @@ def _loads(grid: Grid, mapping: Mapping, wrench: Floats) -> list[str]:
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
-def _as_commanded(found: _Found, poses: Sequence[str], q: Floats, arm: Arm) -> None:
+def _as_commanded(table: Table, q: Floats, arm: Arm) -> None:
     """Take the angles of a pose's first row as commanded, those of each row as actual."""
     first: dict[str, int] = {}
-    rows = [first.setdefault(name, k) for k, name in enumerate(poses)]
+    rows = [first.setdefault(name, k) for k, name in enumerate(table.text["pose"])]
     names, reported = (
         own_columns(of(arm.n), q.shape[1], arm)
         for of in (columns.joint_columns, columns.actual_columns)
     )
     for k, (name, actual) in enumerate(zip(names, reported, strict=True)):
-        found.number[actual], found.alias[actual] = q[:, k], found.alias[name]
-        found.number[name] = q[rows, k]
+        table.number[actual], table.alias[actual] = q[:, k], table.alias[name]
+        table.number[name] = q[rows, k]
 
 
 def _poses(grid: Grid, mapping: Mapping, q: Floats) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
-    if mapping.pose is not None:
+    if mapping.pose is not None and mapping.pose.column is None:
+        return [f"row {row}" for row in grid.rows.tolist()]
+    if mapping.pose is not None and mapping.pose.column is not None:
         names = grid.text(mapping.pose.column)
         if "" in names:
             i = names.index("")
             raise InputError(
-                f"{grid.at(i, grid.name(mapping.pose.column))}: the pose has no name; without "
+                f"{grid.at(i, mapping.pose.column)}: the pose has no name; without "
                 f"[pose], rows of the same joints are one pose"
             )
         return names
@@ -344,3 +393,121 @@ def _poses(grid: Grid, mapping: Mapping, q: Floats) -> list[str]:
     for row, key in zip(grid.rows.tolist(), map(tuple, keys.tolist()), strict=True):
         out.append(f"row {first.setdefault(key, row)}")
     return out
+
+
+def seconds(grid: Grid, time: Time) -> Floats:
+    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row.
+
+    Raises:
+        InputError: a cell that is no time, or empty.
+    """
+    if time.unit in units.SECONDS:
+        values = units.SECONDS[time.unit] * grid.numbers(time.column)
+        _refuse_missing(grid, time, values, "a time")
+        return values - values.min() if values.min() > EPOCH else values
+    cells = grid.cells(time.column)
+    values = np.array([_stamp(c, grid, time, k) for k, c in enumerate(cells)])
+    expected = time.format or _EXPECTED.get(time.unit, "a date")
+    _refuse_missing(grid, time, values, expected)
+    return np.asarray(np.round(values - values.min(), 6))
+
+
+def _stamp(cell: Cell, grid: Grid, time: Time, k: int) -> float:
+    """Seconds since 1970 (any zone), NaN where the cell is no time."""
+    if isinstance(cell, datetime):
+        return _since(cell)
+    try:
+        if time.unit == "excel":
+            return _DAY * float(str(cell).replace(",", "."))
+        text = str(cell).strip()
+        if time.format is not None:
+            return _since(datetime.strptime(text, time.format))
+        return _since(datetime.fromisoformat(text.replace(",", ".")))
+    except ValueError:
+        return float("nan")
+
+
+def _since(when: datetime) -> float:
+    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
+
+
+def _refuse_missing(grid: Grid, time: Time, values: Floats, expected: str) -> None:
+    bad = ~np.isfinite(values)
+    if bad.any():
+        k = int(np.argmax(bad))
+        raise InputError(
+            f"{grid.at(k, time.column)}: '{grid.text(time.column)[k]}' is not "
+            f"{expected}; see unit of the times in the mapping"
+        )
+
+
+def approach_by_order(q: Floats) -> Floats:
+    """(N, n) side from which each joint arrived: sign(q_i − q_{i−1}), the last where it kept still.
+
+    The first row, and joints that have not moved yet, count as +1. Rows without a value are passed
+    over.
+    """
+    last = _fill(q)
+    step = np.diff(last, axis=0, prepend=last[:1])
+    side = np.where(np.abs(step) > STILL, np.sign(step), np.nan)
+    side[0] = 1.0
+    return _fill(side)
+
+
+def _fill(a: Floats) -> Floats:
+    """Replace NaN by the last value above it in the column (by the first one at the top)."""
+    row = np.where(np.isfinite(a), np.arange(len(a))[:, None], -1)
+    row = np.maximum.accumulate(row, axis=0)
+    first = np.argmax(np.isfinite(a), axis=0)
+    row = np.where(row < 0, first, row)
+    return np.asarray(np.take_along_axis(a, row, axis=0), dtype=float)
+
+
+def _plausible(
+    readings: Readings, scatter: Floats, rows: Ints, lever: float
+) -> tuple[Readings, list[str]]:
+    """Leave out readings that cannot be; a note on each reason.
+
+    A reading that is the one before it within the scatter (N, m, m) of both, though the joints were
+    sent elsewhere: the arm did not follow, or the tracker did not measure again. Of readings that
+    repeat a pose those whose positions disagree by more than what an arm repeats to and
+    lever · Σ|dq|, what the joints' difference moves the target by at most: which one is wrong
+    cannot be known.
+
+    Raises:
+        InputError: nothing is left.
+    """
+    from scipy.spatial import cKDTree
+
+    q, value = readings.states.q, readings.value
+    variance = np.diagonal(scatter, axis1=1, axis2=2)
+    stale = np.zeros(len(q), dtype=bool)
+    sent = np.abs(np.diff(q, axis=0)).max(axis=1) > MOVED
+    limit = SIGMAS * np.sqrt(variance[1:] + variance[:-1])
+    stale[1:] = sent & np.all(np.abs(np.diff(value, axis=0)) <= limit, axis=1)
+    used = np.flatnonzero(~stale)
+    pairs = cKDTree(q[used]).query_pairs(REPEATED, p=np.inf, output_type="ndarray")
+    i, j = used[pairs[:, 0]], used[pairs[:, 1]]
+    apart = np.linalg.norm(value[i, :3] - value[j, :3], axis=1)
+    wrong = apart > REPEATS_TO + lever * np.abs(q[i] - q[j]).sum(axis=1)
+    odd = np.zeros(len(q), dtype=bool)
+    odd[i[wrong]] = odd[j[wrong]] = True
+    notes = [
+        f"{int(bad.sum())} of {len(bad)} rows left out ({_listed(rows[bad])}): {why}"
+        for bad, why in (
+            (stale, "the same reading as the row before, though the joints were sent on"),
+            (odd, "they repeat a pose but disagree by more than noise can explain"),
+        )
+        if bad.any()
+    ]
+    if (stale | odd).all():
+        raise InputError("no row can be used; expected one measured pose per row")
+    kept = readings[~(stale | odd)]
+    used, pose = np.unique(kept.pose, return_inverse=True)
+    names = tuple(kept.pose_names[k] for k in used)
+    return replace(kept, pose=pose, pose_names=names), notes
+
+
+def _listed(rows: Ints) -> str:
+    """Name the first of some rows."""
+    return ", ".join(map(str, rows[:_LISTED].tolist())) + ", ..." * (len(rows) > _LISTED)

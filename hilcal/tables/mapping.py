@@ -4,32 +4,356 @@ TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
 """
 
 from pathlib import Path
+from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, Strict, model_validator
 
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise
 from hilcal.robot.catalogue import configs_dir
-from hilcal.tables.mapping_sections import (
-    Air,
-    Approach,
-    CommandedJoints,
-    Correlation,
-    CovarianceColumns,
-    FileFormat,
-    HungMass,
-    Joints,
-    JointTemperatures,
-    LoadName,
-    Name,
-    Orientation,
-    Position,
-    SecondFile,
-    Std,
-    Time,
-    Wrench,
+from hilcal.tables.orientation import CONVENTIONS, NUMBERS
+from hilcal.tables.units import SECONDS, Angle, Length, Temperature
+from hilcal.toml import NonNegative, Positive, Section, load_section, suggest
+
+Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge=1)]
+
+
+def _columns(*valid: int) -> AfterValidator:
+    """Refuse another number of columns than the valid ones."""
+    *others, last = map(str, valid)
+
+    def counted(given: tuple[Column, ...]) -> tuple[Column, ...]:
+        if len(given) not in valid:
+            words = f"{', '.join(others)} or {last}"
+            raise ValueError(f"columns: {len(given)} given; it must be {words}")
+        return given
+
+    return AfterValidator(counted)
+
+
+Row = Annotated[int, Strict(), Field(ge=1)]
+_UNLOADED = (
+    "none|0|no|no load|unloaded|empty|-|ohne|leer|keine|unbelastet|sans|sans charge|vide|"
+    "sin carga|vacío|senza|无|空载"
 )
-from hilcal.tables.units import SECONDS
-from hilcal.toml import Section, load_section, suggest
+UNLOADED = tuple(_UNLOADED.split("|"))
+"""Names that mean "no load" unless the mapping lists others, in small letters; a choice."""
+
+_COLUMN = "the name of a column, or its number from 1"
+_LENGTH = 'a unit of length: "m", "mm", "um" or "in"'
+_ANGLE = 'a unit of angles: "rad", "mrad", "deg" or "arcsec"'
+_OPTIONAL = "true where some files lack it, else false"
+_UNIT_T = '"degC", "degF" or "K"'
+
+
+class FileFormat(Section):
+    """[file]: how the file is written; what is left out is as in a plain CSV file."""
+
+    separator: Literal[",", ";", "|", "tab", "blanks"] | None = Field(
+        None, description='",", ";", "|", "tab" or "blanks"'
+    )
+    decimal: Literal[".", ","] = Field(".", description='the decimal mark: "." or ","')
+    thousands: Literal[",", ".", "'", " "] | None = Field(
+        None, description='the mark between thousands: ",", ".", "\'" or " "'
+    )
+    encoding: Literal["utf-8", "latin-1", "utf-16"] | None = Field(
+        None, description='"utf-8", "latin-1" or "utf-16"'
+    )
+    header_row: Annotated[int, Strict(), Field(ge=0)] = Field(
+        1, description="the row of the column names, a whole number from 1; 0 where there is none"
+    )
+    units_row: Row | None = Field(None, description="the row of units, a whole number from 1")
+    skip_rows: tuple[Row, ...] = Field((), description="rows that are no readings, from 1")
+    comment: str | None = Field(
+        None, min_length=1, description='what a comment line begins with, e.g. "//"'
+    )
+    missing: tuple[str | float, ...] = Field(
+        (), description='values that mean that there is none, e.g. [-9999, "lost"]'
+    )
+    sheet: str | None = Field(None, min_length=1, description="the name of a sheet (XLSX)")
+    variable: str | None = Field(None, min_length=1, description="the name of a variable (MAT)")
+
+    @model_validator(mode="after")
+    def _marks_differ(self) -> "FileFormat":
+        if self.thousands == self.decimal:
+            raise ValueError(f'thousands and decimal are both "{self.decimal}"; they must differ')
+        if self.decimal == "," and self.separator == ",":
+            raise ValueError('separator and decimal are both ","; they must differ')
+        return self
+
+
+class SecondFile(FileFormat):
+    """[second_file]: the other half of the columns, e.g. the controller's log of the joints."""
+
+    path: str | None = Field(
+        None, min_length=1, description="a path relative to the mapping file; or give --second"
+    )
+    match: tuple[Column, Column] | None = Field(
+        None, description="two columns, of the first and of this file, that name the row"
+    )
+
+
+class Position(Section):
+    """[position]: the target's position, or those of several targets side by side."""
+
+    columns: tuple[Column, ...] = Field(
+        description="three columns x, y, z; with targets, three for each"
+    )
+    unit: Length = Field(description=_LENGTH)
+    targets: tuple[str, ...] = Field(
+        (), description="names of the targets whose positions stand side by side in a row"
+    )
+
+    @model_validator(mode="after")
+    def _three_each(self) -> "Position":
+        wanted = 3 * max(1, len(self.targets))
+        if len(self.columns) != wanted:
+            raise ValueError(
+                f"columns: {len(self.columns)} given; it must be {wanted}"
+                + (f" for {len(self.targets)} targets" if self.targets else ": x, y, z")
+            )
+        return self
+
+
+class Orientation(Section):
+    """[orientation]: the target's orientation."""
+
+    columns: tuple[Column, ...] = Field(
+        description="three columns of angles or of a rotation vector, four of a quaternion, or "
+        "nine of a rotation matrix, row by row"
+    )
+    convention: str = Field(description=f"one of {', '.join(CONVENTIONS)}")
+    unit: Angle = Field("rad", description=_ANGLE)
+
+    @model_validator(mode="after")
+    def _known(self) -> "Orientation":
+        if self.convention not in CONVENTIONS:
+            raise ValueError(
+                f'convention = "{self.convention}" is unknown'
+                f"{suggest(self.convention, list(CONVENTIONS))}; valid: {', '.join(CONVENTIONS)}"
+            )
+        wanted = NUMBERS.get(CONVENTIONS[self.convention], 3)
+        if len(self.columns) != wanted:
+            raise ValueError(
+                f'columns: {len(self.columns)} given; "{self.convention}" has {wanted}'
+            )
+        return self
+
+
+class Joints(Section):
+    """[actual_joints]: joint angles that the encoders reported."""
+
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
+        description="one column per joint"
+    )
+    unit: Angle = Field(description=_ANGLE)
+
+
+class CommandedJoints(Joints):
+    """[joints]: commanded joint angles."""
+
+    reported: bool = Field(
+        False,
+        description="true where they are what the encoders reported: those of a pose's first row "
+        "then count as commanded, else false",
+    )
+
+
+class Name(Section):
+    """[cycle], [target]: a column of names or numbers."""
+
+    column: Column = Field(description=_COLUMN)
+
+
+class PoseName(Section):
+    """[pose]: a column of names; or every row is a pose of its own."""
+
+    column: Column | None = Field(None, description=_COLUMN)
+    each_row: bool = Field(
+        False, description="true where every row is a pose of its own, called after its number"
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> "PoseName":
+        if (self.column is None) != self.each_row:
+            raise ValueError("column or each_row = true: give one of them")
+        return self
+
+
+class LoadName(Section):
+    """[load]: the load's name."""
+
+    column: Column = Field(description=_COLUMN)
+    none: tuple[str, ...] = Field(UNLOADED, description="the names that mean no load")
+
+
+class Time(Section):
+    """[time] and [load_time]: seconds, a date and time, or a spreadsheet's day number."""
+
+    column: Column = Field(description=_COLUMN)
+    unit: Literal["s", "ms", "min", "h", "iso", "excel", "format"] = Field(
+        description='"s", "ms", "min", "h", "iso" (2024-05-31T12:00:00), "excel" (days since '
+        '1899-12-30), or "format" with the key format'
+    )
+    format: str | None = Field(
+        None, min_length=1, description='as of strptime, e.g. "%d.%m.%Y %H:%M:%S"'
+    )
+
+    @model_validator(mode="after")
+    def _both(self) -> "Time":
+        if (self.unit == "format") != (self.format is not None):
+            raise ValueError('unit = "format" and the key format belong together')
+        return self
+
+
+class Air(Section):
+    """[air]: temperature of the air."""
+
+    column: Column = Field(description=_COLUMN)
+    optional: bool = Field(False, description=_OPTIONAL)
+    unit: Temperature = Field("degC", description=_UNIT_T)
+
+
+class JointTemperatures(Section):
+    """[joint_temperatures]: one per joint."""
+
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
+        description="one column per joint"
+    )
+    unit: Temperature = Field("degC", description=_UNIT_T)
+
+
+class Wrench(Section):
+    """[wrench]: what the load exerts on the tool at the load point, base axes; empty is 0."""
+
+    columns: Annotated[tuple[Column, ...], _columns(3, 6)] = Field(
+        description="three columns: fx, fy, fz; or six with mx, my, mz"
+    )
+    unit: Literal["N", "kN", "kgf", "lbf"] = Field("N", description='"N", "kN", "kgf" or "lbf"')
+    moment_unit: Literal["Nm", "Nmm", "kNm"] = Field("Nm", description='"Nm", "Nmm" or "kNm"')
+    of: Literal["load", "reaction"] = Field(
+        "load", description='"load": exerted on the tool; "reaction": exerted by the tool'
+    )
+
+
+class HungMass(Section):
+    """[hung_mass]: a mass that hangs at the load point; its weight is the wrench. Empty is 0."""
+
+    column: Column = Field(description=_COLUMN)
+    unit: Literal["kg", "g", "lb"] = Field("kg", description='"kg", "g" or "lb"')
+
+
+class Approach(Section):
+    """[approach]: the side from which each joint arrived, -1 or +1."""
+
+    columns: tuple[Column, ...] = Field((), description="one column per joint")
+    by_order: bool = Field(
+        False, description="true where rows stand in the order of the moves, which tell the side"
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> "Approach":
+        if bool(self.columns) == self.by_order:
+            raise ValueError("columns or by_order = true: give one of them")
+        return self
+
+
+class Rows(Section):
+    """[rows]: which rows are readings."""
+
+    plausible_only: bool = Field(
+        description="true: leave out rows that read what the row before reads though the joints "
+        "were sent elsewhere, and rows of the same joints whose positions cannot all be right"
+    )
+
+
+class Instrument(Section):
+    """[instrument]: its noise, where the table's figures are not of the cell's [tracker]."""
+
+    range_std_m: NonNegative = Field(description="along the beam, m, e.g. 5e-6")
+    range_std_per_m: NonNegative = Field(0.0, description="its growth with distance, m/m")
+    transverse_std_m: NonNegative = Field(description="across the beam, m, e.g. 8e-6")
+    transverse_std_per_m: NonNegative = Field(0.0, description="its growth with distance, m/m")
+    orientation_std_rad: NonNegative = Field(0.0, description="of an orientation, rad")
+
+    def noise(self) -> TrackerNoise:
+        """Return it as a specification."""
+        return TrackerNoise(
+            self.range_std_m,
+            self.range_std_per_m,
+            self.transverse_std_m,
+            self.transverse_std_per_m,
+            self.orientation_std_rad,
+        )
+
+
+class Std(Section):
+    """[std]: standard deviations, as columns or as figures for all readings."""
+
+    columns: tuple[Column, ...] = Field(
+        (), description="one column for all axes, three for the position, or six"
+    )
+    values: tuple[NonNegative, ...] = Field(
+        (), description="one number for all axes, three for the position, or six"
+    )
+    kind: Literal["std", "expanded", "variance"] = Field(
+        "std",
+        description='"std", "expanded" (U = k times the standard deviation) or "variance" '
+        "(then unit and angle_unit are those of its root)",
+    )
+    k: Positive = Field(2.0, description="the coverage factor of an expanded uncertainty, e.g. 2")
+    of: Literal["axis", "point"] = Field(
+        "axis", description='"axis", or "point": one figure is the 3-D length, √3 times an axis\'s'
+    )
+    unit: Length = Field("m", description=_LENGTH)
+    angle_unit: Angle = Field("rad", description=_ANGLE)
+    add_instrument: bool = Field(
+        False,
+        description="true where they are the scatter of samples only: the noise in [tracker] is "
+        "added, else false",
+    )
+
+    at_least: tuple[NonNegative, NonNegative] | None = Field(
+        None,
+        description="the least figure of a position and of an angle, in their units: the mean of "
+        "few samples can agree by chance",
+    )
+    optional: bool = Field(
+        False, description=f"{_OPTIONAL}; at_least is taken in the place of the columns then"
+    )
+
+    @model_validator(mode="after")
+    def _number(self) -> "Std":
+        if bool(self.columns) == bool(self.values):
+            raise ValueError("columns or values: give one of them")
+        given = len(self.columns) or len(self.values)
+        if given not in (1, 6) and (given % 3 or not given):
+            raise ValueError(f"{given} figures; it must be 1, 3 or 6, or 3 for each target")
+        if self.of == "point" and given != 1:
+            raise ValueError(f'of = "point" with {given} figures; it must be one')
+        if self.values and not all(self.values):
+            raise ValueError("values must be more than 0")
+        if self.optional and (self.at_least is None or not self.columns):
+            raise ValueError("optional = true needs columns and at_least")
+        return self
+
+
+class Correlation(Section):
+    """[correlation]: coefficients beside [std]."""
+
+    columns: Annotated[tuple[Column, ...], _columns(3, 15)] = Field(
+        description="three columns (xy, xz, yz), or the 15 of the upper triangle row by row"
+    )
+
+
+class CovarianceColumns(Section):
+    """[covariance]: the matrix, its upper triangle or all of it, row by row."""
+
+    columns: Annotated[tuple[Column, ...], _columns(6, 9, 21, 36)] = Field(
+        description="6 (upper triangle) or 9 columns of the position's covariance, or 21 or 36"
+    )
+    unit: Length = Field(description=_LENGTH + "; the covariance is in its square")
+    angle_unit: Angle = Field("rad", description=_ANGLE)
 
 
 class Mapping(Section):
@@ -45,7 +369,7 @@ class Mapping(Section):
         description='a section [joints] with columns, one per joint, and unit = "deg" or "rad"'
     )
     actual_joints: Joints | None = Field(None, description="a section [actual_joints]")
-    pose: Name | None = Field(None, description="a section [pose] with column")
+    pose: PoseName | None = Field(None, description="a section [pose] with column")
     load: LoadName | None = Field(None, description="a section [load] with column")
     cycle: Name | None = Field(None, description="a section [cycle] with column")
     target: Name | None = Field(None, description="a section [target] with column")
@@ -58,6 +382,8 @@ class Mapping(Section):
     wrench: Wrench | None = Field(None, description="a section [wrench]")
     hung_mass: HungMass | None = Field(None, description="a section [hung_mass]")
     approach: Approach | None = Field(None, description="a section [approach]")
+    rows: Rows | None = Field(None, description="a section [rows]")
+    instrument: Instrument | None = Field(None, description="a section [instrument]")
     std: Std | None = Field(None, description="a section [std]")
     correlation: Correlation | None = Field(None, description="a section [correlation]")
     covariance: CovarianceColumns | None = Field(None, description="a section [covariance]")

@@ -14,15 +14,20 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
-from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
+from hilcal.readings.covariance import INSTRUMENT, ROUNDING, TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
-from hilcal.tables.csvfile import CsvTable
-from hilcal.tables.stated_noise import floored, rounding_variance, with_rounding
-from hilcal.tables.table import instrument_covariance, stated_covariance, states_of
-from hilcal.tables.tabular import is_plain, pyarrow_module
+from hilcal.tables.files import is_plain, package
+from hilcal.tables.grid import Table
+from hilcal.tables.table import (
+    check_covers,
+    instrument_covariance,
+    measured_of,
+    stated_covariance,
+)
+from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
 from hilcal.types import Floats
 
 NAMES = ("pose", "load", "cycle")
@@ -78,14 +83,8 @@ class ReadingStream:
             name: _numbers(self.path, name, found.column(k), row)
             for k, name in enumerate(self.columns)
         }
-        table = CsvTable(str(self.path), self.columns, rows, {}, number)
-        states = states_of(table, self.arm)
-        value = table.matrix(columns.POSITION)
-        checks.check_positions(table, value, states.q, self.arm)
-        if columns.ROTATION[0] in number:
-            rotation = table.matrix(columns.ROTATION)
-            checks.check_rotations(table, rotation)
-            value = np.hstack([value, rotation])
+        table = Table(str(self.path), rows, {}, number)
+        states, value = measured_of(table, self.arm)
         count = len(rows)
         alone, none = np.arange(count), np.zeros(count, dtype=np.int64)
         checks.check_wrenches(table, states.wrench, none, ["as recorded"], self.arm)
@@ -145,7 +144,7 @@ def open_stream(
 
 
 def _opened(path: Path) -> Any:
-    parquet = pyarrow_module(path, "pyarrow.parquet")
+    parquet = package(path, "pyarrow.parquet", "Parquet")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
@@ -183,11 +182,7 @@ def _words(error: Exception) -> str:
 def _covers(path: Path, group: int) -> str:
     """What the covariances cover, as the first row says it."""
     word = str(next(_tables(path, group, (columns.COVERS,), 1)).column(0)[0].as_py())
-    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
-        raise InputError(
-            f"{path}: row 1, column '{columns.COVERS}': {word!r} is unknown; valid: {INSTRUMENT}, "
-            f"{WHOLE}, each with {ROUNDING}"
-        )
+    check_covers(word, f"{path}: row 1, column '{columns.COVERS}'")
     return word
 
 

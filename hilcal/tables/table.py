@@ -1,22 +1,23 @@
 """The exchange table: readings as CSV or Parquet, one row per reading."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.names import check_name
+from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
 from hilcal.readings.readings import Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.tables import checks, columns
-from hilcal.tables.csvfile import CsvTable, read_columns
-from hilcal.tables.following import following_columns, with_following
-from hilcal.tables.imported import ImportResult
-from hilcal.tables.stated_noise import LEAST, floored, rounding_variance, with_rounding
-from hilcal.tables.tabular import Column, is_parquet, read_parquet, write_columns
+from hilcal.tables.columns import following_columns, with_following
+from hilcal.tables.files import open_grid
+from hilcal.tables.grid import Table
+from hilcal.tables.mapping import FileFormat
+from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
+from hilcal.tables.write import Column, write_columns
 from hilcal.toml import suggest
 from hilcal.types import Floats, Ints
 
@@ -25,6 +26,27 @@ FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
+FORM = FileFormat(encoding="utf-8")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ImportResult:
+    """Readings, and what was decided on the way.
+
+    Attributes:
+        readings: the readings that can be used.
+        notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
+        covers: what the covariances cover, see `readings.covariance`.
+        noise_stated: whether the table or [tracker] states the noise; where False, the covariances
+            are those of the instrument that [tracker] has by default.
+        from_tracker: whether the covariances are those of the noise in [tracker].
+    """
+
+    readings: Readings
+    notes: tuple[str, ...]
+    covers: str = INSTRUMENT
+    noise_stated: bool = True
+    from_tracker: bool = False
 
 
 def read_table(
@@ -34,21 +56,7 @@ def read_table(
     station: Floats | Sequence[float] | None = None,
     targets: Sequence[str] = (),
 ) -> Readings:
-    """Read an exchange table; every unit is SI, every complaint names row and column.
-
-    Args:
-        path: a CSV or Parquet file with the columns of `columns.known_columns`.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the table has none.
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-        targets: names of the cell's targets, see `Cell.target_names`.
-
-    Returns:
-        The readings in the table's order; poses and loads are numbered as they appear.
-
-    Raises:
-        InputError: anything that cannot be right.
-    """
+    """Return the readings of an exchange table; arguments and errors are `import_table`'s."""
     return import_table(path, arm, noise, station, targets).readings
 
 
@@ -59,19 +67,29 @@ def import_table(
     station: Floats | Sequence[float] | None = None,
     targets: Sequence[str] = (),
 ) -> ImportResult:
-    """Read an exchange table as `read_table` does, with notes on where its covariances come from.
+    """Read an exchange table; every unit is SI, every complaint names row and column.
+
+    Args:
+        path: a CSV, Parquet or XLSX file with the columns of `columns.known_columns`.
+        arm: its number of joints, their limits and its reach are checked.
+        noise: gives the covariances where the table has none.
+        station: (3,) where the tracker's beam starts, m; the origin where None.
+        targets: names of the cell's targets, see `Cell.target_names`.
+
+    Returns:
+        The readings in the table's order, poses and loads numbered as they appear; and notes on
+        where its covariances come from.
 
     Raises:
         InputError: anything that cannot be right.
     """
-    path = Path(path)
-    read = read_parquet if is_parquet(path) else read_columns
-    table = read(path, lambda header: _choose(str(path), header, arm))
-    return readings_of(table, arm, noise, station, targets=targets)
+    chosen: list[Sequence[str]] = []
+    grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
+    return readings_of(Table.of(grid, *chosen), arm, noise, station, targets=targets)
 
 
 def readings_of(
-    table: CsvTable,
+    table: Table,
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
@@ -98,15 +116,10 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    states = replace(states_of(table, arm), target=target)
+    states, value = measured_of(table, arm)
+    states = replace(states, target=target)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
-    value = table.matrix(columns.POSITION)
-    checks.check_positions(table, value, states.q, arm)
-    if columns.ROTATION[0] in table.number:
-        rotation = table.matrix(columns.ROTATION)
-        checks.check_rotations(table, rotation)
-        value = np.hstack([value, rotation])
     stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
@@ -136,10 +149,9 @@ def readings_of(
     return ImportResult(readings, (*notes, *rounded), covers)
 
 
-def _choose(path: str, header: list[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
+def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
     """Check the header; text and number columns to read."""
-    if header and header[0].startswith("Timestamp;"):
-        raise InputError(f"{path}: not an exchange table; looks like --format ipa-ur10")
+    check_names(header, f"{path}: row 1, column")
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
@@ -164,7 +176,7 @@ def _index(names: list[str]) -> tuple[Ints, list[str]]:
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
 
 
-def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
+def _targets(table: Table, names: Sequence[str]) -> Ints | None:
     """(N,) numbers of the targets by the cell's names; None where there is one target.
 
     Raises:
@@ -200,7 +212,7 @@ def _targets(table: CsvTable, names: Sequence[str]) -> Ints | None:
     return np.array([names.index(name) for name in given], dtype=np.int64)
 
 
-def _covers(table: CsvTable) -> tuple[str, bool]:
+def _covers(table: Table) -> tuple[str, bool]:
     """What the table's covariances cover, by its column `covers`, and whether rounding, too.
 
     Without the column it is the instrument.
@@ -210,12 +222,7 @@ def _covers(table: CsvTable) -> tuple[str, bool]:
     """
     given = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(given):
-        if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
-            raise InputError(
-                f"{table.at(k, columns.COVERS)}: {word!r} is unknown; valid: {INSTRUMENT} (the "
-                f"covariance of the tracker), {WHOLE} (the arm's repeatability is in it), each "
-                f"with {ROUNDING} where the rounding of the positions is in it"
-            )
+        check_covers(word, table.at(k, columns.COVERS))
         if word != given[0]:
             raise InputError(
                 f"{table.at(k, columns.COVERS)}: {word}, but {given[0]} in the first row; all "
@@ -224,8 +231,36 @@ def _covers(table: CsvTable) -> tuple[str, bool]:
     return given[0].removesuffix(ROUNDING), given[0].endswith(ROUNDING)
 
 
-def states_of(table: CsvTable, arm: Arm) -> States:
-    """Return the states of a table's rows; raises as `read_table` does."""
+def check_covers(word: str, where: str) -> None:
+    """Refuse another word than those for what covariances cover.
+
+    Raises:
+        InputError: lists the valid ones.
+    """
+    if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
+        raise InputError(
+            f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
+            f"{WHOLE} (the arm's repeatability is in it), each with {ROUNDING} where the rounding "
+            "of the positions is in it"
+        )
+
+
+def measured_of(table: Table, arm: Arm) -> tuple[States, Floats]:
+    """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
+
+    Raises:
+        InputError: a value that cannot be right.
+    """
+    states, value = _states(table, arm), table.matrix(columns.POSITION)
+    checks.check_positions(table, value, states.q, arm)
+    if columns.ROTATION[0] in table.number:
+        rotation = table.matrix(columns.ROTATION)
+        checks.check_rotations(table, rotation)
+        value = np.hstack([value, rotation])
+    return states, value
+
+
+def _states(table: Table, arm: Arm) -> States:
     table = with_following(table, arm)
     number, n = table.number, arm.n
     q = table.matrix(columns.joint_columns(n))
@@ -260,11 +295,11 @@ def states_of(table: CsvTable, arm: Arm) -> States:
     )
 
 
-def _group(table: CsvTable, names: Sequence[str]) -> Floats | None:
+def _group(table: Table, names: Sequence[str]) -> Floats | None:
     return table.matrix(names) if names[0] in table.number else None
 
 
-def _in_range(table: CsvTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
+def _in_range(table: Table, names: Sequence[str], low: float, high: float, unit: str) -> None:
     value = table.matrix(names)
     table.refuse(
         (value < low) | (value > high),
@@ -273,7 +308,7 @@ def _in_range(table: CsvTable, names: Sequence[str], low: float, high: float, un
     )
 
 
-def _cycles(table: CsvTable) -> Ints:
+def _cycles(table: Table) -> Ints:
     if "cycle" not in table.number:
         return np.zeros(len(table.rows), dtype=np.int64)
     cycle = table.matrix(("cycle",))
@@ -282,7 +317,7 @@ def _cycles(table: CsvTable) -> Ints:
     return cycle[:, 0].astype(np.int64)
 
 
-def stated_covariance(table: CsvTable, m: int) -> Floats | None:
+def stated_covariance(table: Table, m: int) -> Floats | None:
     """Covariances (N, m, m) that the table states, None where it states none."""
     names = columns.covariance_columns(m)
     if names[0] not in table.number:
@@ -294,7 +329,7 @@ def stated_covariance(table: CsvTable, m: int) -> Floats | None:
 
 
 def instrument_covariance(
-    table: CsvTable,
+    table: Table,
     value: Floats,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,

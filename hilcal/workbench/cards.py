@@ -14,14 +14,17 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.distinguish import Difference
 from hilcal.diagnosis.effect_ranking import Suspect
-from hilcal.present import text
-from hilcal.present.charts import error_per_revision, measured_predicted, misfit, residuals
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.law import law
-from hilcal.present.charts.residual_over import residual_over
-from hilcal.present.text_info import model_words
-from hilcal.present.two_revisions import left_out_m, two_revisions, verdict_of
-from hilcal.present.verdict_words import headline, message
+from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import added_variable, curve_chart, misfit_shares
+from hilcal.present.charts.readings import (
+    measured_predicted,
+    residual_by_load,
+    residual_by_pose,
+    residual_over,
+)
+from hilcal.present.fit import CERTAIN, follows, misses, model_name
+from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.store.revision import RevisionRecord
 from hilcal.workbench.elements import answer, button, chart, number, plain, point, title
@@ -31,7 +34,7 @@ from hilcal.workbench.snapshot import Figure, Snapshot
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
 
-CERTAIN = text.CERTAIN
+CERTAIN = CERTAIN
 SUSPECTS = 6
 FURTHEST = 8
 FURTHEST_SHARE = 0.05
@@ -126,7 +129,7 @@ def model(view: View, d: Snapshot) -> None:
     """Draw the effects of the model, each with a button that takes it out."""
     called = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
     with ui.row().classes("items-center").style("gap: 6px 10px"):
-        ui.label(f"{called}: {text.model_name(d.fit.model.named)}").classes("soft")
+        ui.label(f"{called}: {model_name(d.fit.model.named)}").classes("soft")
         for name in d.removable:
             button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
     answer(view, "model")
@@ -138,8 +141,8 @@ def fails(view: View, d: Snapshot) -> None:
     if d.diagnosis.residual_is_noise:
         ui.label("Nowhere beyond the noise: what is left is what it explains.").classes("soft")
         return
-    ui.label(text.follows(d.diagnosis.misfit_breakdown)).classes("soft")
-    shown = chart(view, misfit.misfit_shares(d.diagnosis))
+    ui.label(follows(d.diagnosis.misfit_breakdown)).classes("soft")
+    shown = chart(view, misfit_shares(d.diagnosis))
     shown.props("data-part=fails")
     shown.on("plotly_click", lambda e: _picked_bar(view, d, e))
     ui.label("Click a bar: the readings over that variable.").classes("soft")
@@ -259,7 +262,7 @@ def readings(view: View, d: Snapshot) -> None:
     found = None if plain_kind else view.session.recorded(d).get(variable or "")
     title("The readings" if variable is None else f"The readings over {variable}")
     if found is None or variable == "load":
-        kind = residuals.residual_by_load if variable == "load" else residuals.residual_by_pose
+        kind = residual_by_load if variable == "load" else residual_by_pose
         figure = kind(d.story, d.revision)
     else:
         name, factor = numbers.angle_or(found.unit)
@@ -329,7 +332,7 @@ def furthest(d: Snapshot) -> list[int]:
 def fell(view: View, d: Snapshot) -> None:
     """Draw how the error fell."""
     title("How the error fell")
-    chart(view, error_per_revision.error_per_revision(d.story)).props("data-part=fell")
+    chart(view, error_per_revision(d.story)).props("data-part=fell")
 
 
 def revisions(view: View, d: Snapshot) -> None:
@@ -411,18 +414,17 @@ def pair_table(a: RevisionRecord, b: RevisionRecord) -> None:
 def compared(view: View, d: Snapshot) -> None:
     """Draw what was measured against what is predicted."""
     title("Model and measurement")
-    ui.label(text.misses(d.fit)).classes("soft")
-    chart(view, measured_predicted.measured_predicted(d.story, d.revision))
+    ui.label(misses(d.fit)).classes("soft")
+    chart(view, measured_predicted(d.story, d.revision))
 
 
 def laws(view: View, d: Snapshot) -> None:
     """Draw the laws of the model that the catalogue does not have."""
     title("Laws beyond the catalogue")
     for one in d.revision.laws:
-        ui.label(f"{one.name}: {one.formula}; {one.coefficients}; acts on {one.acts_on}").classes(
-            "soft"
-        )
-        chart(view, law(one)).props("data-part=law")
+        told = "; ".join(f"{what}: {said}" for what, said in one.facts)
+        ui.label(f"{one.title}: {told}").classes("soft")
+        chart(view, curve_chart(one)).props("data-part=law")
 
 
 def viewer(view: View) -> None:

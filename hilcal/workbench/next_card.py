@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from hilcal.present import text_next
+from hilcal.present.plan import power_rows, powers_summary
 from hilcal.workbench.elements import answer, button, title
 from hilcal.workbench.session import Session
 from hilcal.workbench.snapshot import Snapshot
@@ -42,10 +42,10 @@ def planned(session: Session) -> None:
         return
     found, path = session.planned
     summary = found.made.summary
-    ui.label(text_next.summary(found.found.powers, summary.poses, summary.readings)).props(
+    ui.label(powers_summary(found.found.powers, summary.poses, summary.readings)).props(
         "data-part=planned"
     )
-    for effect, rival, now, then in text_next.power_rows(found.found.powers):
+    for effect, rival, now, then in power_rows(found.found.powers):
         ui.label(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.").classes(
             "soft"
         )

@@ -12,8 +12,8 @@ from nicegui import ui
 
 from hilcal import numbers
 from hilcal.campaign.changes import Changed
-from hilcal.present import text_refine
-from hilcal.present.two_revisions import refitted
+from hilcal.present.campaign import refitted
+from hilcal.present.diagnosis import addition_lines, fell, rose
 from hilcal.workbench import cards, next_card
 from hilcal.workbench.elements import Status
 from hilcal.workbench.session import Say, Session
@@ -106,11 +106,9 @@ def told(c: Changed | None) -> str:
     """Return what adding or removing an effect did."""
     if c is None:
         return ""
-    say = text_refine.fell if c.added else text_refine.rose
+    say = fell if c.added else rose
     lines = [say(c.before, c.fit, c.added or c.removed or ""), f"It is revision {c.number}."]
-    return " ".join(
-        lines + ([] if c.expected is None else [*text_refine.addition_lines(c.expected)])
-    )
+    return " ".join(lines + ([] if c.expected is None else [*addition_lines(c.expected)]))
 
 
 class View:

@@ -26,8 +26,8 @@ from hilcal.errors import InputError
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.present.build_story import Chapter, build_story, regressor
-from hilcal.present.covariance_words import covariance_words
-from hilcal.present.story import Regressor
+from hilcal.present.registration import covariance_words
+from hilcal.present.story import Curve
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import RevisionRecord
@@ -252,7 +252,7 @@ class Session:
         except InputError:
             return True
 
-    def evidence(self, snapshot: Snapshot, effect: str) -> Regressor | None:
+    def evidence(self, snapshot: Snapshot, effect: str) -> Curve | None:
         """Return residual and regressor of a suspect, for its added-variable plot."""
         found = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
         return None if found is None else regressor(snapshot.fit, found)

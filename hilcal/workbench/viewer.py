@@ -72,7 +72,7 @@ class WebViewer:
             HilcalError: the viewer cannot be had, or the story not be recorded.
         """
         from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
-        from hilcal.present.viewer.digest import Limits, digest
+        from hilcal.present.viewer.digest import digest
         from hilcal.present.viewer.layout import blueprint
         from hilcal.present.viewer.stream import APPLICATION
 
@@ -81,7 +81,7 @@ class WebViewer:
         with tempfile.TemporaryDirectory() as folder:
             paths = [Path(folder) / name for name in names]
             save(story, paths[0])
-            blueprint(digest(story, Limits())).save(APPLICATION, str(paths[1]))
+            blueprint(digest(story)).save(APPLICATION, str(paths[1]))
             recorded = {path.name: path.read_bytes() for path in paths}
         if not self._files:
             say("preparing the viewer")

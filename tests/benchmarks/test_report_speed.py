@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import CDPSession
 
-from hilcal.present.charts.readings_drawn import MOST
+from hilcal.present.charts.readings import MOST
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.page import page as page_of
 from tests.benchmarks.conftest import Claim

@@ -16,7 +16,7 @@ import pytest
 import rerun as rr
 
 from hilcal.measuring.progress import ArmAt
-from hilcal.present.live_messages import Measuring
+from hilcal.present.live_viewer import Measuring
 from hilcal.present.viewer import live, save
 from hilcal.present.viewer.live_scene import LiveScene
 from tests.benchmarks.conftest import Claim

@@ -317,8 +317,8 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     def planned(*_: object) -> None:
         raise AssertionError("it plans first")
 
-    for module in ("simulating", "running"):
-        name = "make_plan" if module == "simulating" else "_own_plan"
+    for module in ("rehearsing", "running"):
+        name = "make_plan" if module == "rehearsing" else "_own_plan"
         monkeypatch.setattr(f"hilcal.cli.{module}.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")
@@ -337,7 +337,7 @@ def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     def started(*_: object) -> None:
         raise InputError("no devices here")
 
-    monkeypatch.setattr("hilcal.cli.simulating.simulated_cell", started)
+    monkeypatch.setattr("hilcal.cli.rehearsing.simulated_cell", started)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
     told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)

@@ -6,6 +6,7 @@ import re
 import pytest
 import typer
 
+from hilcal.cli import looking_up
 from hilcal.cli.commands import COMMANDS, SECTIONS, load
 from tests.support.cli_cases import ok, refused, run
 from tests.support.paths import ROOT
@@ -98,7 +99,6 @@ def test_an_error_is_one_document_with_json(
 def test_an_unexpected_error_and_an_interrupt_are_documents(
     capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hilcal.cli import effects
 
     def fails(error: BaseException) -> object:
         def raises(*_: object) -> None:
@@ -107,11 +107,11 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(
         return raises
 
     monkeypatch.delenv("HILCAL_DEBUG", raising=False)
-    monkeypatch.setattr(effects, "example_cell", fails(ZeroDivisionError("by\nzero")))
+    monkeypatch.setattr(looking_up, "example_cell", fails(ZeroDivisionError("by\nzero")))
     found = run(capsys, "effects", "--json")
     assert (found.code, found.document["error"]["kind"]) == (1, "unexpected")
     assert "ZeroDivisionError: by zero" in found.document["error"]["message"]
-    monkeypatch.setattr(effects, "example_cell", fails(KeyboardInterrupt()))
+    monkeypatch.setattr(looking_up, "example_cell", fails(KeyboardInterrupt()))
     found = run(capsys, "effects", "--json")
     assert found.code == 130
     assert found.document["error"] == {

@@ -6,7 +6,7 @@ import pytest
 
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE
 from drivers.simulated.on_the_wire import case_of_plan, read_plan
-from hilcal.cli import doubting
+from hilcal.cli import demo
 from hilcal.cli.rehearsing import RehearsalSettings
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import History
@@ -248,7 +248,7 @@ def rehearsal_of(seed: int, path: Path) -> RehearsalSettings:
 
 def in_doubt_at_first(seed: int, path: Path) -> bool:
     """Whether the first readings of an ambiguous demo, which the seed determines, leave a doubt."""
-    case, plan, doubtful = doubting.doubtful_case(rehearsal_of(seed, path), None, print)
+    case, plan, doubtful = demo.doubtful_case(rehearsal_of(seed, path), None, print)
     assert doubtful
     assert case.choice in HARD_TO_SEPARATE
     secret = case_of_plan(case.config, plan, case.choice, case.seed)
@@ -258,7 +258,7 @@ def in_doubt_at_first(seed: int, path: Path) -> bool:
 
 
 def test_an_ambiguous_demo_is_in_doubt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doubting, "DRAWS", 2)
+    monkeypatch.setattr(demo, "DRAWS", 2)
     assert in_doubt_at_first(2, tmp_path / "x")
 
 
@@ -269,8 +269,8 @@ def test_every_ambiguous_demo_is_in_doubt(tmp_path: Path) -> None:
 
 def test_a_case_without_a_doubt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect that everything separates is hidden all the same, if that is asked for."""
-    monkeypatch.setattr(doubting, "TRIES", 2)
-    monkeypatch.setattr(doubting, "_resembled", lambda r, case: False)
-    case, _, doubtful = doubting.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
+    monkeypatch.setattr(demo, "TRIES", 2)
+    monkeypatch.setattr(demo, "_resembled", lambda r, case: False)
+    case, _, doubtful = demo.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
     assert case.choice == "creep"
     assert not doubtful

@@ -17,8 +17,8 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
 from hilcal.present.build_story import build_story
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import refine

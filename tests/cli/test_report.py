@@ -118,7 +118,7 @@ def test_deflection_and_absolute_revisions_stand_in_no_column_together(
     kinds = {"1": "deflection", "2": "absolute", "3": "deflection"}
     seen = []
     for heads, rows in found.tables:
-        if "left out" in heads or "left out, rms" in heads:
+        if "left out" in heads or "poses left out" in heads:
             own = {kinds[row[0].removeprefix("→ ")] for row in rows}
             assert len(own) == 1, (heads, rows)
             seen.append(own.pop())

@@ -11,8 +11,8 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.tables import matfile
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.sheets import open_grid
+from hilcal.tables.files import open_grid
+from hilcal.tables.mapping import FileFormat
 from tests.fuzz.bench import Bench
 from tests.fuzz.damage import NUMBERS, ODD, bytes_damaged, words_damaged
 from tests.fuzz.harness import Parser

@@ -19,8 +19,7 @@ from hilcal.effects import template
 from hilcal.effects.catalogue import installed
 from hilcal.identification import posterior_document
 from hilcal.identification.carried import carried_prior, check_arm
-from hilcal.present import text_info
-from hilcal.present.two_revisions import two_revisions
+from hilcal.present.campaign import info_json, info_report, two_revisions
 from hilcal.procedure.state import next_step, settings_of
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import revision, run_log
@@ -29,7 +28,7 @@ from hilcal.store.overview import overview
 from hilcal.store.rows import _reading_crc, text_crc
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.parquet_stream import open_stream
-from hilcal.tables.revision_table import revision_table
+from hilcal.tables.write import revision_table
 from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import Bench
 from tests.fuzz.damage import (
@@ -90,9 +89,9 @@ def _told(file: CampaignFile) -> None:
     """Ask for everything that a campaign file says of itself."""
     found = overview(file)
     console = Console(file=io.StringIO(), width=100)
-    for part in text_info.info_report(found, "x", "instrument"):
+    for part in info_report(found, "x", "instrument"):
         console.print(part)
-    text_info.to_json(found, "x", "instrument")
+    info_json(found, "x", "instrument")
     revision_table(found.revisions, found.in_use)
     for record in found.revisions:
         two_revisions(record, record)

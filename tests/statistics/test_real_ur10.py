@@ -12,11 +12,11 @@ from hilcal.config import load_config
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.validation import validate
-from hilcal.present.verdict_words import message
+from hilcal.library import read_table
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.refinement import Refinement, refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.tables.ipa_ur10 import read_ipa_ur10
 
 pytestmark = pytest.mark.slow
 
@@ -36,7 +36,7 @@ class Series:
 @cache
 def series(name: str, directory: Path) -> Series:
     cell = cell_from_config(load_config(configs_dir() / "cells" / "ipa_ur10.toml"))
-    return Series(cell, read_ipa_ur10(directory / FILES[name], cell.arm).readings)
+    return Series(cell, read_table(directory / FILES[name], cell, "ipa-ur10"))
 
 
 @cache

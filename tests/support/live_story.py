@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark
-from hilcal.present.live_messages import Measuring
+from hilcal.present.live_viewer import Measuring
 from hilcal.store.plan import Plan, Step
 from tests.support.viewer_story import ur10e
 

@@ -4,16 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.present.story import (
-    Regressor,
-    Story,
-    StoryCurve,
-    StoryLimit,
-    StoryParameter,
-    StoryRevision,
-    StoryRival,
-    StorySuspect,
-)
+from hilcal.present.document import table
+from hilcal.present.story import Curve, Story, StoryRevision
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
 
@@ -103,29 +95,24 @@ def story(
     )
 
 
-ANGLE = StoryCurve(
-    variable="joint 4 angle",
-    share=0.71,
+ANGLE = Curve(
+    title="joint 4 angle",
+    says="71 % of the misfit on poses left out follows joint 4 angle.",
     x=np.array([-150.0, -90.0, -20.0, 35.0, 110.0]),
     y=np.array([-40.0, 12.0, 31.0, 8.0, -25.0]),
     error=np.array([6.0, 4.0, 3.0, 4.0, 9.0]),
     x_label="joint 4 angle [°]",
     y_label="error of joint 2 [µrad]",
 )
-LOAD = StoryCurve(
-    variable="load",
-    share=0.23,
+LOAD = Curve(
+    title="load",
+    says="23 % of the misfit on poses left out follows load.",
     x=np.arange(3.0),
     y=np.array([-60.0, 5.0, 55.0]),
     error=np.array([8.0, 8.0, 9.0]),
     x_label="load",
-    y_label="error of target along (0.51, -0.30, 0.81) [µm]",
+    y_label="error of the target along (0.51, -0.30, 0.81) [µm]",
     names=("none", "5kg", "10kg"),
-)
-LIMITS = (
-    StoryLimit("hysteresis", 11e-6, "9.6 µrad"),
-    StoryLimit("tracker_scale", 46e-6, "21 ppm"),
-    StoryLimit("creep", np.inf, ""),
 )
 
 
@@ -133,20 +120,9 @@ def doubtful(names: str = "") -> Story:
     """A story with doubts: a missing effect, an ambiguous one, an unknown one, and none left."""
     told = story(poses=12, names=names)
     first, second, third, last = told.revisions
-    second = replace(
-        second,
-        verdict="ambiguous",
-        rivals=(StoryRival("hysteresis" + names, 0.04, 4.5), StoryRival("creep", 1e-5, np.inf)),
-    )
-    third = replace(
-        third,
-        verdict="unknown_effect",
-        suspects=(),
-        regressor=None,
-        curves=tuple(replace(c, variable=c.variable + names) for c in (ANGLE, LOAD)),
-    )
-    limits = tuple(replace(s, effect=s.effect + names) for s in LIMITS)
-    return replace(told, revisions=(first, second, third, replace(last, limits=limits)))
+    second = replace(second, verdict="ambiguous")
+    third = replace(third, verdict="unknown_effect", follows=ANGLE)
+    return replace(told, revisions=(first, second, third, last))
 
 
 def _revision(k, parts, truth, offset, covariance, torque, names):
@@ -163,44 +139,32 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         "rms_sigma": float(np.sqrt(norm2.mean() / 3)),
     }
     left = EFFECTS[k + 1 :]
-    suspects = tuple(
-        StorySuspect(
-            e + names,
-            0.86 * 0.13**i,
-            0.84 * 0.13**i,
-            10.0 ** -(40 / (1 + 2 * i)),
-            ("joint_stiffening",) if e == "hysteresis" else (),
-        )
-        for i, e in enumerate(left)
-    )
-    parameters = tuple(
-        StoryParameter(f"{e}.{axis}{names}", v, s, "µrad/Nm", ok)
-        for j, e in enumerate(EFFECTS[: k + 1])
-        for axis, v, s, ok in (
-            ("joint1", None, None, False) if j == 0 else ("x", 1.1 / (j + 1), 0.02 * (j + 1), True),
-            ("joint2", 2.6 / (j + 1), 0.03 * (j + 1), True),
-            ("joint3", 0.04 - 0.01 * j, 0.05, True),
-        )
-    )
-    adequate = not left
+    shares = [(e + names, f"{86 * 0.13**i:.0f} %", "84 %") for i, e in enumerate(left)]
+    words = "What is left looks like noise."
+    if left:
+        words = f"{left[0]} is missing: it explains 86 % of what is left."
+    verdict = "missing_effect" if left else "adequate"
+    suspects = table("missing effect?", "explains", "left out", rows=shares)
     return StoryRevision(
         revision=k,
         change="" if k == 0 else "+ " + EFFECTS[k] + names,
-        model=EFFECTS[: k + 1],
-        verdict="adequate" if adequate else "missing_effect",
-        message="What is left looks like noise."
-        if adequate
-        else f"{left[0]} is missing: it explains 86 % of what is left, "
-        "and does so on poses it was not fitted to.",
+        verdict=verdict,
+        message=words,
         residual=residual,
         predicted=predicted + offset,
         whitened_norm2=norm2,
         error_fit=error,
         error_holdout={key: 1.06 * v for key, v in error.items()},
-        variance_factor=float(norm2.mean() / 3),
-        suspects=suspects,
-        parameters=parameters,
-        regressor=None
-        if adequate
-        else Regressor(torque[:, 1], 1e6 * residual[:, 2], "torque of joint 2 [Nm]", "z [µm]"),
+        cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
+        panels={"verdict": (words, *([suspects] if left else []))},
+        follows=Curve(
+            left[0],
+            "",
+            torque[:, 1],
+            1e6 * residual[:, 2],
+            "torque of joint 2 [Nm]",
+            "z [µm]",
+        )
+        if left
+        else None,
     )

@@ -12,7 +12,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.refinement import MOST_REVISIONS, Refinement, add, refine
 from hilcal.regression.paired_test import LEAST_GAIN

@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import plain, to_json
-from hilcal.present.diagnosis_document import to_json as diagnosis_json
+from hilcal.present.diagnosis_json import to_json as diagnosis_json
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import add
 from hilcal.store.records import content_hash

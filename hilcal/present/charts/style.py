@@ -6,13 +6,15 @@ tells anything by colour alone.
 """
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import plotly.graph_objects as go
 from scipy import stats
 
 from hilcal.names import escaped
-from hilcal.types import Floats, Ints
+from hilcal.present.story import LIMITS
+from hilcal.types import Floats
 
 MEASURED = "#3a96d0"
 NOISE = "#009e73"
@@ -23,11 +25,8 @@ RED = "#e0325c"
 LIGHT, DARK = "#ffffff", "#15171c"
 """The papers that charts are drawn on."""
 LEVELS = (GREY, AMBER, RED)
-LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 SYMBOLS = ("circle", "diamond", "x")
 """Marks of the levels, so that they are told apart without colours."""
-LIMITS = (0.99, 0.9999)
-"""Quantiles of χ²(3) from which a reading is doubtful, and outside: as in the viewer."""
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
@@ -84,6 +83,30 @@ def figure(
     return out
 
 
+def line(
+    x: Floats, y: Floats, name: str = "", color: str = NOISE, dash: str = "solid"
+) -> go.Scatter:
+    """Return a line that tells nothing when it is pointed at."""
+    return go.Scatter(
+        x=drawn(x),
+        y=drawn(y),
+        mode="lines",
+        line={"color": color, "width": 2, "dash": dash},
+        name=name,
+        showlegend=bool(name),
+        hoverinfo="skip",
+    )
+
+
+def marks(
+    x: object, y: Floats, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
+) -> go.Scatter:
+    """Return points; `more` is their name and what they tell."""
+    x = drawn(x) if isinstance(x, np.ndarray) else x
+    marker = {"color": color, "symbol": symbol, "size": size}
+    return go.Scatter(x=x, y=drawn(y), mode="markers", marker=marker, **more)
+
+
 def says(chart: go.Figure) -> str:
     """Return the sentence that a chart shows."""
     meta: Mapping[str, str] = chart.layout.meta or {}
@@ -102,11 +125,6 @@ def empty(words: str) -> go.Figure:
     note = {"text": words, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
     hidden = {"visible": False}
     return figure(words, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
-
-
-def levels(norm2: Floats) -> Ints:
-    """Level (N,) of squared Mahalanobis distances, 3 dof: 0 noise, 1 doubtful, 2 outside."""
-    return np.digitize(norm2, stats.chi2.ppf(LIMITS, 3)).astype(np.int64)
 
 
 def sigma_limits() -> tuple[float, float]:

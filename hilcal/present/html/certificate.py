@@ -1,6 +1,7 @@
 """The certificate: before and after, limit, uncertainty, what was not tested, by what."""
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -8,14 +9,23 @@ import numpy as np
 from hilcal import numbers
 from hilcal.calibration.budget import COVERAGE, Budget, budget
 from hilcal.identification.fit import Fit
-from hilcal.present import text, text_validate
-from hilcal.present.covariance_words import covariance_words
+from hilcal.present.document import (
+    Block,
+    Items,
+    Section,
+    Table,
+    Words,
+    captioned,
+    heading,
+    note,
+    table,
+)
+from hilcal.present.fit import errors, prior_lines
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import left_out_errors, limit_words
-from hilcal.present.html.parts import Items, Part, Section, Table, Words, from_terminal, table
-from hilcal.present.scatter_words import repeatability_source
-from hilcal.present.text_prior import prior_lines
-from hilcal.present.text_registration import base_line
+from hilcal.present.registration import base_line, covariance_words
+from hilcal.present.validation import loads_report, opening, validation_report
+from hilcal.present.verdict import repeatability_source
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 
@@ -23,14 +33,14 @@ from hilcal.store.plan import UNLOADED
 def certificate(m: ReportContent) -> Section:
     """Return the certificate for a quality manager."""
     fit = m.fit
-    parts = [*from_terminal([text.errors(fit)], "Error before and after")]
+    parts: list[Block] = [replace(errors(fit), caption="Error before and after")]
     if m.corrected is not None:
         parts.append(_corrected(m.corrected))
-    parts += [Words("Uncertainty", "heading"), *_uncertainty(fit)]
-    parts += [Words("Limit", "heading"), *_limit(m)]
-    parts += [Words("Poses and loads", "heading"), *_conditions(m)]
-    parts += [Words("What was not tested", "heading"), Items(tuple(not_tested(m)))]
-    parts += [Words("Measured with", "heading"), *_instruments(m)]
+    parts += [heading("Uncertainty"), *_uncertainty(fit)]
+    parts += [heading("Limit"), *_limit(m)]
+    parts += [heading("Poses and loads"), *_conditions(m)]
+    parts += [heading("What was not tested"), Items(tuple(not_tested(m)))]
+    parts += [heading("Measured with"), *_instruments(m)]
     return Section("certificate", "Certificate", tuple(parts))
 
 
@@ -43,10 +53,11 @@ def _corrected(found: Mapping[str, Any]) -> Table:
         within = f"{part['inside']} of {part['count']}"
         rows.append((name, str(part["count"]), *(numbers.length(float(x)) for x in sizes), within))
     heads = ("load", "n", "before, rms", "largest", "corrected, rms", "largest", "in 95 % band")
-    return table("Measured at uncorrected and at corrected joint targets", heads, rows)
+    caption = "Measured at uncorrected and at corrected joint targets"
+    return table(*heads, rows=rows, caption=caption)
 
 
-def _conditions(m: ReportContent) -> Iterator[Part]:
+def _conditions(m: ReportContent) -> Iterator[Block]:
     o, r = m.overview, m.fit.readings
     count = f"{len(r)} readings of {len(np.unique(r.pose))} poses"
     loads = ", ".join(
@@ -54,15 +65,15 @@ def _conditions(m: ReportContent) -> Iterator[Part]:
     )
     set_aside = int(m.fit.outlier.sum())
     gross = f"; {set_aside} set aside as gross errors" if set_aside else ""
-    yield Words(f"{count}{gross}. Loads (readings): {loads}.")
-    yield from (Words(line.strip()) for line in prior_lines(m.fit))
-    yield Words(_choice(m))
+    yield f"{count}{gross}. Loads (readings): {loads}."
+    yield from (*prior_lines(m.fit), _choice(m))
     q = np.degrees(r.states.q)
     joints = range(q.shape[1])
     yield table(
-        "Joint angles that were measured",
-        ("joint", *(str(j + 1) for j in joints)),
-        (
+        "joint",
+        *(str(j + 1) for j in joints),
+        caption="Joint angles that were measured",
+        rows=(
             ("from", *(f"{q[:, j].min():.0f}°" for j in joints)),
             ("to", *(f"{q[:, j].max():.0f}°" for j in joints)),
         ),
@@ -84,24 +95,19 @@ def _choice(m: ReportContent) -> str:
     )
 
 
-def _limit(m: ReportContent) -> Iterator[Part]:
+def _limit(m: ReportContent) -> Iterator[Block]:
     words, passed = limit_words(m)
     if passed is None:
-        yield Words(
-            "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
-        )
+        yield "No limit was given (hilcal report --limit LENGTH), so nothing is passed or failed."
     else:
         yield Words(words, "strong")
     if m.tested is not None:
         t = m.tested
-        yield Words(f"Validation campaign {t.name}")
-        yield from from_terminal(text_validate.opening(t.judged, t.prediction))
-        yield from from_terminal(
-            text_validate.validation_report(t.judged, t.prediction, t.beyond), "Validation"
-        )
-        yield from from_terminal(
-            text_validate.loads_report(t.shares), "Errors of the validation campaign"
-        )
+        yield f"Validation campaign {t.name}"
+        yield from opening(t.judged, t.prediction)
+        told = validation_report(t.judged, t.prediction, t.beyond)
+        yield from captioned(told, "Validation")
+        yield from captioned(loads_report(t.shares), "Errors of the validation campaign")
 
 
 def _by_load(m: ReportContent) -> Table:
@@ -125,12 +131,12 @@ def _by_load(m: ReportContent) -> Table:
             row.append("kept" if error[worst] <= m.limit_m else "over")
         rows.append(row)
     heads = ["load", "n", "rms", "largest", "at pose"] + (["limit"] if m.limit_m else [])
-    return table("Error of poses left out, by load", heads, rows)
+    return table(*heads, rows=rows, caption="Error of poses left out, by load")
 
 
-def _uncertainty(fit: Fit) -> Iterator[Part]:
+def _uncertainty(fit: Fit) -> Iterator[Block]:
     if fit.scaling != "gc":
-        yield Words("No uncertainty is stated: the fit is not weighted by the full covariance.")
+        yield "No uncertainty is stated: the fit is not weighted by the full covariance."
         return
     b = budget(fit)
     error = left_out_errors(fit)
@@ -143,18 +149,17 @@ def _uncertainty(fit: Fit) -> Iterator[Part]:
         "strong",
     )
     yield table(
-        "Contributions (GUM): standard uncertainties",
-        ("contribution", "evaluated by", "3-D", "share of u²"),
-        (
+        *("contribution", "evaluated by", "3-D", "share of u²"),
+        rows=(
             (name, how, numbers.length(u), numbers.percent((u / b.combined) ** 2))
             for name, how, u in _contributions(b, fit.model.cell.arm)
         ),
+        caption="Contributions (GUM): standard uncertainties",
     )
-    yield Words(
+    yield note(
         "This holds for poses and loads among those below. It does not contain what no reading "
         "here can show: an error of scale or alignment of the instrument beyond its stated "
         "covariance, temperatures and loads that were not measured, and changes of the arm since.",
-        "note",
     )
 
 
@@ -196,13 +201,13 @@ def not_tested(m: ReportContent) -> Iterator[str]:
         yield f"At no plausible size would these readings show {numbers.names(d.not_shown, 'or')}."
 
 
-def _instruments(m: ReportContent) -> Iterator[Part]:
+def _instruments(m: ReportContent) -> Iterator[Block]:
     o = m.overview
     if o.instruments:
         yield table(
-            "Instruments",
-            ("part", "instrument", "serial number", "answered first (UTC)", "further"),
-            (
+            *("part", "instrument", "serial number", "answered first (UTC)", "further"),
+            caption="Instruments",
+            rows=(
                 (
                     i.part,
                     i.name,
@@ -215,13 +220,13 @@ def _instruments(m: ReportContent) -> Iterator[Part]:
         )
     else:
         imported = ": the readings were imported from a table" if o.planned is None else ""
-        yield Words(f"The file names no instrument{imported}.")
-    yield Words(f"Noise of the readings: {covariance_words(m.covariance)}.", "note")
+        yield f"The file names no instrument{imported}."
+    yield note(f"Noise of the readings: {covariance_words(m.covariance)}.")
     revision = m.chapters[-1].number
     yield table(
-        "Identity of this report",
-        ("", ""),
-        (
+        *("", ""),
+        caption="Identity of this report",
+        rows=(
             ("Robot", o.config.robot.model),
             ("Base", base_line(m.fit.model.cell, m.fit.frames, m.fit.mode)),
             ("Operator", m.operator or "not stated"),

@@ -10,9 +10,9 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import names
-from hilcal.present import text
+from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
-from hilcal.present.verdict_words import UNCALIBRATED, message
+from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -70,28 +70,18 @@ def headline_of(d: Diagnosis | None) -> tuple[str, str]:
     """Return the verdict in a few words, and its tone."""
     if d is None:
         return "Not judged: only a model fitted with scaling gc can be", "doubt"
-    lead = d.lead.effect if d.lead is not None else ""
-    if d.verdict == "adequate":
-        if d.fit.mode == "deflection":
-            return f"The model is good for deflections; {UNCALIBRATED}", "good"
-        return "The model is good: what is left is noise", "good"
-    if d.verdict == "missing_effect":
-        return f"The model is incomplete: {lead} is missing", "bad"
-    if d.wrong_figures:
-        return "A figure of the cell seems to be wrong: correct it first", "bad"
-    if d.verdict == "ambiguous":
-        if d.reason == "inseparable_addition":
-            return "The model is good, but another one would be as good", "doubt"
-        return "The model is incomplete, and these readings cannot tell what is missing", "doubt"
-    if d.verdict == "unknown_effect":
-        return "The model is incomplete: no known effect explains what is left", "bad"
-    return "The stated noise is wrong: the model cannot be judged by it", "doubt"
+    said = headline(d)
+    if d.verdict == "missing_effect" and d.lead is not None:
+        said = f"{said}: {d.lead.effect}"
+    good, open_ = d.verdict == "adequate", d.verdict in ("ambiguous", "noise_misjudged")
+    tone = "good" if good else "doubt" if open_ and not d.wrong_figures else "bad"
+    return f"{said[0].upper()}{said[1:]}", tone
 
 
 def how_good(m: ReportContent) -> str:
     """Say in a sentence how well the model predicts."""
     d, prior = m.diagnosis, m.fit.model.prior
-    told = text.misses(m.fit)
+    told = misses(m.fit)
     if prior is not None:
         told += f" It also rests on a prior: {prior.posterior.source.campaign or 'a posterior'}."
     if d is None:
@@ -112,54 +102,20 @@ def where_wrong(m: ReportContent) -> str:
     pose, load = names(fit.readings[~fit.outlier], furthest)
     at = "unloaded" if load == UNLOADED else f"under {load}"
     said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
-    return said if d is None else f"{said} {text.follows(d.misfit_breakdown)}"
+    return said if d is None else f"{said} {follows(d.misfit_breakdown)}"
 
 
 def missing(d: Diagnosis | None) -> str:
-    """Say in few words what is missing; the whole sentence stands with the evidence."""
+    """Say what is missing, and what that effect is."""
     if d is None:
         return "Not judged; hilcal identify --scaling gc, then hilcal diagnose, say it."
     if d.verdict == "adequate":
         return "Nothing that these readings could show."
-    if d.wrong_figures:
-        return numbers.sentence(message(d))
-    if d.reason == "inseparable_addition":
-        return _as_good(d)
-    if d.reason == "no_suspect":
-        best = f": the best, {d.suspects[0].effect}, does not" if d.suspects else ""
-        return (
-            f"No effect of the catalogue surely explains what is left{best}. hilcal discover "
-            "searches a law for it."
-        )
-    lead = d.lead
-    if lead is None or d.reason == "insufficient_catalogue":
-        return numbers.sentence(message(d), d.significant)
-    explained = (
-        f"explains {numbers.percent(lead.share)} of the misfit, "
-        f"{numbers.percent(max(lead.holdout_share, 0.0))} on poses left out"
-    )
-    name = lead.coarse or lead.effect
-    law = f"{name} is: {d.fit.model.catalogue[name].summary}."
-    if d.reason == "inseparable_suspects":
-        others = numbers.few([r.effect for r in d.separability])
-        return (
-            f"{lead.effect}, which {explained}; or {others}: these readings do not separate them. "
-            f"hilcal next plans those that do. {law}"
-        )
-    what = f"joints that differ in {name}: it" if lead.coarse else f"{name}: it"
-    return numbers.sentence(f"{what} {explained}. {law}", d.significant)
-
-
-def _as_good(d: Diagnosis) -> str:
-    """Say which effects of an adequate model others could replace."""
-    doubts = [
-        f"{a.effect} could as well be "
-        + (numbers.few(a.same_as, 1) if a.same_as else f"{len(a.others)} other effects together")
-        for a in d.alternatives
-        if a.inseparable
-    ]
-    told = "; ".join(doubts)
-    return f"Nothing that lowers the error. But {told}. hilcal next plans what separates them."
+    said = numbers.sentence(message(d), d.significant)
+    if d.lead is None or d.wrong_figures:
+        return said
+    name = d.lead.coarse or d.lead.effect
+    return f"{said} {name} is: {d.fit.model.catalogue[name].summary}."
 
 
 def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:

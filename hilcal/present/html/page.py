@@ -1,21 +1,26 @@
 """The page: template, style, script and plotly.js in one file that loads nothing else."""
 
 import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import plotly.graph_objects as go
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from plotly.offline import get_plotlyjs
 
 from hilcal.names import escaped
 from hilcal.present.charts import style
-from hilcal.present.html.appendix import appendix
+from hilcal.present.document import (
+    Chart,
+    Section,
+    captioned,
+)
 from hilcal.present.html.certificate import certificate
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import FirstScreen, first_screen
-from hilcal.present.html.parts import Section, in_script
-from hilcal.present.html.sections import sections
+from hilcal.present.html.sections import appendix, sections
 
 HERE = Path(__file__).parent
 
@@ -47,7 +52,8 @@ def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...
             title=title,
             about=about,
             first=first,
-            sections=parts,
+            sections=[replace(s, blocks=captioned(s.blocks)) for s in parts],
+            figure=_figure,
             looks=Markup(in_script(json.dumps(looks))),  # noqa: S704  (escaped by in_script)
             config=Markup(in_script(json.dumps(style.CONFIG))),  # noqa: S704
             plotly=Markup(get_plotlyjs()),  # noqa: S704  (the library's own text)
@@ -55,6 +61,23 @@ def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...
             script=Markup((HERE / "script.js").read_text(encoding="utf-8")),  # noqa: S704
         )
     )
+
+
+def in_script(json: str) -> str:
+    """Return JSON that nothing in it can end the script that holds it, or turn its text."""
+    return escaped(json).replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def _figure(chart: Chart) -> dict[str, object]:
+    """Return what the template needs of a chart: the figure, its sentence and height."""
+    bare = go.Figure(chart.figure)
+    bare.layout.template = None
+    bare.layout.height = chart.height or chart.figure.layout.height
+    return {
+        "json": Markup(in_script(bare.to_json())),  # noqa: S704  (escaped by in_script)
+        "says": style.says(chart.figure),
+        "height": int(bare.layout.height),
+    }
 
 
 def _plain(value: object) -> object:

@@ -1,4 +1,4 @@
-"""The sections after the certificate: each of charts, tables and the words of commands."""
+"""The sections after the certificate, and the appendix, which only another expert asks for."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -7,33 +7,45 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.fit import Fit
-from hilcal.present import text
 from hilcal.present.build_story import curve, regressor
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.error_per_revision import error_per_revision
-from hilcal.present.charts.law import law
-from hilcal.present.charts.measured_predicted import measured_predicted
-from hilcal.present.charts.misfit import misfit_curve
-from hilcal.present.charts.noise_check import noise_check
-from hilcal.present.charts.residuals import residual_by_load, residual_by_pose, residual_by_time
-from hilcal.present.charts.workspace import workspace
-from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import missing
-from hilcal.present.html.parts import (
+from hilcal.present.campaign import info_report
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import (
+    added_variable,
+    correlations,
+    curve_chart,
+    noise_check,
+)
+from hilcal.present.charts.readings import (
+    measured_predicted,
+    residual_by_joint,
+    residual_by_load,
+    residual_by_pose,
+    residual_by_time,
+    workspace,
+)
+from hilcal.present.diagnosis import could_have_been_seen, doubtful, redundant_line
+from hilcal.present.document import (
+    Block,
     Chart,
-    Part,
     Section,
     Table,
     Words,
-    chart,
-    from_terminal,
+    captioned,
+    heading,
+    note,
     table,
 )
-from hilcal.present.text_seen import doubtful, redundant_line
-from hilcal.present.verdict_words import message
+from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
+from hilcal.present.html.content import ReportContent
+from hilcal.present.registration import covariance_words
+from hilcal.present.story import REVISION_HEADS
+from hilcal.present.validation import worst_table
+from hilcal.present.verdict import message
+from hilcal.store.command_line import COMMAND
 
 MOST_CURVES = 2
 MOST_LISTED = 6
@@ -50,42 +62,41 @@ def sections(m: ReportContent) -> tuple[Section, ...]:
 
 def _where(m: ReportContent) -> Section:
     story, last, d = m.story, m.left_out, m.diagnosis
-    parts: list[Part] = [
-        Words(
-            "Errors are those of poses left out: each is predicted by a fit to the others."
-            + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any()))
-        ),
-        chart("By pose", residual_by_pose(story, last), wide=True),
-        chart("Measured against predicted", measured_predicted(story, last)),
+    parts: list[Block] = [
+        "Errors are those of poses left out: each is predicted by a fit to the others."
+        + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
+        Chart("By pose", residual_by_pose(story, last), wide=True),
+        Chart("Measured against predicted", measured_predicted(story, last)),
     ]
     if len(set(story.load_names)) > 1:
-        parts.append(chart("By load", residual_by_load(story, last)))
+        parts.append(Chart("By load", residual_by_load(story, last)))
     if story.time_s is not None:
-        parts.append(chart("Over time", residual_by_time(story, last)))
+        parts.append(Chart("Over time", residual_by_time(story, last)))
     parts += [
-        chart("From above", workspace(story, last, "xy")),
-        chart("From the side", workspace(story, last, "xz")),
-        chart("Noise check: fitted poses", noise_check(m.fit)),
+        Chart("From above", workspace(story, last, "xy")),
+        Chart("From the side", workspace(story, last, "xz")),
+        Chart("Noise check: fitted poses", noise_check(m.fit)),
     ]
     if d is not None:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
-            parts += [chart(c.variable, misfit_curve(c)) for c in curves]
-        told = from_terminal(text.where_table(d.misfit_breakdown), "What the error follows")
+            parts += [Chart(c.title, curve_chart(c)) for c in curves]
+        told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
-    parts.append(Words(_noise(m)))
+    parts.append(_noise(m))
     return Section("where", "Where it fails", tuple(parts))
 
 
 def _evidence(m: ReportContent) -> Section:
     d, title = m.diagnosis, "What is missing, with its evidence"
     if d is None:
-        words = Words("Not diagnosed: only a model fitted with scaling gc can be.")
-        return Section("evidence", title, (words,))
-    said = numbers.sentence(message(d), d.significant)
-    parts: list[Part] = [] if said == missing(d) else [Words(said)]
+        said = "Not diagnosed: only a model fitted with scaling gc can be."
+        return Section("evidence", title, (said,))
+    parts: list[Block] = []
+    if d.verdict == "adequate":  # else the first screen has it
+        parts.append(numbers.sentence(message(d)))
     parts.append(suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
-    parts += from_terminal([*doubtful(d), *redundant_line(d)])
+    parts += [*doubtful(d), *redundant_line(d)]
     parts += added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
     return Section("evidence", title, tuple(parts))
 
@@ -95,28 +106,21 @@ def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
     for s in of:
         found = regressor(d.fit, s)
         if found is not None:
-            yield chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
+            yield Chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
 
 
 def _laws(m: ReportContent) -> Section | None:
     found = m.story.revisions[-1].laws
     if not found:
         return None
-    parts: list[Part] = []
-    for name in dict.fromkeys(one.name for one in found):
-        first = next(one for one in found if one.name == name)
-        rows = (
-            ("law", first.formula),
-            ("acts on", first.acts_on),
-            ("coefficients", first.coefficients),
-        )
-        parts.append(table(f"{name}, an effect of a file", ("", ""), rows))
-    parts += [chart(f"{one.name}: {one.y_label}", law(one)) for one in found[:MOST_LAWS]]
+    parts: list[Block] = []
+    for name, facts in {one.title: one.facts for one in found}.items():
+        parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
+    parts += [Chart(f"{one.title}: {one.y_label}", curve_chart(one)) for one in found[:MOST_LAWS]]
     parts.append(
-        Words(
+        note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
             "Nothing is known outside of the range that is drawn, nor within its gaps.",
-            "note",
         )
     )
     return Section("laws", "Laws beyond the catalogue", tuple(parts))
@@ -126,9 +130,9 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
     """Return a table of suspects."""
     heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
     return table(
-        caption,
-        (*heads, "not separable from"),
-        (
+        *(*heads, "not separable from"),
+        caption=caption,
+        rows=(
             (
                 s.effect,
                 numbers.percent(s.share),
@@ -144,46 +148,28 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
 
 
 def _revisions(m: ReportContent) -> Section:
-    parts: list[Part] = [
-        chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
-        table(
-            "Revisions",
-            ("revision", "change", "fitted, rms", "left out, rms", "left out, σ",
-             "variance factor", "verdict"),
-            (
-                (
-                    str(r.revision),
-                    r.change or text.model_name(r.model),
-                    numbers.length(r.error_fit["rms_m"]),
-                    numbers.length(r.error_holdout["rms_m"]),
-                    f"{r.error_holdout['rms_sigma']:.2f}",
-                    numbers.digits(r.variance_factor),
-                    r.verdict.replace("_", " "),
-                )
-                for r in m.story.revisions
-            ),
-        ),
-    ]  # fmt: skip
+    parts: list[Block] = [
+        Chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
+        table(*REVISION_HEADS, rows=(r.cells for r in m.story.revisions), caption="Revisions"),
+    ]
     if not m.stored:
         parts.append(
-            Words(
-                "No revision is stored in the campaign: the baseline was fitted for this report "
-                "and is not kept. hilcal refine finds the effects that are missing."
-            )
+            "No revision is stored in the campaign: the baseline was fitted for this report "
+            "and is not kept. hilcal refine finds the effects that are missing."
         )
     return Section("revisions", "How the error fell", tuple(parts))
 
 
 def _parameters(m: ReportContent) -> Section:
     fit = m.fit
-    parts: list[Part] = []
+    parts: list[Block] = []
     for name in fit.model.named:
         if name in fit.model.catalogue.names:
-            parts.append(Words(f"{name}: {fit.model.catalogue[name].summary}.", "note"))
+            parts.append(note(f"{name}: {fit.model.catalogue[name].summary}."))
     more = "hilcal report --appendix"
-    for part in from_terminal(text.parameters(fit, MOST_PARAMETERS, more), "Parameters"):
+    for part in captioned(parameters(fit, MOST_PARAMETERS, more), "Parameters"):
         parts += _halves(part) if isinstance(part, Table) else (part,)
-    parts += [Words(line) for line in text.background_line(fit)]
+    parts += background_line(fit)
     return Section("parameters", "Parameters", tuple(parts))
 
 
@@ -192,10 +178,9 @@ def _halves(t: Table) -> Iterator[Table]:
     middle = -(-len(t.rows) // 2)
     for rows, more in ((t.rows[:middle], ""), (t.rows[middle:], ", continued")):
         if rows:
-            cut = tuple(row[:-1] for row in rows)
-            yield replace(
-                t, caption=f"{t.caption}{more}", heads=t.heads[:-1], rows=cut, narrow=True
-            )
+            cut = [row[:-1] for row in rows]
+            caption = f"{t.caption}{more}"
+            yield replace(t, caption=caption, heads=t.heads[:-1], rows=cut, narrow=True)
 
 
 def _noise(m: ReportContent) -> str:
@@ -220,4 +205,85 @@ def _too_few_repeats(fit: Fit) -> str:
     return (
         f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
         f"{what} by them: the model alone does."
+    )
+
+
+NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
+
+
+def appendix(m: ReportContent) -> tuple[Section, ...]:
+    """Return the sections of the appendix."""
+    found = {
+        "joints": ("Over each joint", _joints(m)),
+        "rejected": ("Rejected suspects", _rejected(m)),
+        "all": ("Parameters and what they mean", _all_parameters(m)),
+        "scalings": ("Scaling none, gu and gc", _scalings(m)),
+        "planned": ("As planned and as reached", _planned(m)),
+        "provenance": ("Provenance", _provenance(m)),
+    }
+    told = ((name, title, tuple(parts)) for name, (title, parts) in found.items())
+    return tuple(Section(name, f"Appendix: {title}", parts) for name, title, parts in told if parts)
+
+
+def _joints(m: ReportContent) -> Iterator[Block]:
+    for j in range(m.story.arm.n):
+        yield Chart(f"Over joint {j + 1}", residual_by_joint(m.story, m.left_out, j))
+    if m.tested is not None:
+        yield replace(worst_table(m.tested.shares), caption="Worst poses")
+
+
+def _rejected(m: ReportContent) -> Iterator[Block]:
+    d = m.diagnosis
+    if d is None:
+        return
+    if len(d.suspects) > MOST_LISTED:
+        yield suspects_table(d.suspects[MOST_LISTED:], "Other suspects")
+    rejected = [s for s in d.suspects if not s.passes and s.plausible and s.share >= LEAST_SHARE]
+    yield from added_variables(d, rejected)
+    yield from captioned(could_have_been_seen(d), "What could have been seen")
+
+
+def _all_parameters(m: ReportContent) -> Iterator[Block]:
+    yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
+    yield from captioned(remarks(m.fit))
+    yield Chart("Correlations", correlations(m.fit), wide=True, height=0)
+
+
+def _scalings(m: ReportContent) -> Iterator[Block]:
+    if len(m.scalings) > 1:
+        yield from captioned(scalings_table(m.scalings), "The same model with each scaling")
+
+
+def _planned(m: ReportContent) -> Iterator[Block]:
+    predicted = None if m.plan is None else m.plan.about.get("predicted_std")
+    if not isinstance(predicted, dict):
+        return
+    reached = {p.name: p for p in m.fit.parameters if p.std is not None}
+    rows = [
+        (n, numbers.sizes([(reached[n].unit, s)]),
+         numbers.sizes([(reached[n].unit, float(reached[n].std or 0.0))]))
+        for n, s in predicted.items() if isinstance(s, int | float) and n in reached
+    ]  # fmt: skip
+    if rows:
+        heads = ("parameter", "planned", "reached")
+        yield table(*heads, rows=rows, caption="Standard uncertainties")
+
+
+def _provenance(m: ReportContent) -> Iterator[Block]:
+    o = m.overview
+    yield table(
+        *("revision", "made (UTC)", "hilcal", "SHA-256 of its readings"),
+        rows=(
+            (str(r.number), r.created[:19].replace("T", " "), r.program_version, r.data_hash)
+            for r in o.revisions
+        ),
+        caption="Revisions by time and program",
+    )
+    made = [("the campaign", o.command or NOT_KEPT)]
+    made += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
+    yield table("made", "by", rows=made, caption="Commands as they were typed")
+    yield heading("Commands that show the same")
+    yield from (Words(c, "code") for c in m.commands)
+    yield from captioned(
+        info_report(o, m.name, covariance_words(m.covariance)), "The campaign file"
     )

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import rerun as rr
 
+from hilcal.present.viewer import style
 from hilcal.present.viewer.style import MEASURED
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule
@@ -128,6 +129,28 @@ def log_targets(
     if names:
         rec.log(
             f"world/arm/body{arm.n + 1}/names",
-            rr.Points3D(targets, labels=list(names), radii=1e-4, show_labels=True),
+            labels(targets, names),
             static=True,
         )
+
+
+def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points3D:
+    """Return words at places (K, 3), in the colour that is legible in both themes."""
+    return rr.Points3D(
+        places,
+        labels=[style.safe(t) for t in texts],
+        colors=[style.LABEL],
+        radii=1e-4,
+        show_labels=True,
+    )
+
+
+def label_columns(places: Floats, texts: Sequence[str]) -> rr.ComponentColumnList:
+    """Return one such text for each of K times."""
+    return rr.Points3D.columns(
+        positions=places,
+        labels=[style.safe(t) for t in texts],
+        colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(places), 1)),
+        radii=np.full(len(places), 1e-4),
+        show_labels=[True] * len(places),
+    )

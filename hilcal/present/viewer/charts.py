@@ -1,28 +1,42 @@
-"""The flat views: bars per pose, error per revision, residual, parameters."""
+"""The charts of the viewer: errors of revisions, bars per pose, what the residual follows."""
 
 import numpy as np
 import rerun as rr
 
-from hilcal.present.story import StoryParameter, StoryRevision
+from hilcal.present.story import Curve, StoryRevision
 from hilcal.present.viewer import style
 from hilcal.present.viewer.digest import Digest
-from hilcal.present.viewer.errors import error_now
-from hilcal.present.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, nothing, write
-from hilcal.present.viewer.residuals import law_chart, residual_chart
 from hilcal.types import Floats, Ints
 
-_FOREST_SIGMAS = 10.0
-_FOREST_ROWS = 10
+SERIES = (
+    ("fit", "fitted poses, rms", style.MEASURED),
+    ("holdout", "poses left out, rms", style.HOLDOUT),
+    ("largest", "largest of all", style.RED),
+    ("noise", "noise alone, rms", style.NOISE),
+)
+"""Of the errors of revisions: entity, name and colour."""
+_BINS = 12
+"""Of single readings over what they may follow, for their mean."""
+_PARTS = ("mean", "law")
+
+
+def error_series(rec: rr.RecordingStream) -> None:
+    """Log what the series of errors are called, and how they look."""
+    for entity, name, color in SERIES:
+        line = rr.SeriesLines(names=[name], colors=[color], widths=[1.5])
+        mark = rr.SeriesPoints(names=[name], colors=[color], markers=["circle"], marker_sizes=[4.0])
+        rec.log(f"errors/{entity}", line, mark, static=True)
 
 
 def revision_charts(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
-    error_now(rec, d, r)
+    sizes = (r.error_fit["rms_m"], r.error_holdout["rms_m"], r.error_fit["max_m"])
+    for (entity, *_), size in zip(SERIES, (*sizes, d.story.noise_floor_m), strict=True):
+        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
     pose_bars(rec, d, r)
-    residual_chart(rec, d, r)
-    parameter_chart(rec, r)
+    curve_bars(rec, "follows", r.follows)
     if any(one.laws for one in d.story.revisions):
-        law_chart(rec, r)
+        curve_bars(rec, "law", r.laws[0] if r.laws else None)
 
 
 def pose_charts(rec: rr.RecordingStream, d: Digest) -> None:
@@ -66,50 +80,43 @@ def _bar_places(d: Digest) -> tuple[Ints, Floats, Floats]:
     return starts, edges[:-1], np.diff(edges)
 
 
-def parameter_chart(rec: rr.RecordingStream, r: StoryRevision) -> None:
-    """Log each parameter as its value in units of its standard uncertainty, with ±2 σ."""
-    known = [p for p in r.parameters if p.identifiable and p.value is not None and p.std]
-    if not known:
-        write(rec, "parameters/labels", [(WIDTH / 2, HEIGHT / 2)], ["no identifiable parameter"])
-        for part in ("points", "whiskers", "axes"):
-            rec.log(f"parameters/{part}", rr.Points2D([]) if part == "points" else nothing())
-        return
-    t = np.array([float(p.value or 0.0) / float(p.std or 1.0) for p in known])
-    strongest = np.sort(np.argsort(-np.abs(t), kind="stable")[:_FOREST_ROWS])
-    t = t[strongest]
-    left = 0.42 * WIDTH
-    row = (np.arange(len(t)) + 0.5) * HEIGHT / max(len(t), 6)
+def curve_bars(rec: rr.RecordingStream, entity: str, c: Curve | None) -> None:
+    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
 
-    def at(sigmas: Floats) -> Floats:
-        bent = np.arcsinh(sigmas / 2) / np.arcsinh(max(_FOREST_SIGMAS, np.abs(t).max() + 2) / 2)
-        return np.asarray(left + (WIDTH - left) * (bent + 1) / 2)
-
-    significant = np.abs(t) > 2
-    colors = np.where(significant[:, None], style.MEASURED, style.GREY).astype(np.uint8)
-    rec.log(
-        "parameters/points",
-        rr.Points2D(np.stack([at(t), row], 1), colors=colors, radii=rr.Radius.ui_points(4.0)),
-    )
-    ends = np.stack([np.stack([at(t - 2), row], 1), np.stack([at(t + 2), row], 1)], 1)
-    rec.log(
-        "parameters/whiskers",
-        rr.LineStrips2D(list(ends), colors=colors, radii=rr.Radius.ui_points(1.5)),
-    )
-    ticks = np.array([s for s in (-1000, -100, -10, -2, 0, 2, 10, 100, 1000)], dtype=float)
-    ticks = ticks[(at(ticks) >= left) & (at(ticks) <= WIDTH)]
-    lines = [[(a, 0), (a, HEIGHT)] for a in at(ticks)]
-    rec.log(
-        "parameters/axes",
-        rr.LineStrips2D(lines, colors=[(90, 92, 100)], radii=rr.Radius.ui_points(0.6)),
-    )
-    names = [_in_words(known[i]) for i in strongest]
-    few = f"; the {len(t)} strongest of {len(known)}" if len(t) < len(known) else ""
-    places = [(0.38 * left, y + RAISED) for y in row] + [(a, FOOT) for a in at(ticks)]
-    places += [(WIDTH / 2, BELOW)]
-    words = [*names, *(f"{s:g}" for s in ticks), f"value in units of its standard uncertainty{few}"]
-    write(rec, "parameters/labels", places, words)
+    Single readings are drawn by their mean in bins of equal count.
+    """
+    bars: dict[str, tuple[Floats, Floats]] = {}
+    if c is not None and len(c.x):
+        x, y = (c.x, c.y) if c.error is not None else _means(c)
+        bars["mean"] = np.arange(float(len(x))) if c.names else x, y
+        if c.line is not None:
+            bars["law"] = x, np.interp(x, *c.line)
+    for k, part in enumerate(_PARTS):
+        if part not in bars:
+            rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
+            continue
+        x, y = bars[part]
+        order = np.argsort(x, kind="stable")
+        edges = _edges(x[order])
+        width = np.diff(edges) / len(bars)
+        chart = rr.BarChart(
+            y[order],
+            abscissa=edges[:-1] + k * width,
+            widths=width,
+            color=(style.MEASURED, style.NOISE)[k],
+        )
+        rec.log(f"{entity}/{part}", chart)
 
 
-def _in_words(p: StoryParameter) -> str:
-    value, _, unit = style.quantity(float(p.value or 0), p.std, p.unit)
-    return f"{p.name} = {value} {unit}"
+def _edges(x: Floats) -> Floats:
+    """(K + 1,) of bins about growing centres (K,): half-way between them."""
+    if len(x) == 1:
+        return np.array([x[0] - 0.5, x[0] + 0.5])
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
+
+
+def _means(c: Curve) -> tuple[Floats, Floats]:
+    order = np.argsort(c.x, kind="stable")
+    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
+    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Story, StoryRevision, worst_and_even
 from hilcal.present.viewer import style
 from hilcal.robot.body import body_poses
 from hilcal.types import Floats, Ints
@@ -14,16 +14,8 @@ ARROW_CAP = 0.40  # longest arrow, m
 DEFLECTION_LENGTH = 0.25  # a large measured deflection is drawn this long, m
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """How much is drawn at most, so that a picture stays legible and a file small."""
-
-    arrows: int = 150
-    balls: int = 60
-    pairs: int = 150
-    bars: int = 150
-    points: int = 1500
-    parameters: int = 40
+ARROWS, BALLS, PAIRS, BARS = 150, 60, 150, 150
+"""How much is drawn at most, so that a picture stays legible and a file small."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,7 +24,6 @@ class Digest:
 
     Attributes:
         story: the story.
-        limits: how much is drawn.
         poses: (P,) pose numbers, growing.
         row: (N,) index into `poses` of each reading.
         first: (P,) the first reading of each pose.
@@ -45,7 +36,6 @@ class Digest:
     """
 
     story: Story
-    limits: Limits
     poses: Ints
     row: Ints
     first: Ints
@@ -59,7 +49,7 @@ class Digest:
     @property
     def poses_per_bar(self) -> int:
         """Consecutive poses that share one bar, so that bars stay wide enough to be read."""
-        return -(-len(self.poses) // self.limits.bars)
+        return -(-len(self.poses) // BARS)
 
     def pose_rms(self, revision: StoryRevision) -> Floats:
         """(P,) root mean square length of the residuals of each pose, m."""
@@ -82,7 +72,7 @@ class Digest:
 
     def shown(self, revision: StoryRevision) -> Ints:
         """Return the readings whose arrows are drawn: the worst, the balled, an even rest."""
-        some = worst_and_even(revision.whitened_norm2, self.limits.arrows)
+        some = worst_and_even(revision.whitened_norm2, ARROWS)
         return np.union1d(some, self.balled(revision))
 
     def worst_of_poses(self, revision: StoryRevision) -> Ints:
@@ -96,17 +86,17 @@ class Digest:
         size = np.linalg.norm(deviation(self.story, self.story.measured), axis=1)
         order = np.lexsort((size, self.row))
         of_pose = order[np.append(np.flatnonzero(np.diff(self.row[order])), len(order) - 1)]
-        chosen = worst_and_even(revision.whitened_norm2[of_pose], self.limits.pairs)
+        chosen = worst_and_even(revision.whitened_norm2[of_pose], PAIRS)
         return np.asarray(of_pose[chosen])
 
     def balled(self, revision: StoryRevision) -> Ints:
         """Return the readings whose ball is drawn: of each chosen pose, its worst reading."""
         of_pose = self.worst_of_poses(revision)
-        chosen = worst_and_even(revision.whitened_norm2[of_pose], self.limits.balls)
+        chosen = worst_and_even(revision.whitened_norm2[of_pose], BALLS)
         return np.asarray(of_pose[chosen])
 
 
-def digest(story: Story, limits: Limits) -> Digest:
+def digest(story: Story) -> Digest:
     """Derive what the views need."""
     poses, first, row = np.unique(story.pose, return_index=True, return_inverse=True)
     bodies = body_poses(story.arm, story.q[first])
@@ -120,7 +110,6 @@ def digest(story: Story, limits: Limits) -> Digest:
     half_sizes, quaternions = ellipsoids(story.covariance)
     return Digest(
         story=story,
-        limits=limits,
         poses=poses.astype(np.int64),
         row=row.astype(np.int64).reshape(-1),
         first=first.astype(np.int64),
@@ -164,14 +153,3 @@ def capped(vectors: Floats, length: float) -> Floats:
     """(K, 3) vectors, those longer than `length` shortened to it."""
     norm = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.asarray(vectors * np.minimum(1.0, length / np.maximum(norm, 1e-300)))
-
-
-def worst_and_even(badness: Floats, count: int) -> Ints:
-    """Return at most `count` indices, growing: the worst fifth, the rest spread evenly."""
-    n = len(badness)
-    if n <= count:
-        return np.arange(n)
-    worst = np.argsort(-badness, kind="stable")[: max(1, count // 5)]
-    rest = np.setdiff1d(np.arange(n), worst)
-    even = rest[np.linspace(0, len(rest) - 1, count - len(worst)).round().astype(np.int64)]
-    return np.sort(np.concatenate([worst, np.unique(even)]))

@@ -1,17 +1,113 @@
-"""The pictures of a fleet: arms of a type side by side, and their parameters in σ of the type."""
+"""The pictures of a fleet: arms of a type side by side, and their campaigns by date."""
 
 import math
+import re
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from hilcal.present.text_fleet import unlike_words
+from hilcal.present.fleet import unlike_words
 from hilcal.present.viewer import arm_shapes, style
-from hilcal.present.viewer.flat import BELOW, FOOT, HEIGHT, RAISED, WIDTH, ticks, write
-from hilcal.present.viewer.fleet_digest import FAR, TypeDigest
+from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, capsules
-from hilcal.types import Floats
+from hilcal.store.revision import seconds_of
+from hilcal.types import Bools, Floats
+
+if TYPE_CHECKING:
+    from hilcal.transfer.members import Member
+    from hilcal.transfer.pooled import Odd, Pooled
+
+FAR = 3.0
+"""Standard deviations between which most arms lie; a choice."""
+_JOINT = re.compile(r"\.j(\d+)\b")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TypeDigest:
+    """One type of a fleet; A arms, K pooled parameters, C campaigns.
+
+    Attributes:
+        pooled: what is known of the type.
+        arm: its links, for drawing.
+        units: (A, K) distance of each arm from the mean of the type, in σ: the root of the spread
+            from arm to arm and its own uncertainty; NaN where it did not determine the parameter.
+        odd: (A, K) what is unlike the type.
+        joints: (K,) joint that a parameter is of, from 1; 0 for none.
+        owner: (C,) arm of each campaign.
+        seconds: (C,) when it was measured, since 1970.
+        campaigns: (C, K) the same distance of each campaign.
+        changed: (C, K) what has changed with that campaign, unlike other arms.
+    """
+
+    pooled: "Pooled"
+    arm: Arm
+    units: Floats
+    odd: Bools
+    joints: tuple[int, ...]
+    owner: tuple[int, ...]
+    seconds: Floats
+    campaigns: Floats
+    changed: Bools
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(K,) names of the parameters."""
+        return tuple(p.parameter for p in self.pooled.parameters)
+
+    def told(self, arm: int) -> "list[Odd]":
+        """Return what is unlike in an arm, or has changed."""
+        return [o for o in self.pooled.odd if o.arm == self.pooled.arms[arm]]
+
+
+def type_digest(t: "Pooled", members: "tuple[Member, ...]") -> TypeDigest:
+    """Derive what the views of a type need."""
+    names, arms = [p.parameter for p in t.parameters], list(t.arms)
+    between = np.array([p.between for p in t.parameters])
+    mean = np.array([p.mean for p in t.parameters])
+    odd, mine = np.zeros((len(arms), len(names)), dtype=np.bool_), []
+    for m in members:
+        if m.type == t.type and m.name in t.campaigns:
+            mine.append(m)
+    mine.sort(key=lambda m: (arms.index(m.arm), seconds_of(m.date)))
+    values = np.full((len(mine), len(names)), np.nan)
+    changed = np.zeros(values.shape, dtype=np.bool_)
+    for c, m in enumerate(mine):
+        p = m.posterior
+        for name, value, std in zip(p.names, p.mean, p.std, strict=True):
+            if name in names and np.isfinite(std):
+                k = names.index(name)
+                values[c, k] = (value - mean[k]) / np.hypot(between[k], std)
+    for o in t.odd:
+        k = names.index(o.parameter)
+        odd[arms.index(o.arm), k] = True
+        for c, m in enumerate(mine):
+            changed[c, k] |= o.campaign == m.name
+    seen = np.isfinite(t.off_std)
+    units = np.where(seen, t.off / np.hypot(between, np.where(seen, t.off_std, 1.0)), np.nan)
+    joints = tuple(int(found[1]) if (found := _JOINT.search(n)) else 0 for n in names)
+    return TypeDigest(
+        pooled=t,
+        arm=_drawn(t),
+        units=units,
+        odd=odd,
+        joints=joints,
+        owner=tuple(arms.index(m.arm) for m in mine),
+        seconds=np.array([seconds_of(m.date) for m in mine]),
+        campaigns=values,
+        changed=changed,
+    )
+
+
+def _drawn(t: "Pooled") -> Arm:
+    """Return an arm that has the links of the type, and nothing else."""
+    n = len(t.prior.links) - 1
+    none, wide = np.zeros(n), np.full(n, np.inf)
+    names = tuple(f"j{k + 1}" for k in range(n))
+    return Arm(t.type, t.prior.links, none, np.zeros((n, 3)), -wide, wide, wide, 0.0, names, "")
+
 
 _STANDS = (0.0, -1.4, 1.0, -1.2, -1.57, 0.0)
 """Joint values of the drawn arms, rad: upright, so that many stand side by side; a choice."""
@@ -21,7 +117,6 @@ _NAMED = 40
 """Arms up to which each has its name beside it; a choice."""
 _ROWS = 12
 """Parameters that are drawn at most; a choice."""
-_LEFT = 0.3 * WIDTH
 
 
 def places(d: TypeDigest) -> Floats:
@@ -76,13 +171,7 @@ def arms(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
     )
     rec.log(
         f"{path}/names",
-        rr.Points3D(
-            at[named] + top + above,
-            labels=[style.safe(_label(d, int(a))) for a in named],
-            colors=[style.LABEL],
-            radii=1e-4,
-            show_labels=True,
-        ),
+        arm_shapes.labels(at[named] + top + above, [_label(d, int(a)) for a in named]),
         static=True,
     )
     if marked.any():
@@ -121,59 +210,6 @@ def rows(d: TypeDigest) -> list[int]:
     """Return the parameters that are drawn: those with the farthest arms, in their order."""
     far = np.nanmax(np.abs(np.where(np.isfinite(d.units), d.units, 0.0)), axis=0)
     return sorted(np.argsort(-far, kind="stable")[:_ROWS].tolist())
-
-
-def parameters(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
-    """Log a dot per arm and parameter, in σ of the type; the band is of `FAR` σ."""
-    chosen = rows(d)
-    most = float(np.nanmax(np.abs(d.units[:, chosen]), initial=FAR)) * 1.1 + 0.5
-    row = (np.arange(len(chosen)) + 0.5) * HEIGHT / max(len(chosen), 3)
-
-    def across(sigmas: Floats) -> Floats:
-        return np.asarray(_LEFT + (WIDTH - _LEFT) * (sigmas / most + 1) / 2)
-
-    edge = across(np.array([-FAR, FAR]))
-    rec.log(
-        f"{path}/band",
-        rr.Boxes2D(
-            mins=[(edge[0], 0.0)],
-            sizes=[(edge[1] - edge[0], HEIGHT)],
-            colors=[style.NOISE],
-            radii=rr.Radius.ui_points(1.0),
-            draw_order=-20.0,
-        ),
-        static=True,
-    )
-    for name, wanted, color, size in (
-        ("like", False, style.MEASURED, 3.0),
-        ("unlike", True, style.RED, 6.0),
-    ):
-        which = np.argwhere((d.odd[:, chosen] == wanted) & np.isfinite(d.units[:, chosen]))
-        at = [(across(d.units[a, chosen[i]]), row[i]) for a, i in which]
-        rec.log(
-            f"{path}/{name}",
-            rr.Points2D(at, colors=[color], radii=rr.Radius.ui_points(size)),
-            static=True,
-        )
-        if wanted:
-            told = [d.pooled.arms[a] for a, _ in which]
-            spots = [(float(x), float(y) + RAISED - 6.0) for x, y in at]
-            write(rec, f"{path}/arms", spots, told, static=True)
-    marks = ticks(-most, most)
-    lines = [[(float(x), 0.0), (float(x), HEIGHT)] for x in across(marks)]
-    rec.log(
-        f"{path}/axes",
-        rr.LineStrips2D(
-            lines, colors=[(90, 92, 100)], radii=rr.Radius.ui_points(0.6), draw_order=-10.0
-        ),
-        static=True,
-    )
-    places_ = [(0.38 * _LEFT, float(y) + RAISED) for y in row]
-    places_ += [(float(x), FOOT) for x in across(marks)] + [(0.5 * (WIDTH + _LEFT), BELOW)]
-    words = [d.names[k] for k in chosen] + [f"{x:g}" for x in marks]
-    few = f"; {len(chosen)} of {len(d.names)} parameters" if len(chosen) < len(d.names) else ""
-    words.append(f"distance from the mean of the type in its σ; frame: ±{FAR:g}{few}")
-    write(rec, f"{path}/words", places_, words, static=True)
 
 
 def drift(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:

@@ -1,7 +1,5 @@
 """The recording of a fleet: which arm is unlike its type, in which joint, and since when."""
 
-import hashlib
-import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,9 +8,11 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
-from hilcal.present.text_fleet import type_lines
-from hilcal.present.viewer import flat, fleet_scene, layout, style
-from hilcal.present.viewer.fleet_digest import TypeDigest, type_digest
+from hilcal.present.document import heading
+from hilcal.present.fleet import type_report
+from hilcal.present.viewer import fleet_scene, layout
+from hilcal.present.viewer.fleet_scene import TypeDigest, type_digest
+from hilcal.present.viewer.markdown import document, markdown
 from hilcal.present.viewer.stream import flush, opened, require_folder, write
 
 if TYPE_CHECKING:  # above this layer
@@ -22,9 +22,8 @@ _LEAST_RANGE_S = 86400.0
 GUIDE = """### How to read this
 - **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
   in a red frame. Amber: beyond 3 σ, which chance does to one parameter in some hundred.
-- **Parameters**: a dot for each arm, in σ of the type: the spread from arm to arm together with the
-  uncertainty of the arm's own campaigns.
-- **By date**: the same of each campaign. A line that leaves the others has changed; lines that go
+- **By date**: each campaign in σ of the type: the spread from arm to arm together with the
+  uncertainty of the campaign. A line that leaves the others has changed; lines that go
   the same way are wear.
 """
 
@@ -39,7 +38,8 @@ def record_fleet(fleet: "Fleet", path: Path) -> None:
     path = Path(path)
     require_folder(path)
     types = [type_digest(t, fleet.members) for t in fleet.types]
-    rec = opened(_recording_id(types))
+    told = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
+    rec = opened(told, *(a for d in types for a in (d.units, d.seconds, d.campaigns)))
     write(rec, _blueprint(types), lambda: _log(rec, types), path)
 
 
@@ -48,42 +48,22 @@ def _log(rec: rr.RecordingStream, types: list[TypeDigest]) -> None:
     rec.send_recording_name(f"hilcal fleet: {arms} arms")
     for i, d in enumerate(types):
         fleet_scene.arms(rec, f"arms{i}", d)
-        fleet_scene.parameters(rec, f"parameters{i}", d)
         fleet_scene.drift(rec, f"date{i}", d)
-        rec.log(f"words/type{i}", _markdown(_told(d)), static=True)
-        rec.log(f"words/table{i}", _markdown(_table(d)), static=True)
-    rec.log("words/guide", _markdown(GUIDE), static=True)
+        rec.log(f"words/type{i}", document(_told(d)), static=True)
+    rec.log("words/guide", document(GUIDE), static=True)
     flush(rec)
 
 
 def _told(d: TypeDigest) -> str:
-    t = d.pooled
-    odd = list(dict.fromkeys(o.arm for o in t.odd))
+    odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
     verb = "is" if len(odd) == 1 else "are"
     title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
-    lines = [f"### {style.escaped(title)}"]
-    lines += [f"{style.escaped(t.type)}: {len(t.arms)} arms, {len(t.campaigns)} campaigns.", ""]
-    lines += [f"{style.escaped(line)}  " for line in type_lines(t)]
-    return "\n".join(lines)
-
-
-def _table(d: TypeDigest) -> str:
-    lines = ["| parameter | mean | ± | from arm to arm |", "| --- | ---: | ---: | ---: |"]
-    for p in d.pooled.parameters:
-        unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
-        mean, std = numbers.with_std(factor * p.mean, factor * p.mean_std)
-        between = f"{numbers.digits(factor * p.between)} {unit}"
-        cells = (p.parameter, mean, std, between)
-        lines.append("| " + " | ".join(style.escaped(c) or " " for c in cells) + " |")
-    return "\n".join(lines)
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")
+    name, table, note, *lines = type_report(d.pooled)
+    return markdown([heading(title), name, *lines, table, note])
 
 
 def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
-    """Left: the arms over their campaigns by date. Right: the verdict over the parameters."""
+    """Left: the arms over their campaigns by date. Right: the verdict and the parameters."""
     many = len(types) > 1
     of = [f"{d.pooled.type}: " if many else "" for d in types]
     arms = [_arms(f"arms{i}", of[i], d) for i, d in enumerate(types)]
@@ -101,30 +81,9 @@ def _blueprint(types: list[TypeDigest]) -> rrb.Blueprint:
         rrb.TextDocumentView(origin=f"words/type{i}", name=f"{of[i]}Unlike the type")
         for i in range(len(types))
     ]
-    words += [
-        rrb.TextDocumentView(origin=f"words/table{i}", name=f"{of[i]}In common")
-        for i in range(len(types))
-    ]
     words.append(rrb.TextDocumentView(origin="words/guide", name="How to read this"))
-    dots = [
-        rrb.Spatial2DView(
-            origin=f"parameters{i}",
-            name=f"{of[i]}Each arm against its type [σ]; red: unlike",
-            background=layout.BACKGROUND,
-            visual_bounds=rrb.VisualBounds2D(x_range=(-6.0, flat.WIDTH + 6.0), y_range=flat.BOUNDS),
-        )
-        for i in range(len(types))
-    ]
     left = rrb.Vertical(rrb.Tabs(*arms), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Vertical(rrb.Tabs(*words), rrb.Tabs(*dots), row_shares=[2, 3])
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="date", state="collapsed", play_state="paused"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return layout.whole(rrb.Horizontal(left, rrb.Tabs(*words), column_shares=[3, 2]), "date")
 
 
 def _whole(d: TypeDigest) -> rrb.TimeAxis:
@@ -139,25 +98,5 @@ def _arms(origin: str, of: str, d: TypeDigest) -> rrb.Spatial3DView:
     at, reach = fleet_scene.places(d), max(d.arm.reach, 0.1)
     middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * reach])
     size = float(np.ptp(at, axis=0).max()) + reach
-    return rrb.Spatial3DView(
-        origin=origin,
-        name=f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where",
-        background=layout.BACKGROUND,
-        line_grid=layout.GRID,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=middle + size * np.array([0.68, 0.0, 0.36]),
-            look_target=middle,
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
-
-
-def _recording_id(types: list[TypeDigest]) -> str:
-    """Return an identifier that depends on the content of the recording alone."""
-    sha = hashlib.sha256()
-    for d in types:
-        sha.update(repr((d.pooled.type, d.pooled.arms, d.pooled.odd, d.names)).encode())
-        for array in (d.units, d.seconds, d.campaigns):
-            sha.update(np.ascontiguousarray(array).tobytes())
-    return str(uuid.UUID(bytes=sha.digest()[:16]))
+    name = f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where"
+    return layout.view3d(origin, name, middle + size * np.array([0.68, 0.0, 0.36]), middle)

@@ -1,23 +1,130 @@
-"""The blueprint: which view stands where, and what its title says."""
+"""The blueprint: which view stands where, what its title says, and where its eye stands."""
 
-from typing import Literal
+from collections.abc import Sequence
+from typing import Any, Literal
 
 import numpy as np
 import rerun.blueprint as rrb
 
-from hilcal.present.viewer import errors, eye, flat
+from hilcal.config import Obstacle
 from hilcal.present.viewer.digest import Digest
 from hilcal.present.viewer.scene import center, seen
+from hilcal.types import Bools, Floats
 
-FOLLOWS = "Residual against suspect"
+_TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
+_HEIGHTS = (0.75, 1.2)
+_SAMPLES = np.linspace(0.0, 0.98, 80)  # of a line of sight
+_FOV = np.deg2rad(55.0)  # of the viewer's eye, upright
+_ASPECT = 1.15  # of a small window, without the room for labels at both sides
+_EDGE = 0.92  # of the view is used at most
+_FACTORS = np.arange(0.7, 2.51, 0.05)
+_WORTH = 0.02  # share of points that must come into sight for the eye to go one place further
+
+
+def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
+    """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
+    at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
+    out = np.zeros(len(points), dtype=np.bool_)
+    for x in things:
+        if x.center_m is not None and x.size_m is not None:
+            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
+            out |= off.all(axis=2).any(axis=1)
+        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
+            off = at - np.array(x.bottom_m)
+            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
+            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
+    return np.asarray(out)
+
+
+def direction(
+    turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
+) -> Floats:
+    """Return the direction (3,) to the eye, in half sizes of the picture.
+
+    Args:
+        turn: about z, that is preferred, rad.
+        middle: (3,) of the picture, m.
+        size: half size of the picture, m.
+        points: (K, 3) what is to be seen, m.
+        things: what may hide it.
+    """
+    places = [
+        np.array([1.7 * np.cos(turn + a), 1.7 * np.sin(turn + a), z])
+        for z in _HEIGHTS
+        for a in _TURNS
+    ]
+    cost = [
+        hidden(middle + size * place, points, things).mean() + _WORTH * k
+        for k, place in enumerate(places)
+    ]
+    return places[int(np.argmin(cost))]
+
+
+def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
+    """Return (K,) which of the points (K, 3) an eye sees that looks at a place, z upwards."""
+    ahead = (look - eye) / np.linalg.norm(look - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    way = points - eye
+    depth = way @ ahead
+    half = _EDGE * np.tan(_FOV / 2) * depth
+    upright = np.abs(way @ np.cross(right, ahead))
+    return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
+
+
+def near(look: Floats, way: Floats, points: Floats) -> Floats:
+    """Return the place (3,) of the eye, as near along `way` from `look` as shows all points."""
+    places = [look + f * way for f in _FACTORS]
+    return next((x for x in places if in_view(x, look, points).all()), places[-1])
+
+
+FOLLOWS = "What the residual follows"
 LAW = "Law beyond the catalogue"
-LIMITS = "Could have been seen"
-ERRORS = "Error of each revision [µm, logarithmic]; framed: this one"
+ERRORS = "Error of each revision [µm]"
 EYE = np.array([1.05, -1.35, 0.55])
 # Views that draw with light colours stay dark in the light theme too.
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 
 GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
+
+
+def whole(
+    contents: rrb.Container,
+    timeline: str,
+    play: Literal["paused", "following"] = "paused",
+    fps: float | None = None,
+) -> rrb.Blueprint:
+    """Return a blueprint of these views alone, over a line for the time."""
+    return rrb.Blueprint(
+        contents,
+        rrb.TimePanel(timeline=timeline, state="collapsed", fps=fps, play_state=play),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def view3d(
+    origin: str,
+    name: str,
+    place: Floats,
+    look: Floats,
+    contents: Sequence[str] = ("$origin/**",),
+    **more: Any,
+) -> rrb.Spatial3DView:
+    """Return a 3-D view whose eye stands at a place and looks at another, z upwards."""
+    return rrb.Spatial3DView(
+        origin=origin,
+        contents=list(contents),
+        name=name,
+        background=BACKGROUND,
+        line_grid=GRID,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
+        ),
+        **more,
+    )
 
 
 def blueprint(d: Digest) -> rrb.Blueprint:
@@ -28,27 +135,21 @@ def blueprint(d: Digest) -> rrb.Blueprint:
     left = rrb.Vertical(
         rrb.Tabs(_residuals(d), _deflections(d)),
         rrb.Tabs(
-            _flat(errors.ORIGIN, ERRORS, errors.WIDTH, errors.BOUNDS),
-            rrb.BarChartView(
-                origin="bars",
-                name=bars_title(d),
-                plot_legend=rrb.PlotLegend(visible=False),
-            ),
+            rrb.TimeSeriesView(origin="errors", name=ERRORS),
+            _bars("bars", bars_title(d)),
         ),
         row_shares=[11, 4],
     )
-    laws = [_flat("law", LAW)] if any(r.laws for r in d.story.revisions) else []
+    laws = [_bars("law", LAW)] if any(r.laws for r in d.story.revisions) else []
     right = rrb.Vertical(
         rrb.Tabs(
             rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
             rrb.TextDocumentView(origin="words/details", name="Details"),
-            rrb.TextDocumentView(origin="words/limits", name=LIMITS),
             rrb.TextDocumentView(origin="words/guide", name="How to read this"),
         ),
         rrb.Tabs(
-            _flat("regressor", FOLLOWS),
+            _bars("follows", FOLLOWS),
             *laws,
-            _flat("parameters", "Parameters in σ (whiskers ±2 σ)"),
             rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
             rrb.TextDocumentView(origin="words/revisions", name="Table"),
             rrb.TextLogView(origin="log", name="Log"),
@@ -56,14 +157,7 @@ def blueprint(d: Digest) -> rrb.Blueprint:
         row_shares=[5, 4],
     )
     play: Literal["following", "paused"] = "following" if d.story.growing else "paused"
-    return rrb.Blueprint(
-        rrb.Horizontal(left, right, column_shares=[3, 2]),
-        rrb.TimePanel(timeline="revision", state="collapsed", fps=1.0, play_state=play),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "revision", play, fps=1.0)
 
 
 def residual_title(d: Digest) -> str:
@@ -88,19 +182,8 @@ def bars_title(d: Digest) -> str:
 
 def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
     middle, size = center(d)
-    return rrb.Spatial3DView(
-        origin="world",
-        contents=["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"],
-        name=name,
-        background=BACKGROUND,
-        line_grid=GRID,
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital,
-            position=eye.near(middle, EYE * size, seen(d)),
-            look_target=middle,
-            eye_up=(0.0, 0.0, 1.0),
-        ),
-    )
+    contents = ["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"]
+    return view3d("world", name, near(middle, EYE * size, seen(d)), middle, contents)
 
 
 def _residuals(d: Digest) -> rrb.Spatial3DView:
@@ -111,13 +194,5 @@ def _deflections(d: Digest) -> rrb.Spatial3DView:
     return _view3d(d, deflection_title(d), "residual")
 
 
-def _flat(
-    origin: str, name: str, w: float = flat.WIDTH, y: tuple[float, float] = flat.BOUNDS
-) -> rrb.Spatial2DView:
-    x = 0.03 * w + 7.0
-    return rrb.Spatial2DView(
-        origin=origin,
-        name=name,
-        background=BACKGROUND,
-        visual_bounds=rrb.VisualBounds2D(x_range=(-x, w + x), y_range=y),
-    )
+def _bars(origin: str, name: str) -> rrb.BarChartView:
+    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))

@@ -14,7 +14,7 @@ import rerun as rr
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.measuring.progress import ArmAt
-from hilcal.present.live_messages import Measuring, Revised
+from hilcal.present.live_viewer import Measuring, Revised
 from hilcal.present.viewer.live_scene import LiveScene
 from hilcal.present.viewer.stream import APPLICATION, Sink, disable_analytics, free
 

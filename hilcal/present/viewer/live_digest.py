@@ -1,14 +1,20 @@
-"""What is known of a campaign while it is measured: places of its readings, and a tally."""
+"""A campaign while it is measured: places of its readings, a tally, and what it says in words."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import stats
 
+from hilcal import numbers
 from hilcal.measuring.progress import LiveResidual, ReadingStored
-from hilcal.present.live_messages import Measuring
+from hilcal.present.document import Block, Items, heading, table
+from hilcal.present.live_viewer import Measuring
+from hilcal.present.running import spoken, status_words
+from hilcal.present.story import LIMITS
 from hilcal.present.viewer import style
+from hilcal.present.viewer.markdown import markdown
 from hilcal.robot.body import body_poses
 from hilcal.store.plan import UNLOADED, Step
 from hilcal.types import Floats
@@ -150,7 +156,7 @@ class LiveDigest:
     @property
     def wrong(self) -> bool:
         """Whether more readings are outside than noise leaves there, see `ALARM`."""
-        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - style.INSIDE_P)
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
         return self.outside > 0 and bool(chance < ALARM)
 
     @property
@@ -171,3 +177,82 @@ def arrow(live: LiveResidual, found: Judged) -> Floats:
     """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
     length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
     return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
+
+
+_REMARKS = 3
+
+GUIDE = """### How to read this
+Each reading is compared with a simple model, that of frames and joint compliance, fitted to the
+readings **before** it.
+
+**Residuals** (3-D): a small grey dot is a pose of the plan. A green ball is where noise and what
+the model does not know yet would leave 99 % of the readings; an arrow that leaves its ball = the
+model is wrong there. All arrows are in units of that noise. Grey: noise. Amber: beyond 99 %.
+Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
+After 300 readings only arrows that leave their balls are drawn; below stand all.
+
+A campaign of more than 1000 readings is divided into 150 groups, one after the other. The last
+reading is always drawn; of the earlier ones only those stay that were the worst of their group so
+far, here and below. The words count all readings, and the log lists them.
+
+**Residual of each reading** (below): the same along the time of day, in σ as on the
+terminal (rms of the three axes): 1 is noise, the green line 99 %.
+
+What is missing in the model is not asked while measuring: `hilcal refine` does, afterwards.
+"""
+
+
+def status(d: LiveDigest) -> str:
+    """Return how far the campaign is, and what the readings say so far."""
+    return markdown(_status(d))
+
+
+def _status(d: LiveDigest) -> Iterator[Block]:
+    left = f", {spoken(d.left)} left" if d.left > 0 else ""
+    yield from (heading(_heading(d)), _sentence(d))
+    yield f"{d.done} of {d.total} readings{left}. {d.phase}"
+    goal = None if d.last is None else d.last.goal
+    if goal is not None and (told := status_words(goal)):
+        yield f"Goal: {told}."
+    if len(d.loads) > 1 and d.outside:
+        rows = ((n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in d.loads.items())
+        yield table("load", "compared", "outside", "", rows=rows)
+    if d.worst and d.worst[0].level > 0:
+        worst = (
+            (
+                f"{j.step.pose} {j.target}".rstrip(),
+                j.step.load,
+                numbers.length(j.length),
+                f"{j.sigma:.1f}",
+            )
+            for j in d.worst
+            if j.level > 0
+        )
+        yield table("worst so far", "load", "residual", "in σ", rows=worst, left=(0, 1))
+    yield Items(tuple(f"note: {text}" for text in d.remarks[-_REMARKS:]))
+
+
+def residual(found: Judged) -> str:
+    """Return a residual for people, with its size in σ."""
+    return f"{numbers.length(found.length)} ({found.sigma:.1f} σ)"
+
+
+def _heading(d: LiveDigest) -> str:
+    if d.judged == 0:
+        return "Measuring: no judgement yet"
+    if d.wrong:
+        return "✗ The simple model fails: look at the red arrows"
+    return "✓ So far noise explains the readings"
+
+
+def _sentence(d: LiveDigest) -> str:
+    if d.judged == 0:
+        return "The first readings tell where tracker and target are; then each one is compared."
+    share = numbers.percent(d.outside / d.judged)
+    told = (
+        f"{d.outside} of {d.judged} ({share}) compared readings are outside their 99 % noise "
+        "ball (noise alone: 1 %)."
+    )
+    if d.wrong:
+        told += " Something is missing in it: hilcal refine says what, after measuring."
+    return told

@@ -5,18 +5,94 @@ from dataclasses import replace
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
+from rerun.blueprint import archetypes
 
 from hilcal.measuring.progress import ArmAt, GoalMet, Phase, ReadingStored, Remark
-from hilcal.present.goal_words import met_words
-from hilcal.present.live_messages import Measuring, Revised
-from hilcal.present.live_run import figures
-from hilcal.present.story import Story, check
-from hilcal.present.viewer import errors, layout, live_layout, live_words, scene, stream, style
-from hilcal.present.viewer.arm_shapes import MovingArm
-from hilcal.present.viewer.digest import Digest, Limits, digest
+from hilcal.present.live_viewer import Measuring, Revised
+from hilcal.present.running import figures, met_words
+from hilcal.present.story import Story
+from hilcal.present.viewer import layout, live_digest, stream, style
+from hilcal.present.viewer.arm_shapes import MovingArm, labels
+from hilcal.present.viewer.digest import Digest, digest
 from hilcal.present.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
+from hilcal.present.viewer.markdown import document
 from hilcal.robot.body import body_poses
 from hilcal.types import Floats
+
+TIMELINE = "time"
+RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
+IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
+
+
+def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
+    """Return the blueprint.
+
+    Args:
+        d: the campaign.
+        world: the entity below which its readings are drawn.
+        series: the entity below which its residuals are in time.
+    """
+    every = archetypes.VisibleTimeRanges(
+        timeline=TIMELINE,
+        start=rrb.TimeRangeBoundary.infinite(),
+        end=rrb.TimeRangeBoundary.cursor_relative(),
+    )
+    of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
+    middle, size = _live_center(d)
+    scene = layout.view3d(
+        "world",
+        f"{of} {RESIDUALS}",
+        layout.near(middle, layout.EYE * size, live_seen(d)),
+        middle,
+        [f"+ {world}/**"],
+        overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
+    )
+    in_time = rrb.TimeSeriesView(
+        origin=series,
+        name=f"{of} {IN_TIME}",
+        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=archetypes.TimeAxis(
+            view_range=rr.TimeRange(
+                start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
+            )
+        ),
+    )
+    told = rrb.Tabs(
+        rrb.TextDocumentView(origin="words/measuring", name="So far"),
+        rrb.TextDocumentView(origin="words/live_guide", name="How to read this"),
+    )
+    return layout.whole(
+        rrb.Horizontal(
+            rrb.Vertical(scene, in_time, row_shares=[11, 4]),
+            rrb.Vertical(told, _log(), row_shares=[3, 2]),
+            column_shares=[3, 2],
+        ),
+        TIMELINE,
+        "following",
+    )
+
+
+def _log() -> rrb.TextLogView:
+    kinds = (rrb.encodings.TextLogColumnKind.LogLevel, rrb.encodings.TextLogColumnKind.Body)
+    shown = archetypes.TextLogColumns(
+        timeline_columns=[rrb.encodings.TimelineColumn(timeline=TIMELINE, visible=False)],
+        text_log_columns=[rrb.encodings.TextLogColumn(kind=kind, visible=True) for kind in kinds],
+    )
+    return rrb.TextLogView(origin="log", name="Log", columns=shown)
+
+
+def live_seen(d: LiveDigest) -> Floats:
+    """(K, 3) what is to be in the picture: targets and the arm in the first pose, m."""
+    return np.vstack([d.anchor.reshape(-1, 3), d.bodies[0, :, :3, 3]])
+
+
+def _live_center(d: LiveDigest) -> tuple[Floats, float]:
+    points = np.vstack([d.anchor.reshape(-1, 3), np.zeros((1, 3))])
+    lo, hi = points.min(0), points.max(0)
+    half = float(np.linalg.norm(hi - lo)) / 2
+    return (lo + hi) / 2, max(half, 0.3 * d.told.arm.reach)
+
 
 _ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
 BALLS = 60
@@ -41,7 +117,7 @@ class LiveScene:
 
     def tell(self, wall: float, what: object) -> None:
         """Draw what happened at a time of day, s."""
-        self._rec.set_time(live_layout.TIMELINE, timestamp=wall)
+        self._rec.set_time(TIMELINE, timestamp=wall)
         if isinstance(what, ArmAt):
             self._passed.append((wall, what.q))
         if not self._batches:
@@ -73,10 +149,10 @@ class LiveScene:
         if self._story is None:
             return
         self._rec.reset_time()
-        d = digest(replace(self._story, growing=False), Limits())
+        d = digest(replace(self._story, growing=False))
         stream.tell(self._rec, d)
         self._rec.reset_time()
-        d = d if to_open else digest(self._story, Limits())
+        d = d if to_open else digest(self._story)
         self._rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
 
     # measuring
@@ -95,7 +171,7 @@ class LiveScene:
         rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._arm = MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
-        rec.log("words/live_guide", _markdown(live_words.GUIDE), static=True)
+        rec.log("words/live_guide", document(live_digest.GUIDE), static=True)
         rec.log(
             f"{self._world}/planned",
             rr.Points3D(d.anchor.reshape(-1, 3), colors=[style.GREY], radii=[0.006]),
@@ -112,7 +188,7 @@ class LiveScene:
         self._passed.append((wall, tuple(told.plan.q[0].tolist())))
         self._move()
         self._words(d)
-        blueprint = live_layout.blueprint(d, self._world, self._series)
+        blueprint = live_blueprint(d, self._world, self._series)
         rec.send_blueprint(blueprint, make_active=True, make_default=True)
 
     def _earlier(self, d: LiveDigest) -> None:
@@ -124,7 +200,7 @@ class LiveScene:
         self._rec.send_columns(
             f"{self._world}/dots",
             indexes=[
-                rr.TimeColumn(live_layout.TIMELINE, timestamp=[wall for wall, _ in known]),
+                rr.TimeColumn(TIMELINE, timestamp=[wall for wall, _ in known]),
             ],
             columns=rr.Points3D.columns(
                 positions=places,
@@ -138,7 +214,7 @@ class LiveScene:
         passed, self._passed, self._since = self._passed, [], 0
         if passed and self._arm is not None and self._now is not None:
             bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
-            self._arm.send(live_layout.TIMELINE, [wall for wall, _ in passed], bodies)
+            self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
 
     def _event(self, d: LiveDigest, what: object) -> None:
         if isinstance(what, ReadingStored):
@@ -195,11 +271,11 @@ class LiveScene:
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
         words = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
-            words += f"{', ' * bool(worst.target)}{worst.target}: {live_words.residual(worst)}"
-        rec.log(f"{self._world}/last", scene.label(d.place(event.step, target) + _ABOVE, words))
+            words += f"{', ' * bool(worst.target)}{worst.target}: {live_digest.residual(worst)}"
+        rec.log(f"{self._world}/last", labels([d.place(event.step, target) + _ABOVE], [words]))
 
     def _words(self, d: LiveDigest) -> None:
-        self._rec.log("words/measuring", _markdown(live_words.status(d)))
+        self._rec.log("words/measuring", document(live_digest.status(d)))
 
     def _log(self, text: str, level: str = "INFO") -> None:
         self._rec.log("log", rr.TextLog(style.safe(text), level=level))
@@ -208,7 +284,6 @@ class LiveScene:
 
     def _revised(self, story: Story) -> None:
         """Draw a revision with those before it, of the same readings."""
-        check(story)
         rec, before = self._rec, self._story
         new = story.revisions[0]
         earlier = (
@@ -217,11 +292,10 @@ class LiveScene:
             else tuple(r for r in before.revisions if r.revision < new.revision)
         )
         self._story = replace(story, revisions=(*earlier, *story.revisions), growing=True)
-        d = digest(self._story, Limits())
+        d = digest(self._story)
         if not earlier:
             stream.begin(rec, d)
         rec.set_time("revision", sequence=new.revision)
-        errors.error_picture(rec, d, static=False)
         stream.tell_revision(rec, d, new)
         rec.disable_timeline("revision")
         titles = _titles(d)
@@ -255,7 +329,3 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
 
 def _titles(d: Digest) -> tuple[str, ...]:
     return layout.residual_title(d), layout.deflection_title(d), layout.bars_title(d)
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")

@@ -1,18 +1,78 @@
-"""The blueprint of a plan's recording: which view stands where, and what its title says."""
+"""The charts and the blueprint of a plan's recording."""
 
 import numpy as np
+import rerun as rr
 import rerun.blueprint as rrb
 
 from hilcal import numbers
-from hilcal.present.viewer import eye, plan_charts, plan_scene
+from hilcal.design.summary import PlanSummary
+from hilcal.present.plan import load_name
+from hilcal.present.viewer import layout, plan_scene, style
 from hilcal.present.viewer.plan_digest import PlanDigest
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
+
+_DOT = 3.5
+
+
+def schedule(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
+    colors = plan_scene.load_colors(d.loads)
+    for k, name in enumerate(d.loads):
+        _dots(rec, d, f"load{k}", load_name(name), np.flatnonzero(d.load == k), tuple(colors[k]))
+    if d.unseen.any():
+        lost = np.flatnonzero(d.unseen)
+        _dots(rec, d, "unseen", "not seen by the tracker", lost, style.RED, "cross")
+
+
+def _dots(
+    rec: rr.RecordingStream,
+    d: PlanDigest,
+    entity: str,
+    name: str,
+    steps: Ints,
+    color: style.Color,
+    marker: str = "circle",
+) -> None:
+    points = rr.SeriesPoints(
+        names=[f"{style.safe(name)}: {len(steps)}"],
+        colors=[color],
+        markers=[marker],  # type: ignore[list-item]
+        marker_sizes=[_DOT if marker == "circle" else 2.0 * _DOT],
+    )
+    rec.log(f"schedule/{entity}", points, static=True)
+    rec.send_columns(
+        f"schedule/{entity}",
+        indexes=[rr.TimeColumn("step", sequence=d.numbers[steps])],
+        columns=rr.Scalars.columns(scalars=d.time[steps] / 60.0),
+    )
+
+
+def curve_unit(s: PlanSummary) -> tuple[str, float]:
+    """Return the unit of the sample-size curve and its factor."""
+    return numbers.unit_for("m", [p.position_std_m for p in s.curve])
+
+
+def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
+    """Log the sample-size curve as bars; the one nearest to the plan is a series of its own."""
+    poses = np.array([p.poses for p in s.curve], dtype=float)
+    height = curve_unit(s)[1] * np.array([p.position_std_m for p in s.curve])
+    width = 0.6 * float(np.diff(poses).min(initial=poses.max(initial=1.0)))
+    own = np.zeros(len(poses), dtype=np.bool_)
+    own[np.argmin(np.abs(poses - s.poses))] = True
+    for name, bars, color in (("other", ~own, style.GREY), ("plan", own, style.MEASURED)):
+        if bars.any():
+            chart = rr.BarChart(
+                height[bars],
+                abscissa=poses[bars],
+                widths=np.full(int(bars.sum()), width),
+                color=color,
+            )
+            rec.log(f"curve/{name}", chart, static=True)
+
 
 _FPS = 2.0
 _LOOKED_AT = 20
 """Steps whose arm is to be seen from the eye."""
-# Views that draw with light colours stay dark in the light theme too.
-_DARK = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
 STEPS = "Plan step by step: a bead per pose and load, beam green = seen"
 TRACKER = "From the tracker"
 SCHEDULE = "Schedule: minute of each reading by step, colour by load"
@@ -36,19 +96,16 @@ def blueprint(d: PlanDigest) -> rrb.Blueprint:
     if details:
         right.append(rrb.Tabs(*details))
     shares = [5, 4][: len(right)]
-    return rrb.Blueprint(
+    return layout.whole(
         rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
-        rrb.TimePanel(timeline="step", state="collapsed", fps=_FPS, play_state="paused"),
-        rrb.SelectionPanel(state="hidden"),
-        rrb.BlueprintPanel(state="hidden"),
-        auto_views=False,
-        auto_layout=False,
+        "step",
+        fps=_FPS,
     )
 
 
 def curve_title(d: PlanDigest) -> str:
     """Return the title of the sample-size curve, with its unit."""
-    unit = plan_charts.curve_unit(d.summary)[0]
+    unit = curve_unit(d.summary)[0]
     return f"Position ± [{unit}] by number of poses; blue: nearest to this plan"
 
 
@@ -69,7 +126,7 @@ def _details(d: PlanDigest) -> list[rrb.View]:
 
 def _steps(d: PlanDigest) -> rrb.Spatial3DView:
     middle, size = plan_scene.framed(d)
-    return _view3d(STEPS, ["+ $origin/**"], middle + size * _eye(d, middle, size), middle)
+    return layout.view3d("world", STEPS, middle + size * _eye(d, middle, size), middle)
 
 
 def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
@@ -77,7 +134,7 @@ def _from_tracker(d: PlanDigest, place: Floats) -> rrb.Spatial3DView:
     contents += [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
     at = d.target.mean(axis=0)
     far = float(np.linalg.norm(place - at))
-    return _view3d(f"{TRACKER}, {numbers.length(far)} away", contents, place, at)
+    return layout.view3d("world", f"{TRACKER}, {numbers.length(far)} away", place, at, contents)
 
 
 def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
@@ -88,22 +145,7 @@ def _eye(d: PlanDigest, middle: Floats, size: float) -> Floats:
         turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
-    return eye.direction(turn, middle, size, points, d.config.obstacles)
-
-
-def _view3d(name: str, contents: list[str], place: Floats, look: Floats) -> rrb.Spatial3DView:
-    return rrb.Spatial3DView(
-        origin="world",
-        contents=contents,
-        name=name,
-        background=_DARK,
-        line_grid=rrb.LineGrid3D(
-            visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 60)
-        ),
-        eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
-        ),
-    )
+    return layout.direction(turn, middle, size, points, d.config.obstacles)
 
 
 def _schedule() -> rrb.TimeSeriesView:

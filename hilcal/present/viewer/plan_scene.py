@@ -1,13 +1,199 @@
-"""What moves in the 3-D view of a plan: the arm with its load and the beam at every step."""
+"""The 3-D view of a plan: the cell with a bead per reading, and what moves at every step."""
 
 import numpy as np
 import rerun as rr
+from numpy.typing import NDArray
 
-from hilcal.present.text_plan import load_name
-from hilcal.present.viewer import arm_shapes, plan_cell, plan_style, style
+from hilcal.config import Obstacle
+from hilcal.present.plan import load_name
+from hilcal.present.viewer import arm_shapes, style
 from hilcal.present.viewer.digest import quaternions_of
 from hilcal.present.viewer.plan_digest import SEEN, PlanDigest
-from hilcal.types import Floats
+from hilcal.robot import body
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Floats, Ints
+
+Colors = NDArray[np.uint8]
+
+# In the order of PlanDigest's SEEN, TURNED, HIDDEN, UNKNOWN.
+SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
+SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
+# Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
+BARE: style.Color = (225, 226, 230)
+"""Of what is unloaded."""
+# After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
+_LOADS: tuple[style.Color, ...] = (
+    (86, 180, 233),
+    (240, 228, 66),
+    (204, 121, 167),
+    (70, 110, 235),
+    (205, 150, 110),
+    (120, 220, 215),
+    (165, 120, 245),
+)
+_FADED = 0.62
+
+
+def load_colors(names: tuple[str, ...]) -> Colors:
+    """(L, 3) a colour of each load; beyond seven, the same again and darker."""
+    out, k = [], 0
+    for name in names:
+        if name == UNLOADED:
+            out.append(np.array(BARE, dtype=float))
+            continue
+        out.append(np.array(_LOADS[k % len(_LOADS)]) * _FADED ** (k // len(_LOADS)))
+        k += 1
+    return np.array(out).round().astype(np.uint8)
+
+
+def sight_colors(sight: Ints) -> Colors:
+    """(S, 3) colour of the beam of each step."""
+    return np.asarray(SIGHT_COLORS[sight])
+
+
+BEAD, BEAD_GAP = 0.0075, 0.016
+"""Radius of a bead and distance of two in a stack, shares of the reach."""
+_OBSTACLE = (122, 112, 104)
+_SOLID = 90  # of 255: what stands behind an obstacle shows through
+_BOX = (64, 82, 108)
+_TRACKER = (235, 235, 240)
+_HEAD = 0.07  # m, of the drawn tracker
+
+
+def static_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
+    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    own = len(body.capsules(d.cell.arm))
+    arm_shapes.log_bodies(rec, d.shapes.scene.parts[:own], d.shapes.scene.parts[own:])
+    _obstacles(rec, d.config.obstacles)
+    _workspace(rec, d)
+    _beads(rec, d)
+    if d.tracker is not None:
+        _tracker(rec, d.tracker)
+
+
+def bead_places(d: PlanDigest, steps: Ints) -> Floats:
+    """(K, 3) where the beads of some steps are: stacked upwards from the target, m."""
+    up = np.zeros((len(steps), 3))
+    up[:, 2] = d.rank[steps] * BEAD_GAP * d.reach
+    return np.asarray(d.target[steps] + up)
+
+
+def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
+    boxes = [x for x in things if x.center_m is not None]
+    if boxes:
+        for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
+            rec.log(
+                f"world/obstacles/box/{part}",
+                rr.Boxes3D(
+                    centers=[x.center_m or () for x in boxes],
+                    sizes=[x.size_m or () for x in boxes],
+                    colors=[(*_OBSTACLE, alpha)],
+                    fill_mode=mode,  # type: ignore[arg-type]
+                ),
+                static=True,
+            )
+    stood = [x for x in things if x.bottom_m is not None]
+    if stood:
+        bottom = np.array([x.bottom_m for x in stood])
+        height = np.array([x.height_m for x in stood], dtype=float)
+        rec.log(
+            "world/obstacles/cylinder",
+            rr.Cylinders3D(
+                centers=bottom + 0.5 * height[:, None] * [0.0, 0.0, 1.0],
+                lengths=height,
+                radii=[x.radius_m or 0.0 for x in stood],
+                colors=[(*_OBSTACLE, _SOLID)],
+                fill_mode="solid",
+            ),
+            static=True,
+        )
+    if things:
+        rec.log(
+            "world/obstacles/names",
+            arm_shapes.labels([_named_at(x) for x in things], [x.name for x in things]),
+            static=True,
+        )
+
+
+def _named_at(thing: Obstacle) -> Floats:
+    """(3,) where an obstacle's name is written: on its top, or on a flat one's front edge."""
+    if thing.center_m is not None and thing.size_m is not None:
+        center, half = np.array(thing.center_m), 0.5 * np.array(thing.size_m)
+        flat = half[2] < 0.5 * min(half[:2])
+        return np.asarray(center + half * ([0.7, -0.7, 1.0] if flat else [0.0, 0.0, 1.0]))
+    up = np.array([0.0, 0.0, thing.height_m or 0.0])
+    return np.asarray(np.array(thing.bottom_m) + up)
+
+
+def _workspace(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    """Log the outline of every side of the workspace that is given."""
+    limits = d.config.limits
+    reach = 1.1 * d.reach
+    low = np.array(limits.workspace_min_m or (-reach, -reach, 0.0), dtype=float)
+    high = np.array(limits.workspace_max_m or (reach, reach, reach), dtype=float)
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    sides = []
+    for given, at in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
+        for axis in range(3) if given is not None else ():
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            corners = np.tile(at, (5, 1))
+            corners[:, a] = [low[a], high[a], high[a], low[a], low[a]]
+            corners[:, b] = [low[b], low[b], high[b], high[b], low[b]]
+            sides.append(corners)
+    if sides:
+        rec.log(
+            "world/workspace",
+            rr.LineStrips3D(sides, colors=[_BOX], radii=rr.Radius.ui_points(0.6)),
+            static=True,
+        )
+
+
+def _beads(rec: rr.RecordingStream, d: PlanDigest) -> None:
+    """Log a bead per pose and load, and a cage around those that the tracker does not see."""
+    steps = d.beads
+    rec.log(
+        "world/target/beads",
+        rr.Points3D(
+            bead_places(d, steps),
+            colors=load_colors(d.loads)[d.load[steps]],
+            radii=BEAD * d.reach,
+        ),
+        static=True,
+    )
+    lost = steps[d.unseen[steps]]
+    if len(lost):
+        rec.log(
+            "world/target/unseen",
+            rr.Ellipsoids3D(
+                centers=bead_places(d, lost),
+                half_sizes=np.full((len(lost), 3), 1.9 * BEAD * d.reach),
+                colors=sight_colors(d.sight[lost]),
+                fill_mode="majorwireframe",
+                line_radii=rr.Radius.ui_points(0.5),
+            ),
+            static=True,
+        )
+
+
+def _tracker(rec: rr.RecordingStream, place: Floats) -> None:
+    up = np.array([0.0, 0.0, 1.0])
+    rec.log(
+        "world/tracker",
+        arm_shapes.capsules(
+            (place - 1.2 * _HEAD * up)[None],
+            (place + 0.2 * _HEAD * up)[None],
+            np.array([_HEAD]),
+            [_TRACKER],
+        ),
+        static=True,
+    )
+    rec.log(
+        "world/tracker/name",
+        arm_shapes.labels([place + 2.2 * _HEAD * up], ["tracker"]),
+        static=True,
+    )
+
 
 _FORCE_LENGTH = 0.35  # the strongest pull is drawn this long, m
 _LABEL_ABOVE = 0.24  # m
@@ -27,12 +213,12 @@ def step_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
                 quaternion=quaternions_of(d.bodies[:, i, :3, :3]),
             ),
         )
-    colors = plan_style.load_colors(d.loads)[d.load]
+    colors = load_colors(d.loads)[d.load]
     rec.send_columns(
         "world/target/now",
         indexes=time,
         columns=rr.Points3D.columns(
-            positions=d.target, colors=colors, radii=np.full(len(d), 1.7 * plan_cell.BEAD * d.reach)
+            positions=d.target, colors=colors, radii=np.full(len(d), 1.7 * BEAD * d.reach)
         ),
     )
     _label(rec, d, time)
@@ -65,7 +251,7 @@ def pull_arrow(d: PlanDigest, name: str) -> Floats | None:
 
 def _beam(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn], place: Floats) -> None:
     strips = np.stack([np.broadcast_to(place, d.target.shape), d.target], 1)
-    colors = plan_style.sight_colors(d.sight)
+    colors = sight_colors(d.sight)
     rec.send_columns(
         "world/beam",
         indexes=time,
@@ -77,28 +263,22 @@ def _beam(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn], pla
 
 def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) -> None:
     above = d.target + np.array([0.0, 0.0, _LABEL_ABOVE])
-    above[:, 2] += d.rank.max(initial=0) * plan_cell.BEAD_GAP * d.reach
+    above[:, 2] += d.rank.max(initial=0) * BEAD_GAP * d.reach
     words = [
-        style.safe(f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}")
+        f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}"
         for k, s in enumerate(d.plan.steps, start=1)
     ]
     rec.send_columns(
         "world/label",
         indexes=time,
-        columns=rr.Points3D.columns(
-            positions=above + np.array([0.0, 0.0, 0.25 * _LABEL_ABOVE]),
-            labels=words,
-            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(d), 1)),
-            radii=np.full(len(d), 1e-4),
-            show_labels=[True] * len(d),
-        ),
+        columns=arm_shapes.label_columns(above + np.array([0.0, 0.0, 0.25 * _LABEL_ABOVE]), words),
     )
     rec.send_columns(
         "world/label/leader",
         indexes=time,
         columns=rr.LineStrips3D.columns(
             strips=np.stack([d.target, above], 1),
-            colors=plan_style.sight_colors(d.sight),
+            colors=sight_colors(d.sight),
             radii=np.full(len(d), 0.0012 * d.reach),
         ),
     )
@@ -106,12 +286,12 @@ def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) ->
 
 def _sight_words(d: PlanDigest, step: int) -> str:
     sight = int(d.sight[step])
-    return f": {plan_style.SIGHT_WORDS[sight]}" if d.unseen[step] or sight == SEEN else ""
+    return f": {SIGHT_WORDS[sight]}" if d.unseen[step] or sight == SEEN else ""
 
 
 def _loads(rec: rr.RecordingStream, d: PlanDigest) -> None:
     """Log what hangs or pulls, at the steps where there is some; cleared where there is none."""
-    colors = plan_style.load_colors(d.loads)
+    colors = load_colors(d.loads)
     for k, name in enumerate(d.loads):
         steps = np.flatnonzero(d.load == k)
         hung = d.shapes.segments(d.plan.q[d.pose[steps]], name)
@@ -143,7 +323,7 @@ def _loads(rec: rr.RecordingStream, d: PlanDigest) -> None:
 
 def _ways(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) -> None:
     """Log the target's whole way under the load of the step, and bright the last motion."""
-    colors = plan_style.load_colors(d.loads)
+    colors = load_colors(d.loads)
     rec.send_columns(
         "world/way/last",
         indexes=time,

@@ -3,6 +3,7 @@
 import numpy as np
 import rerun as rr
 
+from hilcal import numbers
 from hilcal.present.story import StoryRevision
 from hilcal.present.viewer import arm_shapes, style
 from hilcal.present.viewer.digest import Digest, capped, deviation, quaternions_of
@@ -54,9 +55,9 @@ def revision_scene(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None
     )
     rec.log(
         "world/residual/worst",
-        label(
-            story.anchor[worst] + _LABEL_ABOVE,
-            f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}",
+        arm_shapes.labels(
+            [story.anchor[worst] + _LABEL_ABOVE],
+            [f"worst: pose {story.pose_name(worst)}, {pose_words(d, r, worst)}"],
         ),
     )
     rec.log(
@@ -113,12 +114,9 @@ def pose_scene(rec: rr.RecordingStream, d: Digest) -> None:
     rec.send_columns(
         "world/residual/worst",
         indexes=[time],
-        columns=rr.Points3D.columns(
-            positions=story.anchor[worst] + _LABEL_ABOVE,
-            labels=[style.safe(f"pose {story.pose_name(i)}: {pose_words(d, r, i)}") for i in worst],
-            colors=np.tile(np.array(style.LABEL, dtype=np.uint8), (len(worst), 1)),
-            radii=np.full(len(worst), 1e-4),
-            show_labels=[True] * len(worst),
+        columns=arm_shapes.label_columns(
+            story.anchor[worst] + _LABEL_ABOVE,
+            [f"pose {story.pose_name(i)}: {pose_words(d, r, i)}" for i in worst],
         ),
     )
 
@@ -128,7 +126,7 @@ def pose_words(d: Digest, r: StoryRevision, i: int) -> str:
     length = float(np.linalg.norm(r.residual[i]))
     number = d.story.target
     name = "" if number is None else f"{style.safe(d.story.target_names[number[i]])} "
-    return f"{name}{style.micrometres(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+    return f"{name}{numbers.length(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
 
 
 def leader(d: Digest, i: int) -> Floats:
@@ -191,11 +189,4 @@ def _deflections(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
             colors=style.LEVEL_COLORS[style.levels(r.whitened_norm2[some])],
             radii=rr.Radius.ui_points(1.6),
         ),
-    )
-
-
-def label(position: Floats, text: str) -> rr.Points3D:
-    """Return words at a place, in the colour that is legible in both themes."""
-    return rr.Points3D(
-        [position], labels=[style.safe(text)], colors=[style.LABEL], radii=[1e-4], show_labels=True
     )

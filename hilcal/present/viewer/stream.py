@@ -17,9 +17,10 @@ import rerun.blueprint as rrb
 
 from hilcal.errors import HilcalError, InputError
 from hilcal.present.live_viewer import PORT
-from hilcal.present.story import Story, StoryRevision, check
-from hilcal.present.viewer import charts, errors, layout, scene, style, words
-from hilcal.present.viewer.digest import Digest, Limits, digest
+from hilcal.present.story import Story, StoryRevision
+from hilcal.present.viewer import charts, layout, scene, style, words
+from hilcal.present.viewer.digest import Digest, digest
+from hilcal.present.viewer.markdown import document, markdown
 from hilcal.whole_file import replace_file
 
 APPLICATION = "hilcal"
@@ -35,22 +36,20 @@ class Served:
     url: str
 
 
-def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.RecordingStream:
+def record(story: Story, *sinks: Sink) -> rr.RecordingStream:
     """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
 
     Args:
         story: what is told.
         sinks: where it goes.
-        limits: how much is drawn at most.
 
     Returns:
         The open stream; it closes, and ends its sinks, when it is dropped.
 
     Raises:
-        InputError: the story's arrays do not fit together.
         HilcalError: a sink does not take the data (disk full, ...).
     """
-    d, rec = _open(story, limits)
+    d, rec = _open(story)
     rec.set_sinks(*sinks)
     # Active, too: a viewer that has shown another recording would keep the layout of that one.
     rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
@@ -58,29 +57,27 @@ def record(story: Story, *sinks: Sink, limits: Limits | None = None) -> rr.Recor
     return rec
 
 
-def save(story: Story, path: Path, limits: Limits | None = None) -> None:
+def save(story: Story, path: Path) -> None:
     """Write a story as a recording file, whole or not at all; an existing file is replaced.
 
     Raises:
-        InputError: the folder is missing, or the story's arrays do not fit together.
+        InputError: the folder is missing.
         HilcalError: the file cannot be written.
     """
     path = Path(path)
     require_folder(path)
-    d, rec = _open(story, limits)
+    d, rec = _open(story)
     write(rec, layout.blueprint(d), lambda: tell(rec, d), path)
 
 
 @contextlib.contextmanager
-def serve(
-    story: Story, ip: str = "127.0.0.1", port: int = PORT, limits: Limits | None = None
-) -> Iterator[Served]:
+def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Served]:
     """Serve a story to viewers until the block ends; viewers may join late and rejoin.
 
     The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
 
     Raises:
-        InputError: the story's arrays do not fit together, or the port is taken.
+        InputError: the port is taken.
         HilcalError: the port cannot be served.
     """
     disable_analytics()
@@ -91,7 +88,7 @@ def serve(
             f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
         ) from error
     try:
-        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port), limits=limits)
+        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
     except (OSError, RuntimeError) as error:
         raise HilcalError(f"viewer server {ip}:{port}: {error}") from error
     try:
@@ -121,25 +118,15 @@ def free(ip: str, port: int) -> bool:
     return True
 
 
-def recording_id(story: Story) -> str:
-    """Return an identifier that depends on what the story tells, and on nothing else."""
-    sha = hashlib.sha256(
-        f"{story.arm.name} {story.mode} {story.load_names} {story.pose_names}".encode()
-    )
-    for array in (story.q, story.pose, story.anchor, story.measured, story.covariance):
-        sha.update(np.ascontiguousarray(array).tobytes())
-    for r in story.revisions:
-        told = (r.revision, r.change, r.model, r.verdict, r.suspects, r.parameters, r.rivals)
-        sha.update(repr((*told, r.limits, [c.variable for c in r.curves])).encode())
-        sha.update(np.ascontiguousarray(r.residual).tobytes())
-    return str(uuid.UUID(bytes=sha.digest()[:16]))
-
-
-def opened(identifier: str) -> rr.RecordingStream:
-    """Return a stream that is equal for equal data: no clock, no run number goes into it."""
+def opened(*content: object) -> rr.RecordingStream:
+    """Return a stream that is equal for equal content, values or arrays: it names the recording."""
+    sha = hashlib.sha256()
+    for part in content:
+        array = isinstance(part, np.ndarray)
+        sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
     rec = rr.RecordingStream(
         APPLICATION,
-        recording_id=identifier,
+        recording_id=str(uuid.UUID(bytes=sha.digest()[:16])),
         send_properties=False,
         # Chunks end where the stream is flushed, not when a clock ticks: equal files.
         batcher_config=rr.ChunkBatcherConfig.NEVER(),
@@ -216,16 +203,18 @@ def executable() -> str:
     return str(Path(str(rerun_cli.__file__)).parent / "rerun")
 
 
-def _open(story: Story, limits: Limits | None) -> tuple[Digest, rr.RecordingStream]:
-    check(story)
-    return digest(story, limits or Limits()), opened(recording_id(story))
+def _open(story: Story) -> tuple[Digest, rr.RecordingStream]:
+    arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
+    names = (story.arm.name, story.mode, story.load_names, story.pose_names)
+    told = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
+    rec = opened(names, *arrays, told, *(r.residual for r in story.revisions))
+    return digest(story), rec
 
 
 def tell(rec: rr.RecordingStream, d: Digest) -> None:
     """Log the whole story, flushed after each revision."""
     rec.send_recording_name(f"hilcal: {style.safe(d.story.arm.name)}, {len(d.story)} readings")
     begin(rec, d)
-    errors.error_picture(rec, d)
     for r in d.story.revisions:
         rec.set_time("revision", sequence=r.revision)
         tell_revision(rec, d, r)
@@ -238,18 +227,18 @@ def tell(rec: rr.RecordingStream, d: Digest) -> None:
 def begin(rec: rr.RecordingStream, d: Digest) -> None:
     """Log what is the same in every revision."""
     scene.static_scene(rec, d)
-    rec.log("words/guide", _markdown(words.GUIDE), static=True)
+    charts.error_series(rec)
+    rec.log("words/guide", document(words.GUIDE), static=True)
 
 
 def tell_revision(rec: rr.RecordingStream, d: Digest, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
     scene.revision_scene(rec, d, r)
     charts.revision_charts(rec, d, r)
-    rec.log("words/verdict", _markdown(words.verdict(d, r)))
-    rec.log("words/parameters", _markdown(words.parameters(r, d.limits.parameters)))
-    rec.log("words/limits", _markdown(words.limits(r)))
-    rec.log("words/revisions", _markdown(words.revisions(d, r.revision)))
-    rec.log("words/details", _markdown(words.details(d, r)))
+    rec.log("words/verdict", document(words.verdict(d, r)))
+    rec.log("words/parameters", document(markdown(r.panels.get("parameters", ()))))
+    rec.log("words/revisions", document(words.revisions(d, r.revision)))
+    rec.log("words/details", document(words.details(d, r)))
     rec.log("log", rr.TextLog(words.log_line(d, r), level="INFO"))
 
 
@@ -268,7 +257,3 @@ def _poses(rec: rr.RecordingStream, d: Digest) -> None:
         columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
     )
     charts.pose_charts(rec, d)
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")

@@ -5,7 +5,7 @@ import numpy as np
 from hilcal.tables.guessing import column_names as words
 from hilcal.tables.guessing.column_names import ColumnName, parse
 from hilcal.tables.guessing.guess_values import is_quaternion, sentinels
-from hilcal.tables.guessing.guesser import SHOWN, SIDE_BY_SIDE, Guesser, angle_unit, length_unit
+from hilcal.tables.guessing.proposal import SHOWN, SIDE_BY_SIDE, Guesser, angle_unit, length_unit
 
 
 def _kind(c: ColumnName) -> str:
@@ -22,6 +22,8 @@ def _kind(c: ColumnName) -> str:
     return "position"
 
 
+Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
+"""Names of columns by kind, by the words and numbers of their names, by axis."""
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
@@ -109,9 +111,6 @@ def _covariance(g: Guesser) -> None:
         g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
 
 
-Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
-
-
 def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
     quaternions = {s: a for s, a in whole.get("quaternion", {}).items() if "w" in a}
     best = _like(quaternions, stem)
@@ -134,12 +133,12 @@ def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
         plain = {key.split("[")[0].split("(")[0].strip(): name for key, name in by_letter.items()}
         if all(letter in plain and g.number(plain[letter]) for letter in letters):
             names = [plain[letter] for letter in letters]
-            _angles(g, names, convention, sure=False)
+            _angles(g, names, convention)
             return
     usable = [c for c in g.columns if c.name in g.free and not c.has(words.NOMINAL)]
     turns = {c.words[-1]: c.name for c in usable if c.words}
     if {"roll", "pitch", "yaw"} <= set(turns):
-        _angles(g, [turns[w] for w in ("roll", "pitch", "yaw")], "roll-pitch-yaw", sure=False)
+        _angles(g, [turns[w] for w in ("roll", "pitch", "yaw")], "roll-pitch-yaw")
         return
     axes = _like(angles, stem)
     if axes is not None:
@@ -150,7 +149,7 @@ def _by_axes(g: Guesser, names: list[str]) -> None:
     """Angles named by axes: a rotation vector where none is longer than π, else fixed angles."""
     length = np.linalg.norm(g.block(names), axis=1)
     vector = np.nanmax(length) <= np.pi + 1e-3
-    _angles(g, names, "rotation-vector" if vector else "fixed-xyz", sure=False)
+    _angles(g, names, "rotation-vector" if vector else "fixed-xyz")
 
 
 def _like(
@@ -163,10 +162,10 @@ def _like(
     return found[min(usable, key=_rank)] if usable else None
 
 
-def _angles(g: Guesser, names: list[str], convention: str, *, sure: bool) -> None:
+def _angles(g: Guesser, names: list[str], convention: str) -> None:
     unit = angle_unit(g, "orientation", names)
     g.take("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
-    g.proposal.open_convention = not sure
+    g.proposal.open_convention = True
 
 
 def _four_numbers(g: Guesser) -> bool:

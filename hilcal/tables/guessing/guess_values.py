@@ -7,7 +7,8 @@ import numpy as np
 
 from hilcal.tables.grid import Grid
 from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.guesser import FAR, TURN, Guesser, angle_unit, length_unit
+from hilcal.tables.guessing.proposal import FAR, TURN, Guesser, angle_unit, length_unit
+from hilcal.tables.mapped import nines
 from hilcal.types import Floats
 
 NORM = 3e-3
@@ -44,16 +45,6 @@ def sentinels(position: Floats) -> list[float]:
     """Return numbers that stand for a missing point: all three the same, or made of nines."""
     same = (position[:, 0] == position[:, 1]) & (position[:, 1] == position[:, 2])
     return sorted({float(v) for v in position[same, 0] if v != 0} | set(nines(position)))
-
-
-def nines(position: Floats) -> list[float]:
-    """Return numbers of four nines or more, which stand for a missing value."""
-    found = set()
-    for v in np.unique(position[np.isfinite(position)]):
-        digits = f"{abs(v):.0f}"
-        if len(digits) >= 4 and set(digits) == {"9"} and float(digits) == abs(v):
-            found.add(float(v))
-    return sorted(found)
 
 
 def time_unit(

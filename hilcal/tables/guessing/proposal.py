@@ -1,11 +1,29 @@
 """A proposed mapping: what was understood of a table, what is unsure, what was not used."""
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from hilcal.errors import InputError
 from hilcal.names import escaped
+from hilcal.tables.grid import Grid
+from hilcal.tables.guessing.column_names import parse
 from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
+from hilcal.types import Floats
+
+TURN = 2 * np.pi + 0.1
+"""rad; a larger angle is in degrees."""
+FAR = 50.0
+"""A position beyond this number is in millimetres: no arm is measured from 50 m."""
+GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
+SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
+REPORTED = 5e-3
+"""rad; encoders at rest in one pose differ by less, commanded poses by more; a choice."""
+FEWEST_JOINTS, MOST_JOINTS = 4, 8
+SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,3 +103,90 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return repr(value)
+
+
+class Guesser:
+    """Columns that are not yet used, and the mapping that grows."""
+
+    def __init__(self, grid: Grid, joints: int | None) -> None:
+        """Take the table apart.
+
+        Args:
+            grid: the table.
+            joints: of the arm, where the cell is known.
+        """
+        self.grid = grid
+        self.joints = joints
+        self.columns = [parse(name, grid.units.get(name, "")) for name in grid.names]
+        self.proposal = Proposal()
+        self.free = dict(zip(grid.names, self.columns, strict=True))
+        self.values: dict[str, Floats | None] = {name: self._numbers(name) for name in grid.names}
+
+    def _numbers(self, name: str) -> Floats | None:
+        try:
+            values = self.grid.numbers(name)
+        except InputError:
+            return None
+        return values if np.isfinite(values).any() else None
+
+    def number(self, name: str) -> bool:
+        """Whether a column holds numbers."""
+        return self.values[name] is not None
+
+    def block(self, names: Iterable[str]) -> Floats:
+        """(N, k) numbers of columns."""
+        return np.stack([self._known(name) for name in names], axis=1)
+
+    def _known(self, name: str) -> Floats:
+        values = self.values[name]
+        return np.full(len(self.grid.rows), np.nan) if values is None else values
+
+    def take(self, what: str, names: Sequence[str], meaning: str, **section: object) -> None:
+        """Give columns a meaning."""
+        key = "column" if "column" in section else "columns"
+        section = {key: names[0] if key == "column" else list(names)} | section
+        self.proposal.sections[what] = section
+        examples = tuple(self.grid.text(name)[0] for name in names)
+        self.proposal.understood.append(Understood(what, tuple(names), meaning, examples))
+        for name in names:
+            self.free.pop(name, None)
+
+    def unsure(self, about: str, sentence: str) -> None:
+        """Note what should be checked."""
+        self.proposal.unsure.append((about, sentence))
+
+    def drop(self, name: str, why: str) -> None:
+        """Leave a column unused."""
+        if self.free.pop(name, None) is not None:
+            self.proposal.unused.append((name, why))
+
+    def unit(self, names: Sequence[str]) -> str | None:
+        """Return the unit that the names of columns, or the row of units, state."""
+        found = {self.columns[self.grid.names.index(name)].unit for name in names}
+        return found.pop() if len(found) == 1 else None
+
+
+def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+    """Return the unit of angles by name, else by size."""
+    stated = g.unit(names)
+    largest = float(np.nanmax(np.abs(g.block(names))))
+    if stated in ("rad", "mrad", "deg", "arcsec"):
+        if stated == "rad" and largest > TURN:
+            g.unsure(what, f"named rad, but up to {largest:.4g}: read as degrees")
+            return "deg"
+        return stated
+    if largest > TURN:
+        return "deg"
+    g.unsure(what, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
+    return "rad"
+
+
+def length_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+    """Return the unit of positions by name, else by size."""
+    stated = g.unit(names)
+    if stated in ("m", "mm", "um", "in"):
+        return stated
+    largest = float(np.nanmax(np.abs(g.block(names))))
+    unit = "mm" if largest > FAR else "m"
+    g.unsure(what, f"no unit stated; {unit}, since the largest is {largest:.4g}")
+    return unit

@@ -1,6 +1,8 @@
-"""Opening one or two files whose form is unknown, and proposing a mapping for them."""
+"""A mapping for one or two files whose form is unknown, guessed from names and values."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -8,10 +10,26 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.readings.readings import SAME_POSE
+from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
-from hilcal.tables.guessing.guess import guess
-from hilcal.tables.guessing.proposal import Proposal
+from hilcal.tables.guessing import column_names as words
+from hilcal.tables.guessing.column_names import ColumnName, parse
+from hilcal.tables.guessing.guess_axes import guess_axes
+from hilcal.tables.guessing.guess_values import guess_by_values, is_quaternion, time_unit
+from hilcal.tables.guessing.proposal import (
+    FEWEST_JOINTS,
+    GUESSED,
+    MOST_JOINTS,
+    REPORTED,
+    SHOWN,
+    Guesser,
+    Proposal,
+    angle_unit,
+)
 from hilcal.tables.guessing.sniff import sniff
+from hilcal.tables.mapping import UNLOADED
+from hilcal.tables.units import ANGLES
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,3 +112,210 @@ def _is_key(keys: list[str]) -> bool:
     except ValueError:
         return True
     return bool(np.all(numbers == np.rint(numbers)))
+
+
+def guess(grid: Grid, joints: int | None = None) -> Proposal:
+    """Propose a mapping for a table.
+
+    Args:
+        grid: the table.
+        joints: number of the arm's joints, where it is known.
+    """
+    g = Guesser(grid, joints)
+    _joints(g)
+    guess_axes(g)
+    if any(what not in g.proposal.sections for what in ("joints", "position")):
+        guess_by_values(g)
+    guess_names(g)
+    guess_scalars(g)
+    for name, column in list(g.free.items()):
+        g.drop(name, _why_unused(g, column))
+    if set(required_columns(joints or 6)) <= set(grid.names):
+        g.unsure("file", "this is an exchange table: it is imported without --format")
+    if g.proposal.open_convention:
+        g.unsure("orientation", GUESSED)
+    for what, sentence in (
+        ("position", "no position: three columns x, y, z were not found"),
+        (
+            "joints",
+            "no joint angles: where they are in a file of their own, give it with --second",
+        ),
+    ):
+        if what not in g.proposal.sections:
+            g.proposal.lacking.append(sentence)
+    if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
+        g.unsure("pose", "no column names the pose: rows of the same joints count as one pose")
+    if not {"load", "hung_mass", "wrench"} & set(g.proposal.sections):
+        g.unsure("load", "no column tells the load: all readings count as unloaded")
+    return g.proposal
+
+
+def _why_unused(g: Guesser, column: ColumnName) -> str:
+    values = g.values[column.name]
+    if values is not None and np.nanmax(values) == np.nanmin(values):
+        return f"constant, {np.nanmax(values):g}"
+    if column.has(words.DIFFERENCE):
+        return "a difference"
+    if column.has(words.NOMINAL):
+        return "a commanded or nominal value"
+    if values is None:
+        return "no numbers" if any(g.grid.text(column.name)) else "empty"
+    return "its name says nothing"
+
+
+def _joints(g: Guesser) -> None:
+    """Joint angles: columns of a joint's word and a number each, or with an arm's joint names."""
+    groups: dict[tuple[str, ...], dict[int, str]] = {}
+    for c in g.columns:
+        if not c.numbers or c.axis or not c.has(words.JOINT) or not g.number(c.name):
+            continue
+        if not c.has(words.STD):
+            groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
+    found: list[tuple[ColumnName, list[str]]] = []
+    for by_number in groups.values():
+        names = [by_number[k] for k in sorted(by_number)]
+        first = parse(names[0])
+        if is_quaternion(g.block(names)) and len(names) == 4:
+            continue
+        if sorted(by_number)[0] > 1 or not FEWEST_JOINTS <= len(names) <= MOST_JOINTS:
+            continue
+        if first.has(words.NO_ANGLE):
+            _per_joint(g, first, names)
+        else:
+            found.append((first, names))
+    named = [_with_words(g, w) for w in words.ARM_JOINTS]
+    if all(named):
+        found.append((parse("joint"), [str(name) for name in named]))
+    if not found:
+        return
+    found.sort(key=lambda f: (f[0].has(words.MEASURED | {"qa"}), not f[0].has(words.NOMINAL)))
+    first, names = found[0]
+    if first.has(words.MEASURED | {"qa"}):
+        g.unsure("joints", f"'{names[0]}' ... are reported angles, used as the commanded ones")
+    unit = angle_unit(g, "joints", names)
+    g.take("joints", names, unit, unit=unit)
+    if g.joints is not None and len(names) != g.joints:
+        g.unsure("joints", f"{len(names)} columns, the arm has {g.joints} joints")
+    for other, rest in found[1:]:
+        if other.has(words.MEASURED | {"qa"}) and len(rest) == len(names):
+            same = np.nanmax(np.abs(g.block(rest) - g.block(names)))
+            if same < (0.1 if unit == "rad" else 5.7):
+                g.take("actual_joints", rest, unit, unit=unit)
+                break
+
+
+def _with_words(g: Guesser, wanted: tuple[str, ...]) -> str | None:
+    for c in g.columns:
+        digits = {str(k) for k in c.numbers}
+        if set(wanted) <= set(c.words) | digits and g.number(c.name) and not c.has(words.NO_ANGLE):
+            return c.name
+    return None
+
+
+def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
+    """Temperatures and sides of approach of the joints."""
+    values = g.block(names)
+    if first.has(words.TEMPERATURE) or first.unit == "degC" or first.has({"degc"}):
+        unit = first.unit if first.unit in ("degC", "degF", "K") else "degC"
+        g.take("joint_temperatures", names, unit, unit=unit)
+    elif first.has(words.APPROACH) and np.all(np.isin(values, (-1.0, 1.0))):
+        g.take("approach", names, "-1 or +1")
+
+
+def guess_names(g: Guesser) -> None:
+    """Poses, loads, cycles and reflectors."""
+    q = g.proposal.sections.get("joints")
+    _pick(g, "pose", words.POSE, lambda n: q is None or _one_pose_each(g, n, q))
+    for c in list(g.free.values()):
+        if c.has(words.MASS | words.LOAD) and g.number(c.name) and "load" not in g.free:
+            mass = c.unit in ("kg", "g", "lb") or c.has(words.MASS)
+            if mass and "hung_mass" not in g.proposal.sections:
+                unit = c.unit if c.unit in ("kg", "g", "lb") else "kg"
+                if "wrench" in g.proposal.sections:
+                    continue
+                g.take("hung_mass", [c.name], unit, column=c.name, unit=unit)
+    if "hung_mass" not in g.proposal.sections:
+        _pick(g, "load", words.LOAD, lambda n: True)
+    if not {"load", "hung_mass"} & set(g.proposal.sections):
+        for c in list(g.free.values()):
+            texts = [t.lower() for t in g.grid.text(c.name)]
+            few = 1 < len(set(texts)) <= 20
+            if not g.number(c.name) and few and set(texts) & (set(UNLOADED) - {"0", "-", "no"}):
+                g.take("load", [c.name], "name", column=c.name)
+                g.unsure("load", f"'{c.name}' has a value that means no load")
+                break
+    if (load := g.proposal.sections.get("load")) is not None:
+        values = {t.lower() for t in g.grid.text(load["column"])}
+        if not values & {*UNLOADED, ""}:
+            shown = ", ".join(sorted(values)[:SHOWN])
+            g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
+    _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole(g, n))
+    _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few(g, n))
+
+
+def _pick(g: Guesser, what: str, known: set[str], fits: Callable[[str], bool]) -> None:
+    for c in list(g.free.values()):
+        if c.has(known) and not c.axis and not c.has(words.STD) and _is_name(g, c.name):
+            if not fits(c.name):
+                continue
+            g.take(what, [c.name], "name", column=c.name)
+            return
+
+
+def _is_name(g: Guesser, name: str) -> bool:
+    """Whether a column holds text or whole numbers."""
+    return not g.number(name) or _whole(g, name)
+
+
+def _whole(g: Guesser, name: str) -> bool:
+    values = g.block([name])[:, 0]
+    known = values[np.isfinite(values)]
+    return bool(np.all(known == np.rint(known)))
+
+
+def _few(g: Guesser, name: str) -> bool:
+    count = len(set(g.grid.text(name)))
+    return 1 < count <= min(20, len(g.grid.rows) // 2)
+
+
+def _one_pose_each(g: Guesser, name: str, joints: dict[str, Any]) -> bool:
+    """Whether all rows of a name command the same joints, or reported nearly the same."""
+    texts = g.grid.text(name)
+    if "" in texts:
+        return False
+    q = g.block(joints["columns"]) * ANGLES[joints["unit"]]
+    first: dict[str, int] = {}
+    rows = [first.setdefault(text, k) for k, text in enumerate(texts)]
+    off = np.nan_to_num(np.abs(q - q[rows]))
+    if off.max() > REPORTED:
+        k = int(np.argmax(off.max(axis=1)))
+        g.unsure("joints", f"'{name}' is no pose: '{texts[k]}' stands at different joints")
+        return False
+    if off.max() > SAME_POSE and "actual_joints" not in g.proposal.sections:
+        joints["reported"] = True
+        g.unsure("joints", f"they differ by up to {off.max():.2g} rad in a pose: reported angles")
+    return True
+
+
+def guess_scalars(g: Guesser) -> None:
+    """Times and the temperature of the air."""
+    for c in list(g.free.values()):
+        dated = all(isinstance(cell, datetime) for cell in g.grid.cells(c.name))
+        timed = dated or (c.has(words.TIME) and not c.axis)
+        if "time" not in g.proposal.sections and timed:
+            found = time_unit(g.grid, c.name, c.unit, g.values[c.name])
+            if found is not None:
+                section, doubt = found
+                if doubt:
+                    g.unsure("time", doubt)
+                g.take("time", [c.name], str(section["unit"]), column=c.name, **section)
+        elif (
+            "air" not in g.proposal.sections
+            and (c.has(words.TEMPERATURE) or (c.has(words.AIR) and c.unit in ("degC", "K", "degF")))
+            and g.number(c.name)
+            and not c.numbers
+        ):
+            values = g.block([c.name])
+            unit = c.unit or ("K" if np.nanmin(values) > 200 else "degC")
+            if unit in ("degC", "degF", "K"):
+                g.take("air", [c.name], unit, column=c.name, unit=unit)

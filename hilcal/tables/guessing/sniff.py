@@ -11,22 +11,13 @@ from typing import Any
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.tables.grid import (
-    BYTE_ORDER_MARKS,
-    Cell,
-    Grid,
-    content_of,
-    decoded,
-    number,
-    records,
-    table,
-)
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.sheets import REFUSED, open_grid, sheet_names, sheet_rows
+from hilcal.tables.files import content_of, kind_of, open_grid, sheet_names, sheet_rows
+from hilcal.tables.grid import Cell, Grid, number
+from hilcal.tables.mapping import FileFormat
+from hilcal.tables.text import BYTE_ORDER_MARKS, decoded, grid_of_rows, records
 
 HEAD = 400
 """Lines that the dialect is guessed from."""
-NOT_TEXT = (b"PAR1", b"MATLAB", *REFUSED)
 COMMENTS = ("//", "#", "%", "!")
 _UNIT = re.compile(
     r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"
@@ -60,19 +51,14 @@ def sniff(path: str | Path) -> Sniffed:
     """
     content = content_of(path)
     name = str(path)
-    if content.startswith(b"PK\x03\x04"):
+    kind = kind_of(name, content)
+    if kind == "XLSX":
         return _spreadsheet(name, content)
-    binary = (b"PAR1", b"MATLAB", b"SQLite", b"\x89HDF", b"\xd0\xcf\x11", b"\x1f\x8b", b"\x80")
-    if not content.strip(b"\xef\xbb\xbf \t\r\n") or content.startswith(
-        (*binary, b"%PDF", b"\x93N")
-    ):
+    if kind != "text":
         return Sniffed({}, open_grid(path, FileFormat()), ())
     how: dict[str, Any] = {}
-    marked = [mark for mark, _ in BYTE_ORDER_MARKS if content.startswith(mark)]
     text = decoded(name, content, None)
-    if "\x00" in text:
-        raise InputError(f"{name}: binary data; expected text, XLSX, MAT or Parquet")
-    if not marked and not _is_utf8(content):
+    if not content.startswith(tuple(BYTE_ORDER_MARKS)) and not _is_utf8(content):
         how["encoding"] = "latin-1"
     lines = [line for line in text.splitlines() if line.strip()][:HEAD]
     for mark in COMMENTS:
@@ -235,4 +221,4 @@ def _spreadsheet(path: str, content: bytes) -> Sniffed:
     if how["header_row"] == 1:
         del how["header_row"]
     form = FileFormat(**how)
-    return Sniffed(how, table(path, best[2], form), doubts)
+    return Sniffed(how, grid_of_rows(path, best[2], form), doubts)

@@ -8,10 +8,10 @@ import pytest
 from pydantic import TypeAdapter
 from pydantic.fields import FieldInfo
 
-from hilcal.cli.configuring import DRIVERS_OWN
+from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
-from hilcal.present.text_config import page
+from hilcal.present.preparing import reference_page
 from hilcal.toml import Section, section_of
 from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.paths import ROOT
@@ -92,8 +92,8 @@ def test_no_key_is_invented() -> None:
 
 def test_the_page_of_the_reference_is_what_the_program_writes() -> None:
     path = ROOT / "docs" / "reference" / "cell-configuration.md"
-    assert path.read_text(encoding="utf-8") == page(list(TABLES.values())), (
-        "write it anew: python -c 'from hilcal.cli.configuring import write_page; write_page()'"
+    assert path.read_text(encoding="utf-8") == reference_page(list(TABLES.values())), (
+        "write it anew: python -c 'from hilcal.cli.looking_up import write_page; write_page()'"
     )
 
 

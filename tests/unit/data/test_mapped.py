@@ -19,9 +19,9 @@ from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.guessing.sniff import sniff
-from hilcal.tables.imported import ImportResult
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping
+from hilcal.tables.table import ImportResult
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
 

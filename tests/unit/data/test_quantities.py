@@ -5,7 +5,7 @@ import math
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.tables.quantities import parse_duration, parse_length
+from hilcal.tables.units import parse_duration, parse_length
 
 
 @pytest.mark.parametrize(

@@ -20,11 +20,11 @@ from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
+from hilcal.tables.files import open_grid
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapped import import_mapped
-from hilcal.tables.mapping import Mapping
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.sheets import open_grid
+from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.table import import_table
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign
 
@@ -182,3 +182,22 @@ def test_what_is_no_table(content: bytes, message: str, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message) as error:
             attempt()
         assert "\n" not in str(error.value)
+
+
+def test_an_exchange_table_may_be_a_sheet(tmp_path: Path, arm: Arm) -> None:
+    text, sheet = tmp_path / "t.csv", tmp_path / "t.xlsx"
+    header = ["pose", "load", *(f"q{k}_rad" for k in range(1, 7)), "x_m", "y_m", "z_m"]
+    rows = [[f"P{k}", "none", *C.q[k], *C.position[k]] for k in range(3)]
+    text.write_text("\n".join(",".join(map(str, row)) for row in [header, *rows]))
+    out = openpyxl.Workbook()
+    for row in [header, *rows]:
+        out.active.append(row)
+    out.save(sheet)
+    one, other = (import_table(path, arm, NOISE).readings for path in (text, sheet))
+    np.testing.assert_allclose(one.value, other.value, rtol=1e-15)
+    np.testing.assert_allclose(one.states.q, other.states.q, rtol=1e-15)
+    assert one.pose_names == other.pose_names
+    out.active.cell(3, 9, "abc")
+    out.save(sheet)
+    with pytest.raises(InputError, match=r"t.xlsx: row 3, column 'x_m': 'abc' is not a number"):
+        import_table(sheet, arm, NOISE)

@@ -9,9 +9,8 @@ import pytest
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.readings.readings import Readings
-from hilcal.tables.imported import ImportResult
-from hilcal.tables.stated_noise import rounding_variance, step
-from hilcal.tables.table import import_table, write_table
+from hilcal.tables.table import ImportResult, import_table, write_table
+from hilcal.tables.uncertainty import rounding_variance, step
 from tests.support.readings_cases import make_arm, simple
 
 ARM = make_arm()

@@ -15,8 +15,8 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import message
 from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case

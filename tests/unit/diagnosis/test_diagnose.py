@@ -18,9 +18,9 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.text_seen import could_have_been_seen
-from hilcal.present.verdict_words import headline, message
+from hilcal.present.diagnosis import could_have_been_seen
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import headline, message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import add

@@ -9,8 +9,8 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_document import least
-from hilcal.present.text_seen import could_have_been_seen
+from hilcal.present.diagnosis import could_have_been_seen
+from hilcal.present.diagnosis_json import least
 from tests.support.campaigns import campaign
 
 ERROR = "transmission_error"

@@ -11,9 +11,9 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.diagnosis_document import suspect_json
-from hilcal.present.text_refine import finer
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis import finer
+from hilcal.present.diagnosis_json import suspect_json
+from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import NOTHING, Campaign, campaign
 

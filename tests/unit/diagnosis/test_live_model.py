@@ -7,7 +7,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.measuring.progress import LiveResidual, ReadingStored
-from hilcal.present.live_run import figures
+from hilcal.present.running import figures
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import Step
 from tests.support.campaigns import campaign, cell_of, configuration

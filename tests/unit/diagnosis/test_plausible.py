@@ -17,7 +17,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign, configuration
 from tests.support.paths import ROOT

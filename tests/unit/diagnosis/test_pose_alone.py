@@ -13,8 +13,8 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, measured, plan
 
 

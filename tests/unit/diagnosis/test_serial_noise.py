@@ -15,8 +15,8 @@ from hilcal.diagnosis.serial_noise import MOST_READINGS, serial_noise, with_seri
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.serial_noise import symmetric_root
 from hilcal.readings.whitening import MODES, Mode

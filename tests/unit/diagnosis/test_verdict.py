@@ -10,7 +10,7 @@ from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import judge
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from tests.support.campaigns import campaign
 
 

@@ -11,8 +11,8 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.wrong_figures import wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis_json import to_json
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import refine

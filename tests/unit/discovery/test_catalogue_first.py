@@ -17,7 +17,7 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.text_discover import silence, to_json
+from hilcal.present.discovery import discovery_json, silence
 from tests.unit.discovery.test_discover import campaign
 
 
@@ -91,7 +91,9 @@ def test_no_refit_fails_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found == Instead((), ((known.names[0], "it finds no equilibrium"),))
     answer = Discovery(fitted, "no_law", unfitted=found.unfitted)
     assert "load_point could not be tried in the exact model (it finds no eq" in silence(answer)
-    assert to_json(answer)["unfitted"] == [{"effect": "load_point", "why": found.unfitted[0][1]}]
+    assert discovery_json(answer)["unfitted"] == [
+        {"effect": "load_point", "why": found.unfitted[0][1]}
+    ]
 
 
 def _with_load_off(shift: float) -> Fit:

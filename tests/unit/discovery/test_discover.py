@@ -29,7 +29,13 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.text_discover import discovery_report, laws_json, refined_laws, silence, to_json
+from hilcal.present.discovery import (
+    discovery_json,
+    discovery_report,
+    laws_json,
+    refined_laws,
+    silence,
+)
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
 from tests.support.rehearsed import rehearsed
@@ -171,7 +177,7 @@ def test_a_drift_of_readings_without_times_is_said_to_need_them(
     assert (d.reason, d.carried[0].variable) == ("no_law", "row order")
     assert "whose times are missing" in silence(d)
     assert "row order carries" in "".join(map(str, discovery_report(d)))
-    assert to_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
+    assert discovery_json(d)["carried_by"][0]["variable"] == "row order"  # type: ignore[index]
 
 
 @cache
@@ -227,7 +233,7 @@ def test_what_is_told_of_a_law_names_all_that_speaks_for_it() -> None:
     assert "dq_3 = a·cos(q_4)·τ_3" in told
     assert "acts on      joint 3" in told
     assert "µrad/(N·m)" in told
-    (law,) = to_json(found())["laws"][:1]  # type: ignore[index]
+    (law,) = discovery_json(found())["laws"][:1]  # type: ignore[index]
     asked = ("name", "formula", "acts_on", "parameters", "holdout_share", "p_value", "variables")
     assert {*asked} <= {*law}
     assert law["latex"] == r"\delta q_3 = a\,\cos(q_4)\,\tau_3"
@@ -248,7 +254,7 @@ def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
         assert np.all(np.abs(y - np.interp(x, *c.line)) < 5 * std)
     told = "".join(str(part) for part in discovery_report(found()))
     assert "seen for" in told
-    drawn = to_json(found())["curves"][0]  # type: ignore[index]
+    drawn = discovery_json(found())["curves"][0]  # type: ignore[index]
     assert drawn["binned"][0]["readings"] == by_angle.binned[3][0]
 
 
@@ -297,4 +303,4 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.Mo
     assert "dq_3 = a·cos(q_4)·τ_3 predicts" in said
     assert "it finds no equilibrium" in said
     assert "no law of this size" not in said
-    assert to_json(d)["refused"]
+    assert discovery_json(d)["refused"]

@@ -22,7 +22,7 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.charts import style
-from hilcal.present.charts.law import law
+from hilcal.present.charts.evidence import curve_chart
 from hilcal.present.viewer import save
 from tests.support.campaigns import NOTHING, campaign
 
@@ -76,13 +76,12 @@ def test_a_law_is_seen_on_the_page_and_in_the_viewer(tmp_path: Path) -> None:
     (one,) = story.revisions[1].laws
     assert one.x_label == "q_5 [°]"
     assert one.y_label == "dq_3/τ_3 of joint 3 [µrad/(N·m)]"
-    assert one.coefficients.startswith("a = ")
-    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(law(one))
+    assert dict(one.facts)["coefficients"].startswith("a = ")
+    assert "dq_3 = a·cos(q_5)·τ_3" in style.says(curve_chart(one))
     save(story, tmp_path / "x.rrd")
-    chunks = RrdReader(tmp_path / "x.rrd").stream().filter(content="/law/line").to_chunks()
+    chunks = RrdReader(tmp_path / "x.rrd").stream().filter(content="/law/law").to_chunks()
     rows = [row for c in chunks for row in c.to_record_batch().to_pylist()]
-    strips = [row["LineStrips2D:strips"] for row in rows if row.get("revision") in (1, 2)]
-    assert [len(s) for s in strips] == [0, 1]
+    assert {row.get("revision") for row in rows if row.get("BarChart:values")} == {2, None}
 
 
 def test_a_model_of_the_catalogue_has_no_laws() -> None:

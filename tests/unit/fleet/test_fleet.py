@@ -13,8 +13,8 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import carried_prior
 from hilcal.identification.fit import fit
 from hilcal.identification.posterior import Posterior
-from hilcal.present.charts.fleet import arms_chart
-from hilcal.present.html.fleet import page
+from hilcal.present.charts.comparisons import arms_chart
+from hilcal.present.html.other_pages import fleet_page
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
@@ -113,7 +113,7 @@ def test_the_page_shows_who_is_unlike(one: Posterior) -> None:
         (1, "unlike its type"),
     ]
     lost = (Failure("x<b>.hilcal", "no campaign"),)
-    html = page(Fleet((of,), tuple(fleet), lost), "fleet", "2026-04-01T00:00:00", "1")
+    html = fleet_page(Fleet((of,), tuple(fleet), lost), "fleet", "2026-04-01T00:00:00", "1")
     assert f"Unlike their type: arm{ODD}" in html
     assert "joint_compliance.j3" in html
     assert "x&lt;b&gt;.hilcal: no campaign" in html

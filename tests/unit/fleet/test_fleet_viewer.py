@@ -9,8 +9,7 @@ from rerun.chunk import RrdReader
 
 from hilcal.identification.posterior import Posterior
 from hilcal.present.viewer import style
-from hilcal.present.viewer.fleet_digest import type_digest
-from hilcal.present.viewer.fleet_scene import places
+from hilcal.present.viewer.fleet_scene import places, type_digest
 from hilcal.present.viewer.fleet_stream import record_fleet
 from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet

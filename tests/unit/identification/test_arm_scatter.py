@@ -21,7 +21,7 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import register
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings

@@ -11,7 +11,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.bootstrap import Bootstrap, again, bootstrap
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import distinct_poses
-from hilcal.present.text_bootstrap import remarks, to_json
+from hilcal.present.bootstrap import bootstrap_json, bootstrap_remarks
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
@@ -59,11 +59,11 @@ def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
     # the formal uncertainty is too small by the root of the readings that a pose has
     ratio = np.median([b.ratio[frames] for b in found])
     assert 0.75 * np.sqrt(loads) < ratio < 1.25 * np.sqrt(loads)
-    assert any("Stated too small" in line for line in remarks(found[0]))
+    assert any("Stated too small" in line for line in bootstrap_remarks(found[0]))
     crowded = replace(found[0], poses=20)  # for as many parameters
-    assert any("does not show that the stated ones" in line for line in remarks(crowded))
+    assert any("does not show that the stated ones" in line for line in bootstrap_remarks(crowded))
     independent = drawn(fitted(), 50)
-    assert any("can be used" in line for line in remarks(independent))
+    assert any("can be used" in line for line in bootstrap_remarks(independent))
 
 
 def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
@@ -121,7 +121,7 @@ def test_its_document_says_which_parameters_are_compared() -> None:
     c = campaign("transmission_error", "absolute", poses=20)
     model = baseline(c.cell, c.readings, "absolute")
     found = drawn(fit(model, c.readings, "absolute"), 20)
-    document = to_json(found)
+    document = bootstrap_json(found)
     rows = document["parameters"]
     assert isinstance(rows, list)
     assert [r["name"] for r in rows][:2] == ["base_frame.x", "base_frame.y"]
@@ -130,4 +130,4 @@ def test_its_document_says_which_parameters_are_compared() -> None:
         if r["ratio"] is not None:
             assert r["ratio"] == pytest.approx(r["bootstrap_std"] / r["std"])
     assert found.fit.uncertainty.inflated
-    assert any("larger than the noise" in line for line in remarks(found))
+    assert any("larger than the noise" in line for line in bootstrap_remarks(found))

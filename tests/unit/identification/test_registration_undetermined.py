@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.registration import register
-from hilcal.present.text_registration import registration_lines
+from hilcal.present.registration import registration_lines
 from tests.unit.identification.test_registration import pose_of, seen, told
 
 BASE = pose_of(Rotation.from_rotvec([0.4, -0.2, 2.0]).as_matrix(), [0.4, -0.4, 1.9])

@@ -12,7 +12,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.gate import examine
 from hilcal.identification.registration import register
-from hilcal.present.verdict_words import message
+from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.refinement import refine

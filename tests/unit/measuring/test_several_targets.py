@@ -13,7 +13,7 @@ from hilcal.measuring.devices import TargetLostError, TrackerSample, WrenchSampl
 from hilcal.measuring.progress import ReadingStored, Remark
 from hilcal.measuring.rig import Rig
 from hilcal.measuring.run import run
-from hilcal.present.text_info import event_words
+from hilcal.present.campaign import event_words
 from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile

@@ -15,12 +15,13 @@ from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.full_prediction import full_prediction
-from hilcal.present import text, text_refine
 from hilcal.present.build_story import Chapter, build_story
-from hilcal.present.diagnosis_document import to_json as diagnosis_json
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis import diagnosis_report, suspects_table
+from hilcal.present.diagnosis_json import to_json as diagnosis_json
+from hilcal.present.fit import before_and_after, errors, fit_report, worst_poses
+from hilcal.present.verdict import message
 from hilcal.present.viewer import words
-from hilcal.present.viewer.digest import Limits, digest
+from hilcal.present.viewer.digest import digest
 from tests.support.campaigns import campaign
 
 
@@ -53,7 +54,7 @@ def test_before_a_deflection_is_what_was_measured(deflections):
     before = error_before(deflections)
     assert before.rms_m == pytest.approx(float(np.sqrt(np.mean(measured**2))), rel=1e-9)
     assert before.max_m == pytest.approx(float(measured.max()), rel=1e-9)
-    said = text.before_and_after(deflections)
+    said = before_and_after(deflections)
     assert said.startswith(f"Deflections of {numbers.length(before.rms_m)} rms were measured;")
     assert f"the model leaves {numbers.length(deflections.error.rms_m)} (noise" in said
 
@@ -66,13 +67,13 @@ def test_before_of_positions_is_the_rigid_arm_in_frames_of_its_own(absolute):
     assert absolute.error.rms_m < 0.2 * before.rms_m
     assert 0.1 * np.abs(turned).max() < before.rms_m < 3.0 * np.abs(turned).sum(axis=1).max()
     assert "The rigid nominal arm, its frames fitted alone, is off by" in shown(
-        *text.fit_report(absolute)
+        *fit_report(absolute)
     )
 
 
 def test_the_table_and_the_document_have_it(absolute):
     before = error_before(absolute)
-    table = shown(text.errors(absolute))
+    table = shown(errors(absolute))
     assert f"before: rigid nominal arm {numbers.length(before.rms_m)}" in table
     assert to_json(absolute)["error"]["before"] == before.to_json()
 
@@ -82,9 +83,11 @@ def test_a_p_value_reads_the_same_wherever_it_stands(absolute):
     lead = d.suspects[0]
     value = numbers.chance(lead.score.p_value)
     assert numbers.p_equals(lead.score.p_value) in message(d)
-    assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(text_refine.suspects_table(d)))
-    revision = build_story([Chapter(1, None, absolute, d)]).revisions[0]
-    assert f"| {value} |" in words.suspects(revision)
+    assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(d)))
+    story = build_story([Chapter(1, None, absolute, d)])
+    revision = story.revisions[0]
+    panel = words.verdict(digest(story), revision)
+    assert f"| {value.replace('<', chr(92) + '<')} |" in panel
     assert numbers.p_equals(lead.score.p_value) in revision.message
 
 
@@ -102,13 +105,14 @@ def test_how_many_were_tested_stands_where_p_values_do(absolute):
     tests = diagnosis_json(d)["tests"]
     assert tests["count"] == sum(s.score.rank > 0 for s in d.suspects)
     assert tests["each"] == pytest.approx(FALSE_ALARM / tests["count"])
-    report = shown(*text_refine.diagnosis_report(d))
+    report = shown(*diagnosis_report(d))
     assert f"{tests['count']} effects were tested: one counts from p < " in report
     assert f"which is 0.001 / {tests['count']}" in report
     kinds = [v for v in d.misfit_breakdown if v.group not in ("pose", "direction")]
     assert f"{len(kinds)} variables were tested" in report
     story = build_story([Chapter(1, None, absolute, d)])
-    assert (story.revisions[0].tested, story.revisions[0].level) == (tests["count"], FALSE_ALARM)
+    details = words.details(digest(story), story.revisions[0])
+    assert f"{tests['count']} effects were tested" in details
 
 
 def test_a_suspect_counts_only_below_the_shared_level(absolute):
@@ -117,9 +121,9 @@ def test_a_suspect_counts_only_below_the_shared_level(absolute):
 
 
 def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
-    worst = text.worst_poses(full_prediction(absolute))[0]
+    worst = worst_poses(full_prediction(absolute))[0]
     story = build_story([Chapter(1, None, absolute, None)])
-    d = digest(story, Limits())
+    d = digest(story)
     assert worst.pose in absolute.readings.pose_names
     assert story.pose_name(d.worst(story.revisions[0])) == worst.pose
     assert f"Worst: pose {worst.pose}, load {worst.load}," in words.details(d, story.revisions[0])

@@ -13,20 +13,27 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.build_story import Chapter, build_story, of_left_out, regressor
 from hilcal.present.charts import style
-from hilcal.present.charts.added_variable import added_variable
-from hilcal.present.charts.correlations import correlations, parameter_correlations
-from hilcal.present.charts.error_per_revision import error_per_revision
-from hilcal.present.charts.measured_predicted import measured_predicted
-from hilcal.present.charts.misfit import misfit_curve, misfit_shares
-from hilcal.present.charts.noise_check import noise_check
-from hilcal.present.charts.readings_drawn import drawn
-from hilcal.present.charts.residuals import (
+from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.evidence import (
+    added_variable,
+    correlations,
+    curve_chart,
+    misfit_shares,
+    noise_check,
+    parameter_correlations,
+)
+from hilcal.present.charts.readings import (
+    LONGEST,
+    drawn,
+    magnification,
+    measured_predicted,
     residual_by_joint,
     residual_by_load,
     residual_by_pose,
     residual_by_time,
+    workspace,
 )
-from hilcal.present.charts.workspace import LONGEST, magnification, workspace
+from hilcal.present.story import LEVEL_NAMES
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -100,7 +107,7 @@ def test_levels_have_a_colour_and_a_mark():
     figure = residual_by_pose(told, told.revisions[0])
     limits = (0.0, *style.sigma_limits(), np.inf)
     for trace in figure.data:
-        k = style.LEVEL_NAMES.index(trace.name)
+        k = LEVEL_NAMES.index(trace.name)
         assert (trace.marker.color, trace.marker.symbol) == (style.LEVELS[k], style.SYMBOLS[k])
         y = np.asarray(trace.y, float)
         assert ((y >= limits[k] - 1e-5) & (y <= limits[k + 1] + 1e-5)).all()
@@ -172,7 +179,7 @@ def test_shares_and_curves_of_the_misfit():
         [100 * v.share for v in d.misfit_breakdown if v.share >= 0.01][:12],
     )
     for curve in (ANGLE, LOAD):
-        (trace,) = misfit_curve(curve).data
+        (trace,) = curve_chart(curve).data
         np.testing.assert_allclose(np.asarray(trace.y, float), curve.y)
         np.testing.assert_allclose(np.asarray(trace.error_y.array, float), curve.error)
 

@@ -17,10 +17,10 @@ from playwright.sync_api import Browser
 
 from hilcal import numbers
 from hilcal.calibration.budget import budget
+from hilcal.present.document import Chart, Table
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import first_screen, left_out_errors, limit_words
 from hilcal.present.html.page import page as page_of
-from hilcal.present.html.parts import Chart, Table
 from hilcal.present.html.sections import sections
 from hilcal.store.overview import Instrument
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
@@ -80,7 +80,7 @@ def large(m: ReportContent) -> ReportContent:
     told = m.story
     last = told.revisions[-1]
     many = tuple(
-        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "", model=("a",))
+        replace(last, revision=k, change="+ periodic_joint_compliance" if k else "")
         for k in range(12)
     )
     named = tuple(f"calibration pose number {k:03d}" for k in range(len(told)))
@@ -170,8 +170,8 @@ def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
     assert worst in first_screen(m).answers[1][1]
     size = np.linalg.norm(m.left_out.residual, axis=1)
     np.testing.assert_allclose(np.sort(size), np.sort(error), rtol=1e-9)
-    by_pose = next(p for p in sections(m)[1].parts if isinstance(p, Chart))
-    drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.json)["data"]])
+    by_pose = next(p for p in sections(m)[1].blocks if isinstance(p, Chart))
+    drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.figure.to_json())["data"]])
     np.testing.assert_allclose(np.sort(drawn) ** 2, np.sort(m.left_out.whitened_norm2), rtol=1e-5)
 
 
@@ -188,7 +188,7 @@ def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(
     rejected = [s.effect for s in m.diagnosis.suspects if not s.passes]
     assert rejected
     assert not any(f"Added variable: {name}" in short for name in rejected)
-    rows = [row for p in sections(m)[-1].parts if isinstance(p, Table) for row in p.rows]
+    rows = [row for p in sections(m)[-1].blocks if isinstance(p, Table) for row in p.rows]
     known = [p for p in m.fit.parameters if p.identifiable]
     assert [name for name, *_ in rows] == [p.name for p in known] != []
     for p, (_, value, std, unit) in zip(known, rows, strict=True):

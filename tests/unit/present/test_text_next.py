@@ -4,7 +4,7 @@ import pytest
 
 from hilcal.design.discriminated_pairs import not_ruled_out
 from hilcal.design.next import PairPower
-from hilcal.present.text_next import power_rows, summary
+from hilcal.present.plan import power_rows, powers_summary
 
 A, B = "base_compliance", "link_compliance"
 SURE, WEAK = PairPower(A, B, 0.2, 0.9999, False), PairPower(B, A, 0.1, 0.45, False)
@@ -24,7 +24,7 @@ NEVER = PairPower(B, A, 0.02, 0.05, True)
     ],
 )
 def test_the_sentence_follows_from_the_table(powers: tuple[PairPower, ...], words: str) -> None:
-    said = summary(powers, 12, 40)
+    said = powers_summary(powers, 12, 40)
     assert said.startswith("40 readings at 12 poses")
     assert words in said
     assert "100 %" not in said

@@ -17,13 +17,13 @@ from hilcal.design.summary import (
     PredictedParameter,
 )
 from hilcal.design.timing import Duration
-from hilcal.present.text_plan import certified, enough, order_remark, plan_report
+from hilcal.present.plan import certified, enough, order_remark, plan_report
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
-from hilcal.tables.plan_csv import plan_csv
 from hilcal.tables.table import read_table
+from hilcal.tables.write import plan_csv
 
 ORDER = Confounding(60, 0.0251**0.5, "fz", -3.6, 1000.0, 20e-6 / 3600, 5.7e-6, -2e-8, 17e-6 / 3600)
 SUMMARY = PlanSummary(

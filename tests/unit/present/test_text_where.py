@@ -13,10 +13,9 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.text import where_table
-from hilcal.present.text_refine import diagnosis_report
-from hilcal.present.text_unknown import curves
-from hilcal.present.verdict_words import message
+from hilcal.present.diagnosis import curves, diagnosis_report
+from hilcal.present.fit import where_table
+from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, cell_of, noiseless, plan, with_noise, world_of
 
 

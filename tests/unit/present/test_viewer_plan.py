@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.present.viewer import arm_shapes, plan_style, plan_words, style
+from hilcal.present.viewer import arm_shapes, plan_scene, plan_stream, style
 from hilcal.present.viewer.plan_digest import HIDDEN, SEEN, TURNED, UNKNOWN, plan_digest
 from hilcal.present.viewer.plan_stream import record_plan
 from hilcal.robot.chain import evaluate
@@ -100,8 +100,8 @@ def test_a_reflector_that_looks_away_is_told_from_a_hidden_one(shadowed):
     d = plan_digest(cell, config.model_copy(update={"sight": sight}), PLAN, SUMMARY)
     status = dict(zip((s.pose for s in PLAN.steps), d.sight.tolist(), strict=True))
     assert status == {REFERENCE: TURNED, "p1": HIDDEN, "p2": SEEN, "p3": TURNED}
-    assert "incidence" in plan_words.step_card(d, 0)
-    assert "screen between" in plan_words.step_card(d, 1)
+    assert "incidence" in plan_stream.step_card(d, 0)
+    assert "screen between" in plan_stream.step_card(d, 1)
     assert [bool(w) for w in d.why] == [s != SEEN for s in d.sight]
 
 
@@ -113,8 +113,8 @@ def test_without_a_tracker_nothing_is_claimed(tmp_path):
     d = plan_digest(cell, config, PLAN, SUMMARY)
     assert set(d.sight.tolist()) == {UNKNOWN}
     assert not d.unseen.any()
-    assert "not known" in plan_words.overview(d)
-    assert "not known" in plan_words.step_card(d, 0)
+    assert "not known" in plan_stream.overview(d)
+    assert "not known" in plan_stream.step_card(d, 0)
     assert not any("seen" in v[0] for v in rows(path, "/world/label", "Points3D:labels").values())
 
 
@@ -146,7 +146,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(shadowed, recording):
     colors = [rgb(c) for c in rows(recording, "/world/target/beads", "Points3D:colors")[0]]
     pairs = list(dict.fromkeys((s.pose, s.load) for s in PLAN.steps))
     assert len(places) == len(pairs) == 8
-    by_load = dict(zip(PLAN.loads, plan_style.load_colors(PLAN.loads).tolist(), strict=True))
+    by_load = dict(zip(PLAN.loads, plan_scene.load_colors(PLAN.loads).tolist(), strict=True))
     assert len({tuple(c) for c in by_load.values()}) == 3
     for place, color, (pose, load) in zip(places, colors, pairs, strict=True):
         assert list(color) == by_load[load]

@@ -10,7 +10,7 @@ from rerun.chunk import RrdReader
 from hilcal.design.detectable import DetectableEffect
 from hilcal.design.summary import PredictedParameter
 from hilcal.errors import InputError
-from hilcal.present.viewer import plan_layout, plan_style, style
+from hilcal.present.viewer import plan_layout, plan_scene, style
 from hilcal.present.viewer.plan_digest import plan_digest
 from hilcal.present.viewer.plan_stream import record_plan
 from hilcal.present.viewer.stream import executable
@@ -36,7 +36,7 @@ __all__ = ["recording", "shadowed", "strict"]  # fixtures
 
 def test_the_schedule_has_every_reading_at_its_minute_in_its_loads_series(shadowed, recording):
     minutes = plan_digest(*shadowed, PLAN, SUMMARY).time / 60.0
-    colors = plan_style.load_colors(PLAN.loads)
+    colors = plan_scene.load_colors(PLAN.loads)
     drawn = {}
     for k, load in enumerate(PLAN.loads):
         at = rows(recording, f"/schedule/load{k}", "Scalars:scalars")

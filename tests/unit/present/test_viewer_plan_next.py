@@ -6,7 +6,7 @@ from rerun.chunk import RrdReader
 
 from hilcal.config import Obstacle
 from hilcal.design.next import PairPower
-from hilcal.present.viewer import eye
+from hilcal.present.viewer import layout
 from hilcal.present.viewer.plan_digest import plan_digest
 from hilcal.present.viewer.plan_stream import record_plan
 from tests.support.viewer_plan import PLAN, SUMMARY, configured, rows, strict
@@ -36,9 +36,9 @@ def test_the_suspects_and_their_powers_come_before_the_plan(tmp_path):
     text = rows(tmp_path / "next.rrd", "/words/plan", "TextDocument:text")[0][0]
     lines = text.replace("\\", "").splitlines()
     assert lines[0] == "### Which is it: joint_tilt_compliance or link_compliance?"
-    assert "| joint_tilt_compliance | link_compliance | 74 % | 98 % |" in lines[1:5]
-    assert "| link_compliance | joint_tilt_compliance | 56 % | not in this cell |" in lines[1:5]
-    assert any(line.startswith("**Plan: 3 poses") for line in lines[5:])
+    assert "| joint_tilt_compliance | link_compliance | 74 % | 98 % |" in lines[1:6]
+    assert "| link_compliance | joint_tilt_compliance | 56 % | not in this cell |" in lines[1:6]
+    assert any(line.startswith("### Plan: 3 poses") for line in lines[5:])
 
 
 def test_a_plan_without_suspects_begins_with_itself(tmp_path):
@@ -63,8 +63,8 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
     record_plan(cell, config, PLAN, SUMMARY, path)
     d = plan_digest(cell, config, PLAN, SUMMARY)
     arm = d.bodies[:, 1:, :3, 3].reshape(-1, 3)
-    assert eye.hidden(preferred, arm, config.obstacles).mean() > 0.3
-    assert eye.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02
+    assert layout.hidden(preferred, arm, config.obstacles).mean() > 0.3
+    assert layout.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02
 
 
 @pytest.mark.parametrize(
@@ -77,15 +77,15 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
 def test_what_stands_behind_an_obstacle_is_hidden_and_nothing_else(thing):
     behind, above, aside, before = [0, 0, 0.5], [0, 0, 2.0], [0, 1.5, 0.5], [1.5, 0, 0.5]
     points = np.array([behind, above, aside, before], dtype=float)
-    found = eye.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
+    found = layout.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
     assert found.tolist() == [True, False, False, False]
 
 
 def test_the_eye_is_as_near_as_shows_everything():
     look, way = np.array([0.0, 0.0, 0.5]), np.array([1.0, -1.3, 0.5])
     corners = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.6, 0.6) for z in (0.0, 1.0)])
-    place = eye.near(look, way, corners)
-    assert eye.in_view(place, look, corners).all()
-    assert not eye.in_view(look + 0.9 * (place - look), look, corners).all()
+    place = layout.near(look, way, corners)
+    assert layout.in_view(place, look, corners).all()
+    assert not layout.in_view(look + 0.9 * (place - look), look, corners).all()
     behind = place + (place - look)
-    assert not eye.in_view(place, look, behind[None])[0]
+    assert not layout.in_view(place, look, behind[None])[0]

@@ -19,9 +19,8 @@ from hilcal import limits
 from hilcal.cli import main
 from hilcal.errors import InputError
 from hilcal.store.rows import text_crc
-from hilcal.tables.mapping import load_mapping
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.sheets import open_grid
+from hilcal.tables.files import open_grid
+from hilcal.tables.mapping import FileFormat, load_mapping
 from tests.support.unguarded import unguarded
 from tests.unit.data.test_file_versions import HASHED, unpacked
 

@@ -53,22 +53,22 @@ from hilcal.errors import InputError
 from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.present.charts import style as chart_style
-from hilcal.present.charts.readings_drawn import escaped as in_chart
+from hilcal.present.charts.readings import escaped as in_chart
+from hilcal.present.document import Chart, Items, Section, Words, table
 from hilcal.present.html import page
 from hilcal.present.html.first_screen import FirstScreen
-from hilcal.present.html.parts import Items, Section, Words, chart, table
 from hilcal.present.progress import SafeConsole, counting, working
 from hilcal.present.viewer import style as viewer_style
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.rows import text_crc
-from hilcal.tables.grid import read_text
+from hilcal.tables.files import open_grid
 from hilcal.tables.guessing.proposal import Proposal
-from hilcal.tables.mapping_sections import FileFormat
-from hilcal.tables.plan_csv import plan_csv
+from hilcal.tables.mapping import FileFormat
 from hilcal.tables.table import read_table, write_table
-from hilcal.tables.tabular import read_parquet, write_columns
+from hilcal.tables.text import read_text
+from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT
 from tests.support.readings_cases import make_arm, simple
@@ -313,8 +313,8 @@ def report(name: str) -> str:
     parts = (
         *(Words(name, kind) for kind in ("text", "note", "heading", "strong", "code")),
         Items((name,)),
-        table(name, (name, "b"), [(name, name)]),
-        chart(name, figure),
+        table(name, "b", rows=[(name, name)], caption=name),
+        Chart(name, figure),
     )
     first = FirstScreen(name, "good", ((name, name),), (), name, True)
     return page.render(name, name, first, (Section("a", name, parts),))
@@ -449,7 +449,7 @@ def test_tables_and_plans_refuse_a_name_or_keep_it(name: str) -> None:
     grid = as_csv(["a", "b"], [said, 1])
     refused_or(lambda: read_text("g.csv", grid, FileFormat()).text("a")[0], name, "grid")
     pq.write_table(pa.table({"pose": [name]}), folder / "p.parquet")
-    refused_or(lambda: read_parquet(folder / "p.parquet", lambda h: (h, [])).text["pose"][0], name)
+    refused_or(lambda: open_grid(folder / "p.parquet", FileFormat()).text("pose")[0], name)
     text = Plan((name,), np.zeros((1, 6)), (Step(name, "none"),)).to_json()
     refused_or(lambda: read_plan(text, "plan.json").pose_names[0].strip(), name, "plan")
 

@@ -11,7 +11,7 @@ from nicegui import ui
 from nicegui.testing import User, user_simulation
 
 from hilcal.diagnosis.diagnosis import Reason
-from hilcal.present.verdict_words import HEADLINES
+from hilcal.present.verdict import HEADLINES
 from hilcal.workbench.page import Shared, View
 from hilcal.workbench.session import Session
 from tests.support.bench_cases import few_effects, stored

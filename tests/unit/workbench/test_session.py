@@ -8,12 +8,12 @@ import pytest
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.prior import fitted_with
+from hilcal.cli.fits import fitted_with
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import carried_prior
-from hilcal.present.diagnosis_document import to_json
-from hilcal.present.two_revisions import left_out_m, two_revisions, verdict_of
+from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
+from hilcal.present.diagnosis_json import to_json
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
 from hilcal.workbench.session import Session

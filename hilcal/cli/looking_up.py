@@ -1,0 +1,220 @@
+"""`effects`, `config`, `study`: the catalogue, every key of a cell, the program's mathematics."""
+
+import keyword
+import re
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from drivers.geocom import Options as GeoComOptions
+from drivers.ur_link.options import UrOptions
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    OneWorker,
+    Scheduler,
+    argument,
+    catalogue_with,
+    check_seed,
+    one_by_default,
+    option,
+)
+from hilcal.cli.terminal import terminal
+from hilcal.config import reference
+from hilcal.effects import template
+from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
+from hilcal.effects.check import NAME
+from hilcal.effects.example import ROBOT, example_cell, example_states
+from hilcal.effects.protocol import Effect
+from hilcal.effects.written import option_defaults, written
+from hilcal.errors import InputError
+from hilcal.identification.fit_document import plain
+from hilcal.names import quoted
+from hilcal.present.document import Table, note, table
+from hilcal.present.preparing import (
+    reference_page,
+    section_report,
+    sections_json,
+    sections_overview,
+)
+from hilcal.present.progress import counting
+from hilcal.toml import Section
+from hilcal.whole_file import replace_file
+
+OPTIONS_NOTE = (
+    'options are given in parentheses: --effects "joint_compliance, hysteresis(joints=1-3)"; no '
+    "default: none, or one that follows from the readings."
+)
+
+
+def effects(
+    ctx: typer.Context,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """List the effects that a model can have; `new` begins one of your own."""
+    if ctx.invoked_subcommand is not None:
+        return
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    cell = example_cell()
+    states = example_states(cell)
+    made = [kind(cell, states) for kind in catalogue.effects]
+    defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
+    out = table("effect", "law", left=(0, 1))
+    for e in made:
+        units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))
+        needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
+        count = len(e.parameters)
+        facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
+        out.add(e.name, f"{e.summary}\n{facts}")
+    t.show(out)
+    notes = [
+        f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
+        *(
+            f"from {file.path}: {', '.join(e.name for e in file.effects)}"
+            for file in catalogue.files
+        ),
+    ]
+    t.show(note("\n".join(notes)))
+    t.show(["", _options_table(made, defaults)])
+    t.show(note(OPTIONS_NOTE))
+    t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in made]})
+
+
+def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
+    """Return the options of effects; an option that others have too is explained once."""
+    out = table("effect", "option", "what it chooses", left=(0, 1, 2))
+    explained: dict[tuple[str, str], str] = {}
+    for e in made:
+        for name, meaning in e.option_help.items():
+            first = explained.setdefault((name, meaning), e.name)
+            words = meaning if first == e.name else f"as for {first}"
+            default = written(defaults[e.name][name])
+            out.add(e.name, name, f"{words}\ndefault: {default}" if default else words)
+    return out
+
+
+def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> dict[str, object]:
+    shown = [{"name": p.name, "unit": p.unit, "meaning": p.meaning} for p in e.parameters]
+    return {
+        "name": e.name,
+        "law": e.summary,
+        "elastic": e.elastic,
+        "needs": list(e.needs),
+        "options": list(e.option_help),
+        "defaults": plain(defaults),
+        "option_help": dict(e.option_help),
+        "parameters": shown,
+        "plausible": None
+        if not np.isfinite(e.most())
+        else {q.unit: e.most() * q.scale for q in e.parameters},
+        "source": _source(type(e), catalogue),
+    }
+
+
+def _source(kind: type[Effect], catalogue: Catalogue) -> str:
+    """Return where an effect is from: "built in", "installed", or a file."""
+    if file := catalogue.file_of(kind.name):
+        return file.path
+    return "built in" if kind in BUILT_IN else "installed"
+
+
+def new(
+    name: Annotated[str, argument("NAME", "Lower case, digits and _.")],
+    output: Annotated[
+        Path | None, option("-o --output FILE.py", "The file; NAME.py by default.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Write a file with one effect that works as it stands, to be changed into your own."""
+    t = terminal(as_json)
+    path = Path(f"{name}.py") if output is None else output
+    _check_name(name)
+    if path.suffix != ".py":
+        raise InputError(f"{path}: effects are in a Python file; end its name in .py")
+    replace_file(path, template_of(name), must_be_new=True)
+    t.show(
+        f"{path} has the effect {name}: change its law, then try it with:\n"
+        f"  hilcal effects --effects-from {quoted(path)}\n"
+        f"  hilcal diagnose RUN.hilcal --effects-from {quoted(path)}"
+    )
+    t.document({"written": str(path), "effect": name})
+
+
+def _check_name(name: str) -> None:
+    """Refuse a name that an effect cannot have.
+
+    Raises:
+        InputError: lists what would be valid.
+    """
+    if not NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise InputError(
+            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
+            "Python's own"
+        )
+    if name in installed().names:
+        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
+
+
+def template_of(name: str) -> str:
+    """Return the text of the template with the effect's name, and its class called after it."""
+    class_name = "".join(part.capitalize() for part in name.split("_"))
+    while class_name in vars(template):  # a name that the file uses for something else
+        class_name += "Effect"
+    content = Path(str(template.__file__)).read_text(encoding="utf-8")
+    names = {"template": name, "Template": class_name}
+    return re.sub(r"\b[Tt]emplate\b", lambda found: names[found[0]], content)
+
+
+DRIVERS_OWN: dict[str, type[Section]] = {
+    "robot.options": UrOptions,
+    "tracker.options": GeoComOptions,
+}
+"""Keys of the drivers that come with the program, by section."""
+
+
+def config(
+    section: Annotated[str | None, argument("SECTION", "One of them, e.g. tracker.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Explain the sections and keys of CELL.toml: unit, default, example."""
+    t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
+    if section is None:
+        t.show(sections_overview(known))
+        t.document(sections_json(known))
+        return
+    found = reference.table(section, known)
+    t.show(section_report(found))
+    t.document(sections_json((found,)))
+
+
+def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
+    """Write the page of the reference."""
+    replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
+
+
+def scaling(
+    runs: Annotated[int, option("--runs", "Monte-Carlo runs.")] = 2000,
+    seed: Annotated[int, option("--seed", "Of the random numbers.")] = 1,
+    workers: OneWorker = None,
+    scheduler: Scheduler = None,
+    as_json: Json = False,
+) -> None:
+    """Show what the scalings none, gu and gc do to the same data."""
+    from hilcal.engine.engine import open_engine
+    from hilcal.study.scaling import check, experiments, scaling_study
+    from hilcal.study.scaling_table import table
+
+    t = terminal(as_json)
+    check(runs)
+    what = f"experiments of {runs} campaigns, each with every scaling"
+    with (
+        open_engine(*one_by_default(workers, scheduler)) as engine,
+        counting(t.progress, what, experiments()) as advance,
+    ):
+        rng = np.random.default_rng(check_seed(seed))
+        study = scaling_study(rng, runs, engine=engine, advance=advance)
+    t.show(table(study))
+    t.document(study.to_json())

@@ -1,0 +1,272 @@
+"""`report`, `view` and `workbench`: the story of a campaign as a page, in rerun, to work at."""
+
+import os
+import shlex
+import shutil
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Annotated
+
+from hilcal.campaign.campaign import Campaign
+from hilcal.cli.fits import check_record, record_story
+from hilcal.cli.options import (
+    EffectsFrom,
+    Json,
+    Record,
+    Revision,
+    Run,
+    argument,
+    catalogue_with,
+    option,
+)
+from hilcal.cli.terminal import Terminal, terminal, told_to_end
+from hilcal.errors import InputError
+from hilcal.names import quoted
+from hilcal.present.build_story import build_story
+from hilcal.present.live_viewer import PORT, LiveViewer
+from hilcal.present.progress import working
+from hilcal.present.registration import covariance_words
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.schema import is_campaign
+from hilcal.tables.units import parse_length
+
+
+def report(
+    run: Run,
+    later: Annotated[
+        Path | None,
+        argument("[LATER.hilcal]", "A later campaign of the same arm: compare the two."),
+    ] = None,
+    output: Annotated[
+        Path | None, option("-o --output F.html", "The page; RUN.html unless given.")
+    ] = None,
+    limit: Annotated[
+        str | None,
+        option(
+            "--limit LENGTH",
+            'The largest 3-D position error allowed, e.g. "0.1 mm": the page says passed or '
+            "failed.",
+        ),
+    ] = None,
+    validation: Annotated[
+        Path | None,
+        option(
+            "--validation OTHER.hilcal",
+            "A campaign that was never fitted: how well is it predicted?",
+        ),
+    ] = None,
+    operator: Annotated[str, option("--operator NAME", "Who answers for the measurement.")] = "",
+    revision: Revision = None,
+    appendix: Annotated[
+        bool,
+        option(
+            "--appendix",
+            "Also what only another expert asks for: rejected suspects, each joint, "
+            "correlations, scalings, commands, hashes of revisions.",
+        ),
+    ] = False,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
+    from hilcal.write_report import Asked, write_report
+
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    limit_m = None if limit is None else parse_length(limit, "--limit")
+    output = run.with_suffix(".html") if output is None else output
+    with ExitStack() as stack, working(t.progress) as say:
+
+        def opened(path: Path | None) -> Campaign | None:
+            if path is None:
+                return None
+            return stack.enter_context(Campaign.open(path, catalogue, read_only=True))
+
+        first = stack.enter_context(Campaign.open(run, catalogue, read_only=True))
+        asked = Asked(opened(later), opened(validation), limit_m, operator, revision, appendix)
+        done = write_report(first, output, asked, say)
+    t.show(f"{done.headline}.")
+    if done.limit:
+        t.show(done.limit)
+    t.show(f"Report: {output} ({output.stat().st_size / 1e6:.1f} MB); print it for a PDF.")
+    t.document(
+        {
+            "report": str(output),
+            "bytes": output.stat().st_size,
+            "headline": done.headline,
+            "passed": done.passed,
+            "verdict": done.verdict,
+        }
+    )
+
+
+ENDING = 5.0
+"""How long a server of a page or a story may delay the end, s."""
+
+
+def view(
+    run: Run,
+    revision: Revision = None,
+    record: Record = None,
+    port: Annotated[int, option("--port", "Port to serve viewers on.")] = PORT,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Tell the story of the revisions in rerun."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    check_record(record)
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        chapters = o.chapters(say, revision)
+    if record is not None:
+        record_story(t, chapters, record)
+        t.document({"recording": str(record), "revisions": [c.number for c in chapters]})
+        return
+    with working(t.progress) as say:
+        say("preparing the viewer")
+        from hilcal.present.viewer import serve  # loads the viewer's library, which takes a while
+
+        story = build_story(chapters)
+    guard = _end_of_process()  # a viewer that does not answer may delay it; the campaign is closed
+    try:
+        with (
+            told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
+            serve(story, port=port) as served,
+        ):
+            t.show("Open the viewer with:")
+            t.command(f"{viewer_command()} {served.url}")
+            t.document({"url": served.url, "revisions": [c.number for c in chapters]})
+            sys.stdout.flush()
+            t.notice("Serving until Ctrl-C.")
+            wait()
+            guard.start()
+    finally:
+        guard.cancel()
+
+
+def _end_of_process() -> threading.Timer:
+    """Return what ends the process, once started, where its threads do not end by themselves."""
+    guard = threading.Timer(ENDING, os._exit, (0,))
+    guard.daemon = True
+    return guard
+
+
+@contextmanager
+def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]:
+    """Let a live viewer follow what the block does, where it is asked for.
+
+    Args:
+        t: where it is said how to open it, and what is wrong with it.
+        asked: whether somebody wants it.
+        run: the campaign; the recording goes beside it.
+    """
+    if not asked:
+        yield None
+        return
+    live = LiveViewer(live_recording(run), t.notice)
+    try:
+        with working(t.progress) as say:
+            say("starting the live viewer")
+            live.start()
+        if live.url is not None:
+            t.show("Watch it on this machine, now or later, with:")
+            t.command(f"{viewer_command()} {live.url}")
+        yield live
+    finally:
+        live.close()
+        if live.record.exists():
+            t.notice(f"recorded {live.record}; open it with: {opening(live.record)}")
+
+
+def live_recording(run: Path) -> Path:
+    """Return where the recording of a live viewer goes: beside the campaign."""
+    return run.with_name(f"{run.stem}.live.rrd")
+
+
+def opening(recording: Path) -> str:
+    """Return the command that opens a recording."""
+    return shlex.join([viewer_command(), str(recording)])
+
+
+def viewer_command() -> str:
+    """Return how to start the viewer that came with the program."""
+    beside = Path(sys.executable).with_name("rerun")
+    if shutil.which("rerun") is None and beside.is_file():
+        return str(beside)
+    return "rerun"
+
+
+def workbench(
+    run: Annotated[Path, argument("RUN.hilcal|TABLE", "The campaign file, or a table.")],
+    config: Annotated[
+        Path | None, option("--config CELL.toml", "Begin with a table, measured in this cell.")
+    ] = None,
+    kind: Annotated[
+        str, option("--format FORMAT", "Of the table, as hilcal import takes it.")
+    ] = "table",
+    second: Annotated[Path | None, option("--second TABLE", "The second file of a table.")] = None,
+    output: Annotated[
+        Path | None, option("-o --output RUN.hilcal", "Of a table; TABLE.hilcal beside it else.")
+    ] = None,
+    port: Annotated[
+        int | None, option("--port", "Port on this machine; 8787, or a free one, unless given.")
+    ] = None,
+    no_browser: Annotated[
+        bool, option("--no-browser", "Do not open the page, only print its address.")
+    ] = False,
+    effects_from: EffectsFrom = None,
+    as_json: Json = False,
+) -> None:
+    """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    from hilcal.workbench.guard import UNUSED_S
+    from hilcal.workbench.server import require_nicegui, serve
+    from hilcal.workbench.session import Session
+
+    require_nicegui()
+    if config is not None:
+        table, run = run, run.with_suffix(".hilcal") if output is None else output
+        _import(t, table, config, run, kind, second)
+    elif kind != "table" or second is not None or output is not None:
+        raise InputError("--format, --second and -o are of a table; give --config CELL.toml, too")
+    elif run.is_file() and not is_campaign(run):
+        raise InputError(f"{run}: no campaign; to begin with a table, give --config CELL.toml, too")
+    with CampaignFile.open(run, read_only=True) as file:
+        file.readings()  # a file without any is refused before a page is opened
+
+    def told(url: str) -> None:
+        t.show("Open the workbench with:")
+        t.command(url)
+        t.document({"url": url, "run": str(run)})
+        sys.stdout.flush()
+        t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
+
+    if not serve(Session(run, catalogue), port, told, browser=not no_browser):
+        t.notice("Nobody opened it: its address is no longer valid. Start it again.")
+    _end_of_process().start()  # a fit in a thread may delay it; what is stored is durable
+
+
+def _import(
+    t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
+) -> None:
+    """Make the campaign file of a table; one that is there stays.
+
+    Raises:
+        InputError: there is one, or anything in table or cell cannot be right.
+    """
+    if run.exists():
+        raise InputError(
+            f"{run}: the file exists, and is left as it is; open it with hilcal workbench "
+            f"{quoted(run)}, or name another one for the table with -o"
+        )
+    from hilcal.import_campaign import import_campaign
+
+    with working(t.progress) as say:
+        found = import_campaign(table, config, run, kind, second, say=say)
+    t.notice(
+        f"{len(found.readings)} readings of {table} are in {run} now; the table is not changed."
+    )
+    for note in (*found.notes, covariance_words(found.parts, found.noise)):
+        t.notice(note)

@@ -1,0 +1,140 @@
+"""A diagnosis as JSON: in documents of commands and in campaign files."""
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
+from hilcal.diagnosis.minimum_detectable_effect import Strength
+from hilcal.diagnosis.noise import PureError
+from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.present.verdict import message
+
+
+def to_json(d: Diagnosis) -> dict[str, object]:
+    """Return the keys of the contract, and all else that a diagnosis holds."""
+    return {
+        "model": list(d.fit.model.named),
+        "verdict": d.verdict,
+        "message": message(d),
+        "reason": d.reason,
+        "variance_factor": d.fit.variance_factor,
+        "variance_factor_interval": list(d.fit.variance_factor_interval),
+        "predictable_share": d.predictable_share,
+        "where": [
+            {"variable": v.variable, "share": v.share, "p_value": v.p_value}
+            for v in d.misfit_breakdown
+        ],
+        "suspects": [suspect_json(s) for s in d.suspects],
+        "not_shown": list(d.not_shown),
+        "tests": {
+            "count": d.tested,
+            "level": FALSE_ALARM,
+            "each": FALSE_ALARM / max(d.tested, 1),
+        },
+        "apart": [
+            {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
+            for a in d.separability
+        ],
+        "beyond": None
+        if d.insufficiency is None
+        else {
+            "effects": list(d.insufficiency.effects),
+            "refitted": d.insufficiency.refitted,
+            "share": d.insufficiency.share,
+            "variance_factor": d.insufficiency.variance_factor,
+        },
+        "background": [
+            {"effect": b.effect, "p_value": b.p_value, "rms_m": b.rms_m} for b in d.background
+        ],
+        "wrong_figures": [asdict(f) for f in d.wrong_figures],
+        "pose_alone": None if d.pose_alone is None else asdict(d.pose_alone),
+        "rejected": list(d.history.rejected),
+        "alternatives": [
+            {"effect": a.effect, "same_as": list(a.same_as), "others": list(a.others)}
+            for a in d.alternatives
+            if a.inseparable
+        ],
+        "needless": list(d.redundant),
+        "carriers": carriers(d.dependences),
+        "arm_scatter": None if d.scatter is None else d.scatter.to_json(),
+        "serial_noise": None if d.fit.readings.serial is None else d.fit.readings.serial.to_json(),
+        "pure_error": None if d.pure_error is None else repeats(d.pure_error),
+    }
+
+
+def suspect_json(s: Suspect) -> dict[str, object]:
+    """Return what is said of one suspect."""
+    return {
+        "effect": s.effect,
+        "finer_than": s.coarse or None,
+        "p_value": s.score.p_value,
+        "share": s.share,
+        "holdout_share": s.holdout_share,
+        "delta_bic": s.score.delta_bic,
+        "log_evidence": s.score.log_evidence,
+        "significant": s.passes,
+        "same_as": list(s.same_as),
+        "least": least(s.least),
+        "shown": s.shown,
+        "plausible": s.plausible,
+        "needs": [{"unit": unit, "rms": rms, "plausible_rms": most} for unit, rms, most in s.needs],
+        "kept_share": s.kept,
+    }
+
+
+def least(s: Strength) -> dict[str, object] | None:
+    """Return the smallest strength that would have been revealed, SI; null where none would."""
+    if not s.visible:
+        return None
+    finer = None
+    if s.finest_m is not None:
+        seen = bool(np.isfinite(s.finest_m))
+        finer = {"visible": seen, "displacement_m": s.finest_m if seen else None}
+    return {
+        "displacement_m": s.displacement_m,
+        "parameters": [{"unit": unit, "rms": rms} for unit, rms in s.parameters],
+        "finer_than_poses": finer,
+    }
+
+
+def repeats(e: PureError) -> dict[str, object]:
+    """Return the scatter of repeats; `where` is null where it is everywhere the same."""
+    w = e.where
+    return {
+        "variance_factor": e.factor,
+        "interval": list(e.interval),
+        "dof": e.dof,
+        "lack_of_fit_p": e.lack_of_fit_p,
+        "where": None
+        if w is None
+        else {
+            "kind": w.kind,
+            "name": w.name,
+            "variance_factor": w.factor,
+            "interval": list(w.interval),
+            "p_value": w.p_value,
+        },
+    }
+
+
+def carriers(found: Sequence[Dependence]) -> list[dict[str, object]]:
+    """Return variables that carry what is predictable, with their curves, SI units."""
+    return [
+        {
+            "variable": v.variable,
+            "unit": v.unit,
+            "share": v.share,
+            "moves": v.moves,
+            "direction": v.direction.tolist(),
+            "labels": list(v.labels),
+            "x": v.x.tolist(),
+            "y": v.y.tolist(),
+            "error": v.error.tolist(),
+            "y_unit": v.y_unit,
+            "determined": v.determined,
+        }
+        for v in found
+    ]

@@ -1,0 +1,496 @@
+"""A fit in words and tables: parameters, errors, what cannot be seen; scalings, streams, priors."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
+from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
+from hilcal.effects.protocol import FRAME_ROLES, Effect
+from hilcal.identification.background import background_of
+from hilcal.identification.before import error_before
+from hilcal.identification.carried import Group as CarriedGroup
+from hilcal.identification.drift import Conflict
+from hilcal.identification.errors import ErrorBlock
+from hilcal.identification.fit import Fit
+from hilcal.identification.fit_document import notes
+from hilcal.identification.full_prediction import FullPrediction, full_prediction
+from hilcal.identification.gross_errors import gross_errors
+from hilcal.identification.learnt import of_arm
+from hilcal.numbers import names
+from hilcal.present.document import Block, Table, heading, note, table
+from hilcal.present.registration import fitted_lines
+from hilcal.present.verdict import correlated, sigmas
+from hilcal.readings.whitening import Scaling
+from hilcal.stream.fit import StreamFit
+from hilcal.types import Ints
+
+ALL_ROWS = 60
+SCREEN = 6
+"""Parameters on the first screen."""
+PARAMETER_COLUMNS = ("parameter", "value", "±", "unit", "meaning")
+STRONGEST = 5
+DIRECTIONS = 8
+GROSS = 8
+POSE = "pose"
+GROUPS: dict[Group, str] = {
+    "joints": "{}",
+    "load and target": "{}",
+    "time and air": "{}",
+    "pose": "same in all readings of a pose",
+    "direction": "points {}",
+}
+"""Groups of the table of variables in their order, and how a row of each is called."""
+CERTAIN = 0.005
+
+
+def model_name(names: Sequence[str]) -> str:
+    """Write a model as the sum of its effects."""
+    return " + ".join(names) or "the rigid nominal arm"
+
+
+def kind(fit: Fit) -> str:
+    """Return what was fitted, in words."""
+    if fit.mode == "absolute":
+        return f"{len(fit.raw)} absolute readings"
+    return f"{len(fit.raw)} deflections (loaded minus unloaded) of {len(fit.readings)} readings"
+
+
+def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
+    """Yield all that people want to know of a fit, or one screen of it."""
+    yield heading(f"Model: {model_name(fit.model.named)}")
+    yield f"Fitted to {kind(fit)}; scaling {fit.scaling}."
+    yield f"{before_and_after(fit)}\n"
+    yield from parameters(fit, ALL_ROWS if details else SCREEN)
+    yield errors(fit)
+    yield ""
+    yield from remarks(fit) if details else _short(fit)
+
+
+def _short(fit: Fit) -> Iterator[str]:
+    """Yield the remarks of the first screen."""
+    yield _variance_factor(fit)
+    null = [str(d) for d in fit.uncertainty.null]
+    if null:
+        several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
+        yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
+    yield from set_aside(fit, details=False)
+    yield from list(fitted_lines(fit))[:1]
+
+
+def set_aside(fit: Fit, details: bool) -> Iterator[str]:
+    """Yield how many readings were set aside, which are in no error of a fit, or which."""
+    gross = gross_errors(fit)
+    if not gross:
+        return
+    were = f"{len(gross)} readings are" if len(gross) > 1 else "1 reading is"
+    told = f"{were} set aside as gross error{'s' * (len(gross) > 1)}, and in none of these figures"
+    yield f"{told} (pose/load):" if details else f"{told}; --details lists them."
+    if not details:
+        return
+    yield from (f"  {g.pose}/{g.load}: {g.reason}" for g in gross[:GROSS])
+    if len(gross) > GROSS:
+        yield f"  ... and {len(gross) - GROSS} more; --json lists all"
+
+
+def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
+    """Yield a table of parameters, and a summary of each large family.
+
+    Args:
+        fit: the fit.
+        most: rows of the table; where there are more, those of frames come last.
+        where: the others are to be had, in words.
+    """
+    rows: list[tuple[str, ...]] = []
+    frames: list[tuple[str, ...]] = []
+    families, unseen = [], []
+    seen = fit.uncertainty.identifiable
+    for effect, s in zip(fit.model.effects, fit.model.slices(), strict=True):
+        if effect.name in fit.model.background:
+            continue
+        index = np.arange(s.start, s.stop)
+        if effect.groups() is not None or len(index) > ALL_ROWS:
+            families.append(family(fit, effect, index))
+        else:
+            of = frames if effect.role in FRAME_ROLES else rows
+            of += _parameter_rows(fit, effect, index)
+            left = [p.name for k, p in zip(index, effect.parameters, strict=True) if not seen[k]]
+            if left:
+                unseen.append(f"{effect.name} {_which(left, len(index))}")
+    rest = len(frames) + len(rows) - most
+    if frames or rows:
+        shown = [*frames, *rows] if rest <= 0 else [*rows, *frames][:most]
+        yield table(*PARAMETER_COLUMNS, rows=shown, left=(0, 3, 4))
+        more = f"{rest} more parameters: {where}. " if rest > 0 else ""
+        yield note(f"{more}±: standard uncertainty.\n")
+    yield from families
+    if unseen:
+        yield f"Not determined by these readings: {'; '.join(unseen)}.\n"
+
+
+def _which(names: Sequence[str], count: int) -> str:
+    if len(names) == count:
+        return "(none of it)" if count > 6 else " ".join(names)
+    return " ".join(names) if len(names) <= 6 else f"({len(names)} of {count})"
+
+
+def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str, ...]]:
+    seen = fit.uncertainty.identifiable
+    for k, p in zip(index, effect.parameters, strict=True):
+        alike = [
+            i for i, o in zip(index, effect.parameters, strict=True) if o.unit == p.unit and seen[i]
+        ]
+        if not seen[k]:
+            continue
+        std_si, of = float(fit.uncertainty.std[k]), [float(fit.theta[i]) for i in alike]
+        value, std, unit = numbers.measured(p.unit, float(fit.theta[k]), std_si, of)
+        yield f"{effect.name}.{p.name}", value, std, unit, p.meaning
+
+
+def family(fit: Fit, effect: Effect, index: Ints) -> str:
+    """Summarise a family of hundreds of parameters."""
+    theta, live = fit.theta[index], fit.solution.estimated[index]
+    units = {p.unit for p in effect.parameters}
+    unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
+    lines = [
+        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept"
+        + ("." if live.all() else ", the rest are zero.")
+    ]
+    joints: dict[str, float] = {}
+    for value, p in zip(theta, effect.parameters, strict=True):
+        head = p.name.split(".")[0]
+        joints[head] = joints.get(head, 0.0) + float(value) ** 2 / 2
+    rms = ", ".join(f"{j} {numbers.digits(factor * v**0.5)}" for j, v in joints.items())
+    lines.append(f"  rms over a turn [{unit}]: {rms}")
+    strongest = np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
+    named = ", ".join(
+        f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}" for k in strongest
+    )
+    lines.append(f"  strongest [{unit}]: {named}\n")
+    return "\n".join(lines)
+
+
+def errors(fit: Fit) -> Table:
+    """Return the table of errors: before, fitted, left out, and what noise alone leaves."""
+    rows = {
+        "before: rigid nominal arm": error_before(fit),
+        "poses fitted": fit.error,
+        "poses left out": fit.holdout,
+    }
+    return _errors(rows, full_prediction(fit).noise_floor)
+
+
+def _errors(of: Mapping[str, ErrorBlock], floor_m: float) -> Table:
+    out = table("3-D position error", "rms", "mean", "largest", "rms in σ")
+    for name, e in of.items():
+        lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
+        out.add(name, *lengths, f"{e.rms_sigma:.2f}")
+    out.add("noise alone", numbers.length(floor_m), "", "", "1.00")
+    return out
+
+
+def before_and_after(fit: Fit) -> str:
+    """Say in a sentence what was there before, and what the model leaves."""
+    before = numbers.length(error_before(fit).rms_m)
+    floor = numbers.length(full_prediction(fit).noise_floor)
+    was = (
+        f"Deflections of {before} rms were measured"
+        if fit.mode == "deflection"
+        else f"The rigid nominal arm, its frames fitted alone, is off by {before} rms"
+    )
+    left = f"the model leaves {numbers.length(fit.error.rms_m)}"
+    if fit.model.background:  # which follows the fitted poses more closely than others
+        left = f"at poses left out the model leaves {numbers.length(fit.holdout.rms_m)}"
+    return f"{was}; {left} (noise alone: {floor})."
+
+
+def remarks(fit: Fit) -> Iterator[Block]:
+    """Yield a sentence for each thing that the numbers alone do not say."""
+    yield _variance_factor(fit)
+    yield from background_line(fit)
+    scatter = fit.readings.arm_scatter
+    if scatter is not None:
+        yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
+    serial = fit.readings.serial
+    if serial is not None:
+        yield f"{numbers.sentence(correlated(serial))}"
+    yield scaling_remark(fit)
+    null = fit.uncertainty.null
+    if null:
+        what = "directions, parameters that move together," if len(null) > 1 else "direction"
+        yield f"{len(null)} {what} cannot be seen in these readings:"
+        yield from (f"  {d}" for d in null[:DIRECTIONS])
+        if len(null) > DIRECTIONS:
+            yield f"  ... and {len(null) - DIRECTIONS} more; --json lists all"
+    yield from fitted_lines(fit)
+    for remark in notes(fit):
+        yield remark[0].upper() + remark[1:] + "."
+    yield from set_aside(fit, details=True)
+
+
+def background_line(fit: Fit) -> Iterator[str]:
+    """Yield a sentence on the effects that a model predicts with and does not name."""
+    behind = background_of(fit)
+    if behind.effects:
+        yield (
+            f"Background: {len(behind.effects)} effects that are not named, together "
+            f"{numbers.length(behind.rms_m)} rms; all are predicted with."
+        )
+
+
+def _variance_factor(fit: Fit | StreamFit) -> str:
+    low, high = fit.variance_factor_interval
+    return (
+        f"Variance factor {fit.variance_factor:.3g} (95 % interval {low:.3g} to {high:.3g}): the "
+        "squared error in units of the noise, 1 where model and noise are right."
+    )
+
+
+def scaling_remark(fit: Fit) -> str:
+    """Say whether parameter scaling was needed."""
+    basis = fit.solution.equations.basis
+    before, after = basis.condition_unscaled, basis.condition_scaled
+    if not (np.isfinite(before) and np.isfinite(after)):
+        return "Condition numbers: none, the model has no free parameter."
+    need = (
+        "parameter scaling was needed"
+        if before > 1e3 and before > 10 * after
+        else "parameter scaling made no difference that matters"
+    )
+    return (
+        f"Condition number {numbers.condition(before)} in physical units, "
+        f"{numbers.condition(after)} after parameter scaling: {need}."
+    )
+
+
+def misses(fit: Fit) -> str:
+    """Say in a sentence how far the model is from the measurements."""
+    floor = full_prediction(fit).noise_floor
+    what = "deflections" if fit.mode == "deflection" else "positions"
+    return (
+        f"On poses left out, predicted {what} are off by {numbers.length(fit.holdout.rms_m)} rms; "
+        f"noise alone would leave {numbers.length(floor)}."
+    )
+
+
+def follows(places: Sequence[MisfitShare]) -> str:
+    """Say in a sentence what the misfit follows."""
+    found = [p for p in places if p.p_value < CERTAIN and p.share > 0.05]
+    sides = [p for p in found if p.variable.startswith("direction") and p.share > 0.5]
+    same = [p for p in found if p.variable == POSE and p.share > 0.5]
+    causes = [p for p in found if p.variable != POSE and not p.variable.startswith("direction")][:3]
+    if not causes and not sides and not same:
+        return (
+            "The misfit follows none of the variables: neither joints nor load, time or direction."
+        )
+    named = [f"{p.variable} ({numbers.percent(p.share)})" for p in causes]
+    told = (
+        f"The misfit follows {numbers.names(named)}"
+        if named
+        else "The misfit follows none of the variables"
+    )
+    if sides:
+        side = sides[0].variable.removeprefix("direction ")
+        told += f"; {numbers.percent(sides[0].share)} of it is {side}"
+    if same:
+        told += f"; {numbers.percent(same[0].share)} of it is the same under every load of a pose"
+    return f"{told}."
+
+
+def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
+    """Yield the table of variables that the misfit follows, by groups, and what a share is."""
+    out = table("where the model fails", "share", "p-value")
+    shown = [p for p in places if p.share >= LEAST_SHARE]
+    for group, words in GROUPS.items():
+        mine = [p for p in shown if p.group == group]
+        out.rule()
+        for p in mine:
+            name = p.variable.removeprefix("direction ")
+            out.add(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
+    if shown:
+        yield out
+    least = numbers.percent(LEAST_SHARE)
+    rest = len([p for p in places if p.share < LEAST_SHARE])
+    more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
+    yield note(
+        "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
+        "overlap); what is the same in all readings of a pose; what points along a direction"
+        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}"
+    )
+
+
+def tests_of(places: Sequence[MisfitShare]) -> tuple[int, float, str]:
+    """Return how many variables were looked at, and the level that they share."""
+    kinds = [p for p in places if p.group not in ("pose", "direction")]
+    return len(kinds), FALSE_ALARM, "variables"
+
+
+@dataclass(frozen=True, slots=True)
+class Worst:
+    """The measurement of a pose that errs most: 3-D error in m, and all of it in σ."""
+
+    pose: str
+    load: str
+    error_m: float
+    sigma: float
+
+
+def target_words(name: str, n_readings: int, known: bool) -> str:
+    """Return one of several targets in words."""
+    offset = "known" if known else "estimated"
+    return f"{name} ({n_readings} readings, its offset {offset})"
+
+
+def worst_poses(e: FullPrediction, most: int = 6) -> list[Worst]:
+    """Measurements of the poses that err most in units of the noise, worst first."""
+    distance = np.sqrt(e.mahalanobis2)
+    found: dict[str, Worst] = {}
+    for k in np.argsort(-distance, kind="stable"):
+        pose, load = e.name(int(k))
+        of = e.target_name(int(k))
+        if pose not in found:
+            error = float(np.linalg.norm(e.raw[k, :3]))
+            found[pose] = Worst(f"{pose} {of}" if of else pose, load, error, float(distance[k]))
+        if len(found) == most:
+            break
+    return list(found.values())
+
+
+def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
+    """Return the table of the worst poses, as fitted or as predicted without themselves."""
+    title = "worst poses, each left out" if left_out else "worst poses"
+    rows = ((w.pose, w.load, numbers.length(w.error_m), f"{w.sigma:.1f}") for w in worst)
+    return table(title, "load", "error", "in σ", rows=rows, left=(0, 1))
+
+
+def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
+    """Yield a table: parameters with standard uncertainties, errors, condition numbers."""
+    yield heading("The same readings with every scaling")
+    out = table("", *fits, "unit", left=(0, len(fits) + 1))
+    first = next(iter(fits.values()))
+    for effect, s in zip(first.model.effects, first.model.slices(), strict=True):
+        if effect.groups() is not None or s.stop - s.start > ALL_ROWS:
+            continue
+        for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
+            values = [float(f.theta[k]) for f in fits.values() if f.uncertainty.identifiable[k]]
+            if values:
+                unit, factor = numbers.unit_for(p.unit, values)
+                out.add(
+                    f"{effect.name}.{p.name}",
+                    *(_entry(f, k, factor) for f in fits.values()),
+                    unit,
+                )
+    out.rule()
+    for name, entries in _summary(tuple(fits.values())):
+        out.add(name, *entries, "")
+    yield out
+    yield note(
+        "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
+        "covariance, pose by pose. The revision that is kept is that of gc."
+    )
+
+
+def _summary(fits: Sequence[Fit]) -> Iterator[tuple[str, list[str]]]:
+    bases = [f.solution.equations.basis for f in fits]
+    yield "rms error, poses fitted", [numbers.length(f.error.rms_m) for f in fits]
+    yield "rms error, poses left out", [numbers.length(f.holdout.rms_m) for f in fits]
+    yield "variance factor (of gc)", [numbers.digits(f.variance_factor) for f in fits]
+    yield "condition, physical units", [numbers.condition(b.condition_unscaled) for b in bases]
+    yield "condition, parameters scaled", [numbers.condition(b.condition_scaled) for b in bases]
+
+
+def _entry(fit: Fit, k: int, factor: float) -> str:
+    if not fit.uncertainty.identifiable[k]:
+        return "-"
+    value, std = numbers.with_std(
+        factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
+    )
+    return f"{value} ± {std}" if std else value
+
+
+def stream_report(fit: StreamFit) -> Iterator[Block]:
+    """Yield all that people want to know of a fit to a stream."""
+    yield heading(f"Model: {model_name(fit.model.names)}")
+    yield f"Fitted to {fit.readings} absolute readings of a stream, in {fit.passes} passes.\n"
+    meaning = {f"{e.name}.{p.name}": p.meaning for e in fit.model.effects for p in e.parameters}
+    rows, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
+    for p in fit.parameters:
+        if p.value is None or p.std is None:
+            unseen.append(p.name)
+        else:
+            rows.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
+    yield rows
+    yield note("±: standard uncertainty.\n")
+    if unseen:
+        yield f"Not determined by these readings: {', '.join(unseen)}.\n"
+    named = {"readings fitted": fit.error, "tenths of the stream left out": fit.holdout}
+    yield _errors(named, fit.noise_floor)
+    yield ""
+    yield _variance_factor(fit)
+    if fit.inflated:
+        yield (
+            "The residuals are larger than the noise: the standard uncertainties were widened to "
+            "what leaving out tenths of the stream shows."
+        )
+    if fit.outliers:
+        many = f"; the worst: {_rows(fit)}" if fit.named else ""
+        yield f"{fit.outliers} readings were set aside as gross errors{many}."
+    if not fit.converged:
+        yield "Not converged: do not trust the parameters."
+
+
+def _rows(fit: StreamFit) -> str:
+    return ", ".join(f"row {row} ({sigma:.3g} σ)" for row, sigma in fit.named)
+
+
+TELL_P = 1e-3
+"""p-value, times the number of groups that are looked at, below which a disagreement is told."""
+MOST_TOLD = 5
+
+
+def prior_lines(found: Fit) -> list[str]:
+    """Return what people are told of the prior that a fit used; nothing without one."""
+    prior = found.model.prior
+    if prior is None:
+        return []
+    source = prior.posterior.source
+    of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
+    fleet = source.campaign and not source.revision  # it says itself of which arms
+    lines = [
+        f"Prior: {source.campaign or 'a posterior'}"
+        + (f", revision {source.revision}" if source.revision else "")
+        + f" ({source.n_readings} readings{'' if fleet else of})."
+    ]
+    told = disagreements(found)
+    for c in told[:MOST_TOLD]:
+        lines.append(
+            f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the "
+            "prior allows: wear, a crash or a repair?"
+        )
+    if len(told) > MOST_TOLD:
+        lines.append(f"  … and {len(told) - MOST_TOLD} more (--json lists them)")
+    known = {e.name for e in prior.posterior.effects}
+    new = [e.name for e in found.model.effects if of_arm(e) and e.name not in known]
+    ask = "hilcal compare EARLIER LATER says what has changed"
+    if new:
+        lines.append(f"  Its model did not have {names(new)}; {ask}.")
+    elif found.variance_factor_interval[0] > 1:
+        lines.append(f"  With it the model leaves more than the noise; {ask}.")
+    elif not told:
+        lines.append("  The readings agree with it.")
+    return lines
+
+
+def disagreements(found: Fit) -> list[Conflict]:
+    """Return the groups about which prior and readings disagree beyond chance, worst first."""
+    all_of = found.conflicts
+    return [c for c in all_of if c.p_value * len(all_of) < TELL_P]
+
+
+def _of(group: CarriedGroup) -> str:
+    words = group.effect.replace("_", " ")
+    if group.joint is not None:
+        return f"joint {group.joint}'s {words}"
+    return f"the {words} of {group.part}" if group.part else f"the {words}"

@@ -1,0 +1,141 @@
+"""The pages that compare two campaigns of one arm, or the arms of a fleet."""
+
+from typing import TYPE_CHECKING
+
+from hilcal import numbers
+from hilcal.diagnosis.change import LEVEL
+from hilcal.diagnosis.comparison import Comparison
+from hilcal.names import quoted
+from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_by_pose
+from hilcal.present.comparison import comparison_report, headline, next_step, sentence
+from hilcal.present.document import Block, Chart, Section, Words, captioned, heading, table
+from hilcal.present.fleet import closing, type_report, unlike_words
+from hilcal.present.html.first_screen import Card, FirstScreen
+from hilcal.present.html.page import render
+
+if TYPE_CHECKING:
+    from hilcal.transfer.fleet import Fleet
+
+Named = tuple[str, str]
+
+
+def comparison_page(
+    c: Comparison, files: tuple[Named, Named], operator: str, made: str, version: str
+) -> str:
+    """Return the comparison as HTML.
+
+    Args:
+        c: the comparison.
+        files: name and SHA-256 of the earlier campaign's file and of the later one's.
+        operator: who answers for the measurement; empty where nobody is named.
+        made: when the report was made, ISO 8601, UTC.
+        version: of the program.
+    """
+    (earlier, _), (later, _) = files
+    arm = c.fit.model.cell.arm.name
+    told = tuple(comparison_report(c, earlier, later))
+    charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
+    if c.changes.found:
+        charts.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
+    rows = [(which, name, sha) for which, (name, sha) in zip(("earlier", "later"), files,
+                                                             strict=True)]  # fmt: skip
+    provenance = (
+        table("campaign", "name", "SHA-256", rows=rows, caption="Files"),
+        table(
+            *("", ""),
+            caption="Identity of this report",
+            rows=(
+                ("Robot", arm),
+                ("Operator", operator or "not stated"),
+                ("Report made", f"{made[:19].replace('T', ' ')} UTC by hilcal {version}"),
+            ),
+        ),
+        heading("Commands that show the same"),
+        Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
+    )
+    sections = (
+        Section("changes", "What has changed", told),
+        Section("today", "The earlier calibration today", tuple(charts)),
+        Section("provenance", "Provenance", provenance),
+    )
+    return render("Comparison of two campaigns", f"{arm}, {earlier} and {later}, {made[:10]}",
+                  comparison_screen(c, earlier), sections)  # fmt: skip
+
+
+def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
+    """Return what the first screen says."""
+    found, t, told = c.changes, c.today, headline(c)
+    error = t.prediction.error
+    worse = t.p_value < LEVEL
+    good = (
+        f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
+        f"{numbers.digits(t.z, 2)} times what it states: "
+        + ("more than its uncertainty." if worse else "no more than its uncertainty.")
+    )
+    what = " ".join(sentence(x) for x in found.found) or f"{told}."
+    cards = [
+        Card(
+            "Error today",
+            numbers.length(error.rms_m),
+            f"rms; largest {numbers.length(error.max_m)}",
+        ),
+        Card("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
+    ]
+    if t.drawing_m is not None:
+        cards.append(Card("Uncalibrated", numbers.length(t.drawing_m), "rms of the arm as drawn"))
+    answers = (
+        ("Is the calibration still good?", good),
+        ("What has changed?", what),
+        ("What to do?", numbers.sentence(next_step(c, earlier))),
+    )
+    tone = "good" if not found.found and found.explained else "bad"
+    return FirstScreen(told, tone, answers, tuple(cards), "", None)
+
+
+def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
+    """Return a fleet as HTML.
+
+    Args:
+        fleet: the fleet.
+        directory: that its campaigns are in.
+        made: when the page was made, ISO 8601, UTC.
+        version: of the program.
+    """
+    sections = []
+    for k, t in enumerate(fleet.types):
+        drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
+        told = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
+        sections.append(Section(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
+    rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
+    heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
+    sections.append(
+        Section(
+            "campaigns",
+            "Campaigns",
+            (table(*heads, rows=rows, caption="Campaigns"), *closing(fleet)),
+        )
+    )
+    about = f"{directory}, {made[:10]}, hilcal {version}"
+    return render("A fleet of arms", about, _fleet_screen(fleet), tuple(sections))
+
+
+def _fleet_screen(fleet: "Fleet") -> FirstScreen:
+    odd = [o for t in fleet.types for o in t.odd]
+    arms = list(dict.fromkeys(o.arm for o in odd))
+    wear = [name for t in fleet.types for name in t.wear]
+    headline = f"Unlike their type: {numbers.names(arms)}" if arms else "No arm is unlike its type"
+    cards = (
+        Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
+        Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
+    )
+    answers = (
+        ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
+        ("What wears?", ", ".join(wear) or "No drift that the arms have in common."),
+        (
+            "What to do?",
+            "Measure these arms again, and look at these joints."
+            if arms
+            else "Nothing; the prior serves the next arm.",
+        ),
+    )
+    return FirstScreen(headline, "bad" if arms else "good", answers, cards, "", None)

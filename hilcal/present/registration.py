@@ -1,0 +1,197 @@
+"""Where base and target are, what the poses could not tell, and what a covariance consists of."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.cell import Cell
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import CovarianceParts
+from hilcal.identification.noise_estimate import NoiseEstimate
+from hilcal.identification.other_arm import OtherArm
+from hilcal.identification.registration import Registration, Undetermined, register
+from hilcal.identification.robot_frames import RobotFrames
+from hilcal.readings.whitening import Mode
+from hilcal.robot import se3
+from hilcal.types import Bools, Floats
+
+PLACES = 5, 4
+"""Decimals of a position in m and of an angle in degrees. A choice."""
+ALONG = 0.98
+"""Share of its length that one element must have for a direction to be named after that axis."""
+
+
+def registration_lines(found: Registration) -> Iterator[str]:
+    """Yield where the nominal arm's base and target are, and how well the readings fit."""
+    if found.estimated:
+        turn = "" if found.turn_rms is None else f" and {np.degrees(found.turn_rms):.3g}°"
+        yield (
+            f"Registered: {_base(found.cell.registration)}; {_targets(found.cell)}. "
+            f"The nominal arm leaves {numbers.length(found.rms)}{turn} rms."
+        )
+    yield from undetermined_lines(found)
+
+
+def other_arm_line(found: OtherArm) -> str:
+    """Return what to write where the readings are those of another arm of the catalogue."""
+    return (
+        f"These data fit the {found.name} better: {numbers.length(found.rms)} → "
+        f"{numbers.length(found.rms_with)} rms after registration; in CELL.toml: "
+        f'[robot] model = "{found.name}".'
+    )
+
+
+def fitted_lines(fit: Fit) -> Iterator[str]:
+    """Yield where the robot's base is, and the targets that were unknown."""
+    roles = [e.role for e in fit.model.effects]
+    yield base_line(fit.model.cell, fit.frames, fit.mode)
+    if "target" in roles:
+        yield f"As fitted, {_targets(fit.model.cell.with_targets(fit.frames.targets))}."
+    if "target" in roles or "registration" in roles:
+        yield from undetermined_lines(register(fit.model.cell, fit.readings))
+
+
+def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
+    """Return where the robot's base is, which poses, exports and errors are counted from.
+
+    Args:
+        cell: the cell.
+        found: its frames.
+        mode: kind of readings that they were fitted to; of deflections the base is that of the
+            nominal arm, and is written to 1 mm.
+    """
+    if np.array_equal(found.base, np.eye(4)) and found.base_stated:
+        return "The robot's base: the axes that the positions are given in."
+    if found.base_stated:
+        return f"The robot's base: {_at(found.base)}; as the cell states it."
+    why = "the nominal arm on it has the axis of joint 1 where the readings have it"
+    if mode == "deflection":
+        why += "; deflections tell it no better"
+    places = (3, 2) if mode == "deflection" else PLACES
+    return f"The robot's base: {_at(found.base, places)}; {why}."
+
+
+def undetermined_lines(found: Registration) -> Iterator[str]:
+    """Yield a sentence for each direction of the frames that the poses do not determine."""
+    names = found.cell.target_names if found.cell.targets is not None else ()
+    for u in found.undetermined:
+        why, what = _why(found.still), _told(u, names)
+        verb = "separate" if " from " in what else "determine"
+        yield f"The poses cannot {verb} {what}{why}; it stays near the start."
+
+
+def _told(u: Undetermined, names: tuple[str, ...]) -> str:
+    own = "" if u.target is None or not names else f" {names[u.target]}"
+    moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
+    base = _moves(u.base_shift, u.base_turn, "the base's", "its")
+    if not moved:
+        return base or "a combination of base and target"
+    return f"{moved} from {base}" if base else moved
+
+
+def _moves(shift: Floats, turn: Floats, whose: str, axes: str) -> str:
+    parts = []
+    if np.any(shift):
+        height = whose.startswith("the base") and _axis(shift) == "z"
+        parts.append(
+            "the height of the base" if height else f"{whose} offset {_along(shift, axes)}"
+        )
+    if np.any(turn):
+        parts.append(f"{whose} turn about {_axis_words(turn, axes)}")
+    return " with ".join(parts)
+
+
+def _along(v: Floats, axes: str) -> str:
+    return f"along {_axis_words(v, axes)}"
+
+
+def _axis_words(v: Floats, axes: str) -> str:
+    name = _axis(v)
+    if name:
+        return f"{axes} {name}"
+    unit = v / np.linalg.norm(v)
+    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
+
+
+def _axis(v: Floats) -> str | None:
+    k = int(np.argmax(np.abs(v)))
+    return "xyz"[k] if abs(v[k]) > ALONG * np.linalg.norm(v) else None
+
+
+def _why(still: Bools) -> str:
+    """Joints that never turned, 1-based."""
+    which = [int(k) + 1 for k in np.flatnonzero(still)]
+    if not which:
+        return ": the tool hardly changed its orientation, or turned about one axis only"
+    if len(which) == 1:
+        return f": joint {which[0]} never turned"
+    if which == list(range(which[0], which[-1] + 1)):
+        return f": joints {which[0]} to {which[-1]} never turned"
+    return f": joints {', '.join(map(str, which[:-1]))} and {which[-1]} never turned"
+
+
+def _base(t: Floats) -> str:
+    return f"the base is {_at(t)}"
+
+
+def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
+    return f"at {_place(t, places)} in the tracker frame"
+
+
+def _targets(cell: Cell) -> str:
+    if cell.targets is None:
+        return f"the target is at {_place(cell.target)} on the flange"
+    named = zip(cell.target_names, cell.targets, strict=True)
+    return "; ".join(f"target {name} is at {_place(t)} on the flange" for name, t in named)
+
+
+def _place(t: Floats, places: tuple[int, int] = PLACES) -> str:
+    place = ", ".join(f"{x:.{places[0]}f}" for x in t[:3, 3])
+    turn = np.degrees(se3.rotation_vector(t[:3, :3]))
+    if not np.any(np.abs(turn) > 1e-9):
+        return f"({place}) m"
+    words = ", ".join(f"{x:.{places[1]}f}" for x in turn)
+    return f"({place}) m, turned by the rotation vector ({words})°"
+
+
+WORDS: dict[CovarianceParts, str] = {
+    "instrument": (
+        "the instrument alone; the arm's own scatter is not in it ([repeatability] "
+        "joint_std_rad states it)"
+    ),
+    "instrument and repeatability": (
+        "the instrument, and the arm's scatter as [repeatability] states it"
+    ),
+    "instrument and arm as stated": (
+        "instrument and arm's scatter together; [repeatability] is not added again"
+    ),
+    "as imported": (
+        "as an older version of hilcal imported it; [repeatability] is not added (import the "
+        "table again for that)"
+    ),
+}
+
+
+def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None) -> str:
+    """Return a sentence without its full stop.
+
+    Args:
+        parts: what the covariance consists of.
+        noise: the estimate of the noise, where nothing states it.
+    """
+    if noise is not None:
+        return _estimated(noise)
+    return f"each covariance is that of {WORDS[parts]}"
+
+
+def _estimated(n: NoiseEstimate) -> str:
+    turn = "" if n.orientation_rad is None else f", orientations {1e6 * n.orientation_rad:.2g} µrad"
+    arm = ""
+    if n.joint_std_rad is not None:
+        arm = f"; each joint scatters by {1e6 * n.joint_std_rad:.2g} µrad from arrival to arrival"
+    return (
+        f"neither the table nor [tracker] states the noise; it was estimated from the readings, "
+        f"together with all effects: {numbers.length(n.along_m)} along the beam, "
+        f"{numbers.length(n.across_m)} across it at {n.distance_m:.2g} m{turn}{arm}"
+    )

@@ -1,0 +1,219 @@
+"""Readings that were never fitted: their errors by load, by pose, by a limit."""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict
+
+import numpy as np
+
+from hilcal import numbers
+from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
+from hilcal.identification.errors import ErrorBlock
+from hilcal.identification.extrapolation import Beyond, Extrapolation
+from hilcal.identification.validation import Validation
+from hilcal.present.document import Block, Table, note, table
+from hilcal.store.plan import UNLOADED
+from hilcal.types import Floats
+
+MOST = 4
+"""Variables that are listed."""
+WORST = 6
+"""Poses that are listed."""
+DOUBTED = 1.5
+"""Error over the stated standard deviation from which the statement is called too small."""
+
+
+def opening(judged: Judged, found: Validation) -> Iterator[str]:
+    """Yield how many of the readings were fitted, and how far the others are off."""
+    error = f"{numbers.length(found.error.rms_m)} rms"
+    noise = f"noise alone would leave {numbers.length(found.noise_floor)}.\n"
+    count = f"{len(found.raw)} {judged.what}"
+    if not judged.unseen:
+        all_ = "All" if judged.fitted == judged.readings else f"{judged.fitted} of the"
+        yield (
+            f"{all_} {judged.readings} readings were fitted by {judged.model}: these errors say "
+            f"how well it fits, not how well it predicts. {count} are off by {error}; {noise}"
+        )
+        return
+    if judged.fitted:
+        more = f", and {judged.spoilt} more share an unloaded reading" if judged.spoilt else ""
+        yield (
+            f"{judged.fitted} of the {judged.readings} readings were fitted by {judged.model}"
+            f"{more}; they are left out."
+        )
+    yield f"{count} that were never fitted are predicted to {error}; {noise}"
+
+
+def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) -> Iterator[Block]:
+    """Yield the errors, inside and outside of what was measured, and where outside is."""
+    out = table("3-D position error", "rms", "mean", "largest", "rms in σ", "stated", "z")
+    inside, outside = beyond.inside_error, beyond.outside_error
+    everything = np.ones(len(beyond.z), dtype=np.bool_)
+    rows = [("never fitted" if judged.unseen else "fitted", found.error, everything)]
+    if inside is not None and outside is not None:
+        rows += [
+            ("inside", inside, ~beyond.outside),
+            ("outside", outside, beyond.outside),
+        ]
+    for name, e, mine in rows:
+        lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
+        stated = numbers.length(_rms(beyond.stated_m[mine]))
+        out.add(name, *lengths, f"{e.rms_sigma:.2f}", stated, f"{_rms(beyond.z[mine]):.2f}")
+    out.add("noise alone", numbers.length(found.noise_floor), "", "", "1.00", "", "")
+    yield out
+    yield note(
+        "stated: standard deviation that the fit states for these readings, what it does not know "
+        "where nothing was measured included; z: error over it.\n"
+    )
+    yield from _where(beyond)
+    if (z := _rms(beyond.z)) > DOUBTED:
+        yield f"These readings are {z:.2g} times as far off as the fit states.\n"
+
+
+def _where(beyond: Extrapolation) -> Iterator[str]:
+    """Yield where readings lie outside."""
+    count, total = int(beyond.outside.sum()), len(beyond.outside)
+    if not count:
+        yield "All of them lie inside of what was measured.\n"
+        return
+    yield f"Extrapolation: {count} of {total} lie outside of what was measured:"
+    for v in beyond.variables[:MOST]:
+        yield f"  {_beyond(v)}"
+    more = len(beyond.variables) - MOST
+    yield f"  and {more} more variables\n" if more > 0 else ""
+
+
+def _beyond(v: Beyond) -> str:
+    if v.variable == "leverage":
+        return f"leverage: {v.count}, far from all fitted poses in several joints together"
+    if v.unit == "rad":
+        low, high, most = (f"{np.degrees(x):.0f}°" for x in (v.low, v.high, v.most))
+    else:
+        unit = "°C" if v.unit == "K" else v.unit  # the readings hold °C, differences are in K
+        low, high = (f"{numbers.digits(x)} {unit}" for x in (v.low, v.high))
+        most = f"{numbers.digits(v.most)} {v.unit}"
+    return f"{v.variable}: {v.count}, by up to {most} (measured: {low} to {high})"
+
+
+def shares_report(found: Acceptance) -> Iterator[Block]:
+    """Yield errors by load, the worst poses, and whether a limit is kept."""
+    yield from loads_report(found)
+    yield worst_table(found)
+    yield ""
+    if found.limit_m is not None:
+        yield _limit_words(found, found.limit_m)
+
+
+def loads_report(found: Acceptance) -> Iterator[Block]:
+    """Yield errors by load."""
+    every = () if len(found.loads) == 1 else (found.everything,)
+    yield _shares_table("load", "at", (*found.loads, *every), found.limit_m)
+    yield note(
+        f"in 95 %: share of the readings inside of their stated {100 * BAND:.0f} % region.\n"
+    )
+
+
+def worst_table(found: Acceptance) -> Table:
+    """Return the errors of the worst poses."""
+    return _shares_table("worst poses", "load", found.poses[:WORST], found.limit_m)
+
+
+def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
+    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %", "limit")
+    rows = ((*_cells(s), *_verdict(s, limit)) for s in shares)
+    return table(*heads[: None if limit is not None else -1], rows=rows, left=(0, 4))
+
+
+def _cells(s: Share) -> tuple[str, ...]:
+    lengths = [numbers.length(x) for x in (s.rms_m, s.max_m, s.stated_m)]
+    within = f"{100 * s.within:.0f} %"
+    return s.name, str(s.count), *lengths[:2], s.worst, lengths[2], f"{s.z:.2f}", within
+
+
+def _verdict(s: Share, limit: float | None) -> tuple[str, ...]:
+    return () if limit is None else ("kept" if s.passes(limit) else "over",)
+
+
+def _limit_words(found: Acceptance, limit: float) -> str:
+    size, a = numbers.length(limit), found.everything
+    worst = found.poses[0]
+    largest = f"the largest error is {numbers.length(a.max_m)}, at {_place(worst)}"
+    if found.passed:
+        return f"PASSED: no error is over the limit of {size}; {largest}.\n"
+    poses = sum(not s.passes(limit) for s in found.poses)
+    return (
+        f"FAILED: {found.over} of {a.count} errors are over the limit of {size}, at {poses} of "
+        f"{len(found.poses)} poses; {largest}.\n"
+    )
+
+
+def _place(worst: Share) -> str:
+    """Return a pose and the load of its largest error."""
+    return f"{worst.name} " + ("unloaded" if worst.worst == UNLOADED else f"under {worst.worst}")
+
+
+def validation_failure(found: Acceptance, judged: Judged) -> str:
+    """Return the one line on a limit that is not kept."""
+    limit, worst = found.limit_m or 0.0, found.poses[0]
+    head = (
+        f"the limit of {numbers.length(limit)} is not kept: {found.over} of "
+        f"{found.everything.count} {judged.what} are further off, {_place(worst)} by "
+        f"{numbers.length(worst.max_m)}"
+    )
+    if not found.undecided:
+        return head
+    return (
+        f"{head}; but noise alone leaves {numbers.length(found.noise_m)} rms, so that these "
+        "readings cannot tell: measure with less noise, or give a limit above it"
+    )
+
+
+def shares_json(found: Acceptance) -> dict[str, object]:
+    """Return the keys of `validate --json` on loads, poses and the limit."""
+    limit = found.limit_m
+
+    def document(s: Share, own: str, other: str) -> dict[str, object]:
+        d = {own if k == "name" else k: v for k, v in asdict(s).items()}
+        d[f"worst_{other}"] = d.pop("worst")
+        return d if limit is None else {**d, "passed": s.passes(limit)}
+
+    return {
+        "within_95": found.everything.within,
+        "loads": [document(s, "load", "pose") for s in found.loads],
+        "poses": [document(s, "pose", "load") for s in found.poses],
+        "limit": None
+        if limit is None
+        else {"limit_m": limit, "passed": found.passed, "n_over": found.over},
+    }
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
+
+def extrapolation_json(beyond: Extrapolation) -> dict[str, object]:
+    """Return the keys of `validate --json` on extrapolation and stated standard deviations."""
+
+    def block(e: ErrorBlock | None) -> dict[str, float] | None:
+        return None if e is None else e.to_json()
+
+    return {
+        "stated_rms_m": _rms(beyond.stated_m),
+        "z_rms": _rms(beyond.z),
+        "extrapolation": {
+            "n_outside": int(beyond.outside.sum()),
+            "variables": [
+                {
+                    "variable": v.variable,
+                    "unit": v.unit,
+                    "measured": [v.low, v.high],
+                    "n_outside": v.count,
+                    "beyond": v.most,
+                }
+                for v in beyond.variables
+            ],
+            "error_inside": block(beyond.inside_error),
+            "error_outside": block(beyond.outside_error),
+            "z_inside": _rms(beyond.z[~beyond.outside]) if (~beyond.outside).any() else None,
+            "z_outside": _rms(beyond.z[beyond.outside]) if beyond.outside.any() else None,
+        },
+    }

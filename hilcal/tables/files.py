@@ -1,0 +1,388 @@
+"""Opening a file of any kind that holds a table: text, XLSX, MAT, Parquet.
+
+The kind is seen from the file's first bytes. Nothing in a file is ever executed: formulas count by
+the value that is stored with them, macros, links and pickles are not read.
+"""
+
+import io
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from datetime import date, datetime, time
+from importlib import import_module
+from pathlib import Path
+from typing import IO, Any
+from xml.parsers import expat
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.tables import matfile
+from hilcal.tables.grid import Cell, Check, Grid, joined, unique
+from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.text import grid_of_rows, read_text
+from hilcal.toml import suggest
+
+READ = {b"PK\x03\x04": "XLSX", b"PAR1": "Parquet", b"MATLAB": "MAT"}
+"""First bytes of files that are no text, and their kind."""
+_PICKLE = "a Python pickle, which is never loaded; save it as CSV"
+REFUSED = {
+    b"SQLite format 3\x00": "an SQLite file (a campaign is opened, not imported)",
+    b"\x89HDF": "an HDF5 file (MATLAB's -v7.3); save it with -v7, or as CSV",
+    b"\xd0\xcf\x11\xe0": "an old Excel file (XLS); save it as XLSX or CSV",
+    b"\x1f\x8b": "a gzip file; unpack it first",
+    b"\x93NUMPY": "a NumPy file; save it as CSV",
+    **{b"\x80" + bytes([version]): _PICKLE for version in range(2, 6)},
+    b"%PDF": "a PDF; save the table as CSV",
+}
+"""First bytes of files that are not read, and what they are."""
+
+
+def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) -> tuple[Grid, int]:
+    """Open the file or the two files that a mapping is for, as one table.
+
+    Args:
+        path: the first file.
+        mapping: its sections [file] and [second_file].
+        second: the second file, where the mapping does not name it.
+
+    Returns:
+        The table, and how many rows of the first file found no partner in the second.
+
+    Raises:
+        InputError: a file that cannot be read, or files that do not belong together.
+    """
+    first = open_grid(path, mapping.file)
+    if mapping.second_file is None:
+        if second is not None:
+            raise InputError(f"{second}: the mapping has no section [second_file]")
+        return first, 0
+    other = second or mapping.second_file.path
+    if other is None:
+        raise InputError(
+            f"{path}: the mapping has a section [second_file] without path; give it there or by "
+            f"--second"
+        )
+    return joined(first, open_grid(other, mapping.second_file), mapping.second_file.match)
+
+
+@limits.bounded
+def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> Grid:
+    """Open one file as a table of cells.
+
+    Args:
+        path: the file.
+        how: it is written.
+        check: is given the names of its columns as it has them, with repeats and empty ones.
+
+    Raises:
+        InputError: no such file, a kind that is not read, no table in it, or the package that
+            reads it is not installed.
+    """
+    name, content = str(path), content_of(path)
+    kind = kind_of(name, content)
+    with _undamaged(name, "what its first bytes say"):
+        match kind:
+            case "XLSX":
+                return _xlsx(name, content, how, check)
+            case "Parquet":
+                return _parquet(name, content, how, check)
+            case "MAT":
+                return _mat(name, how, check)
+    if how.sheet or how.variable:
+        key = "sheet" if how.sheet else "variable"
+        raise InputError(f"{name}: text has no {key}; remove [file] {key}")
+    return read_text(name, content, how, check)
+
+
+def content_of(path: str | Path) -> bytes:
+    """Read a file.
+
+    Raises:
+        InputError: no such file, or it cannot be read.
+    """
+    try:
+        return limits.read_bytes(Path(path), limits.TABLE)
+    except FileNotFoundError as e:
+        raise InputError(f"{path}: no such file") from e
+    except OSError as e:
+        raise InputError(f"{path}: cannot be read ({e.strerror})") from e
+
+
+def kind_of(path: str, content: bytes) -> str:
+    """Return the kind of a file by its first bytes: one of `READ`, else "text".
+
+    Raises:
+        InputError: it is empty, or of a kind that is not read.
+    """
+    if not content.strip(b"\xef\xbb\xbf \t\r\n"):
+        raise InputError(f"{path}: the file is empty; expected a table of readings")
+    for magic, what in REFUSED.items():
+        if content.startswith(magic):
+            raise InputError(f"{path}: {what}; expected text, XLSX, MAT or Parquet")
+    return next((kind for magic, kind in READ.items() if content.startswith(magic)), "text")
+
+
+def is_parquet(path: Path) -> bool:
+    """Whether a file begins as Parquet does."""
+    try:
+        with path.open("rb") as stream:
+            return READ.get(stream.read(4)) == "Parquet"
+    except OSError:
+        return False
+
+
+@contextmanager
+def _undamaged(path: str, what: str) -> Iterator[None]:
+    """Say in one line what a reader makes of a damaged file, which is not documented."""
+    try:
+        yield
+    except (InputError, MemoryError):
+        raise
+    except Exception as e:
+        raise InputError(f"{path}: damaged, or not {what} ({_short(e)})") from e
+
+
+def _short(error: Exception) -> str:
+    words = " ".join(str(error).split()) or type(error).__name__
+    return words if len(words) <= 80 else words[:77] + "..."
+
+
+def package(path: str | Path, name: str, what: str) -> Any:
+    """Import a package that a kind of file needs.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return import_module(name)
+    except ImportError as e:
+        raise InputError(
+            f"{path}: {what} needs the package {name.split('.')[0]}: pip install hilcal[tables]"
+        ) from e
+
+
+def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
+    sheets = sheet_names(path, content)
+    if how.sheet is not None and how.sheet not in sheets:
+        raise InputError(
+            f"{path}: no sheet '{how.sheet}'{suggest(how.sheet, sheets)}; it has "
+            f"{', '.join(sheets)}"
+        )
+    sheet = how.sheet or sheets[0]
+    found = sheet_rows(path, content, sheet, how.comment)
+    if not found:
+        raise InputError(f"{path}: sheet '{sheet}' is empty; it has {', '.join(sheets)}")
+    return grid_of_rows(path, found, how, check)
+
+
+def _book(path: str, content: bytes) -> Any:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = archive.infolist()
+        if "xl/workbook.xml" not in [m.filename for m in members]:
+            raise InputError(f"{path}: a zip archive that is no XLSX; unpack it, or save as XLSX")
+        limits.check_size(f"{path}: unpacked", sum(m.file_size for m in members), limits.UNPACKED)
+        for member in members:
+            with archive.open(member) as stream, suppress(expat.ExpatError):  # pictures
+                _check_xml(path, member.filename, stream)
+    openpyxl = package(path, "openpyxl", "XLSX")
+    return openpyxl.load_workbook(
+        io.BytesIO(content), read_only=True, data_only=True, keep_links=False
+    )
+
+
+def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
+    """Count the elements of a part of a workbook, of which openpyxl keeps more than it is long.
+
+    Of a sheet it keeps a row, of other parts all.
+
+    Raises:
+        InputError: too many, too deep, or one that is too long.
+    """
+    where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
+    most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS
+    depth = elements = rows = cells = 0
+
+    def start(tag: str, _: dict[str, str]) -> None:
+        nonlocal depth, elements, rows, cells
+        depth += 1
+        elements += 1
+        tag = tag.rpartition(":")[2]
+        if sheet and tag == "row":
+            rows, elements = rows + 1, 0
+            limits.check_rows(where, rows)
+        cells += sheet and tag == "c"
+        if depth > limits.DEEP or elements > most:
+            what = (
+                f"{depth} elements in each other" if depth > limits.DEEP else f"{elements} elements"
+            )
+            raise InputError(
+                f"{where}: {what}{' in a row' if sheet else ''}; valid: a workbook of readings"
+            )
+
+    def end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    fed = 0
+    while piece := stream.read(1 << 16):
+        parser.Parse(piece)
+        fed += len(piece)
+        limits.check_cells(where, cells)
+        limits.check_size(f"{where}: a tag", fed - parser.CurrentByteIndex, limits.LINE)
+    parser.Parse(b"", True)
+
+
+def sheet_names(path: str, content: bytes) -> list[str]:
+    """Names of the sheets of an XLSX file.
+
+    Raises:
+        InputError: no XLSX file, or openpyxl is not installed.
+    """
+    with _undamaged(path, "an XLSX file"):
+        names = list(_book(path, content).sheetnames)
+    if len(names) > limits.SHEETS:
+        raise InputError(f"{path}: {len(names)} sheets; valid: at most {limits.SHEETS}")
+    return names
+
+
+def sheet_rows(
+    path: str, content: bytes, sheet: str, comment: str | None
+) -> list[tuple[int, list[Cell]]]:
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1.
+
+    Raises:
+        InputError: damaged, or more rows or cells than a table may have.
+    """
+    found: list[tuple[int, list[Cell]]] = []
+    cells = 0
+    with _undamaged(path, "an XLSX file"):
+        read = _book(path, content)[sheet]
+        read.reset_dimensions()  # what the file says of its size would pad every row
+        for row, given in enumerate(read.iter_rows(values_only=True), start=1):
+            limits.check_rows(f"{path}: sheet '{sheet}'", row)
+            plain = [_cell(c) for c in given]
+            while plain and plain[-1] is None:
+                plain.pop()
+            remark = comment is not None and str(plain[0] if plain else "").startswith(comment)
+            if plain and not remark:
+                cells += len(plain)
+                limits.check_cells(f"{path}: sheet '{sheet}'", cells)
+                found.append((row, plain))
+    return found
+
+
+def _cell(value: object) -> Cell:
+    """Return a spreadsheet's cell as a number, a date, text or nothing."""
+    if value is None or isinstance(value, datetime):
+        return value
+    if isinstance(value, bool):
+        return str(value)
+    if isinstance(value, int | float):
+        return float(value)
+    if isinstance(value, date):
+        return datetime.combine(value, time())
+    if isinstance(value, time):
+        return datetime.combine(date(1900, 1, 1), value)
+    text = str(value).strip()
+    return text or None
+
+
+def _columns(
+    path: str, named: list[tuple[str, list[Cell]]], how: FileFormat, check: Check | None
+) -> Grid:
+    if not named or not named[0][1]:
+        raise InputError(f"{path}: no readings; expected columns of equal length")
+    titles = [name for name, _ in named]
+    if check is not None:
+        check(titles)
+    rows = np.arange(1, len(named[0][1]) + 1)
+    columns = tuple(cells for _, cells in named)
+    grid = Grid(path, unique(titles), rows, columns, (how,) * len(named))
+    return grid.rows_with(~np.isin(rows, how.skip_rows))
+
+
+def _parquet(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:
+    """Columns of numbers, texts and times of a Parquet file; rows count from 1.
+
+    The metadata tell how large they become. Texts stay as numbers of a dictionary until it is known
+    how long all of them are together: a file of 0.3 MB may hold one of 1 MB in each of 5,000 rows.
+    """
+    parquet = package(path, "pyarrow.parquet", "Parquet")
+    from pyarrow import compute
+
+    schema = parquet.ParquetFile(io.BytesIO(content)).schema_arrow
+    names = [f.name for f in schema if is_plain(f.type)]
+    texts = [f.name for f in schema if is_text(f.type)]
+    file = parquet.ParquetFile(io.BytesIO(content), read_dictionary=texts)
+    meta = file.metadata
+    limits.check_cells(path, meta.num_rows, max(len(names), 1))
+    # By row groups: pyarrow ends the process where the statistics of a column are damaged.
+    sizes = (meta.row_group(k).total_byte_size for k in range(meta.num_row_groups))
+    limits.check_size(f"{path}: unpacked", sum(sizes), limits.UNPACKED)
+    found = file.read(columns=names)
+    for name in texts:
+        lengths = (
+            compute.sum(compute.binary_length(part.dictionary).take(part.indices)).as_py() or 0
+            for part in found[name].chunks
+        )
+        limits.check_size(f"{path}: column '{name}'", max(lengths, default=0), limits.UNPACKED // 4)
+    named = [
+        (name, [_cell(v) for v in column.to_pylist()])
+        for name, column in zip(found.column_names, found.columns, strict=True)
+    ]
+    return _columns(path, named, how, check)
+
+
+def is_text(kind: Any) -> bool:
+    """Whether a column of this type of pyarrow holds texts."""
+    from pyarrow import types
+
+    return bool(types.is_string(kind) or types.is_large_string(kind))
+
+
+def is_plain(kind: Any) -> bool:
+    """Whether a column of this type of pyarrow holds a number, a text or a time in each row."""
+    from pyarrow import types
+
+    numbers = types.is_primitive(kind) or types.is_decimal(kind) or types.is_null(kind)
+    return bool(numbers) or is_text(kind)
+
+
+def _mat(path: str, how: FileFormat, check: Check | None) -> Grid:
+    """Columns of a MAT file: those of its matrices that have the same number of rows.
+
+    A matrix A of k > 1 columns gives "A(1)" ... "A(k)", poses T of shape (4, 4, N) give
+    "T(1,1)" ..., fields of a structure "s.field".
+    """
+    variables, found = matfile.read(path)
+    if how.variable is not None and how.variable not in variables:
+        raise InputError(
+            f"{path}: no variable '{how.variable}'{suggest(how.variable, variables)}; it has "
+            f"{', '.join(variables)}"
+        )
+    chosen = [how.variable] if how.variable else variables
+    blocks = [(name, values) for variable, name, values in found if variable in chosen]
+    lengths = [len(values) for _, values in blocks]
+    if not blocks:
+        raise InputError(
+            f"{path}: no matrix of numbers in {', '.join(chosen) or 'it'}; tables of MATLAB are "
+            f"written by writetable as CSV"
+        )
+    rows = max(lengths, key=lambda k: (lengths.count(k), k))
+    named = [
+        part for name, values in blocks if len(values) == rows for part in _split(name, values)
+    ]
+    return _columns(path, named, how, check)
+
+
+def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
+    count = values.shape[1]
+    for k in range(count):
+        yield (
+            (name if count == 1 else f"{name}({k + 1})"),
+            [_cell(v) for v in values[:, k].tolist()],
+        )

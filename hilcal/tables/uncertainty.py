@@ -1,0 +1,356 @@
+"""Uncertainties that a table states: their covariances, and what cannot be right in them.
+
+Standard deviations, U95, variances, matrices; zero, far too small, below the values' rounding.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise, tracker_covariance
+from hilcal.tables import units
+from hilcal.tables.grid import Grid, Table
+from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
+from hilcal.tables.orientation import angle_axes
+from hilcal.types import Bools, Floats
+
+FAR = 5.0
+"""Ratio of stated and instrument's standard deviation that is worth a word; a choice."""
+NEAR = 3.0
+"""Ratio within which another reading of the figures fits the instrument; a choice."""
+LEAST = (1e-7, 1e-7)
+"""m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
+the resolution of the best."""
+DISTINCT = 10
+"""Different values that are needed to tell rounding: ten that end in zero by chance are one case
+in 10^10."""
+COUNTS = 0.01
+"""Rounding is added where its variance is more than this share of the stated one; a choice."""
+_FINEST = 1e-9
+_PLAUSIBLE = (1e-6, 1e-3)
+"""m; standard deviations that a tracker or a camera states, to guess what was meant."""
+
+
+def mapped_covariance(
+    table: Table,
+    grid: Grid,
+    mapping: Mapping,
+    position: Floats,
+    angles: Floats | None,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None,
+) -> tuple[Floats | None, tuple[str, ...]]:
+    """Return the covariances that the table states, by a mapping, and notes on them.
+
+        V = E D C D Eᵀ + V_tracker
+
+    with D the standard deviations (of the position's axes and the orientation's angles), C their
+    correlation, E the axes about which the angles turn, and the instrument's covariance where the
+    mapping adds it. Orientations without a figure of their own have the instrument's.
+
+    Args:
+        table: the columns in SI units, for messages.
+        grid: the columns as the file holds them.
+        mapping: what they hold.
+        position: (N, 3) m.
+        angles: (N, k) the orientation's numbers in the file's unit; None for positions.
+        noise: of the instrument.
+        station: (3,) where its beam starts.
+
+    Returns:
+        (N, m, m) m² and rad², None where the table states none; and one sentence per decision.
+
+    Raises:
+        InputError: a figure that is missing or cannot be right.
+    """
+    m = 3 if angles is None else 6
+    origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
+    if mapping.std is not None:
+        cov, words = _of_std(grid, mapping, mapping.std, len(position))
+    elif mapping.covariance is not None:
+        cov, words = _of_matrix(grid, mapping.covariance), "covariance: from the table"
+    else:
+        return None, ()
+    instrument = None if noise is None else tracker_covariance(position, noise, origin, m)
+    known = cov.shape[1]
+    source = "[tracker]" if mapping.instrument is None else "[instrument] of the mapping"
+    if known < m:
+        whole = np.zeros((len(position), m, m))
+        if instrument is None:
+            raise InputError(f"{grid.path}: no uncertainty of the orientation; give six figures")
+        whole[:, 3:, 3:] = instrument[:, 3:, 3:]
+        whole[:, :3, :3] = cov
+        cov, words = whole, f"{words}; orientations: the noise in {source}"
+    if known == 6 and angles is not None and mapping.orientation is not None:
+        o = mapping.orientation
+        axes = angle_axes(o.convention, angles, units.ANGLES[o.unit])
+        turn = np.broadcast_to(np.eye(6), cov.shape).copy()
+        turn[:, 3:, 3:] = axes
+        cov = turn @ cov @ np.swapaxes(turn, 1, 2)
+        cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
+    notes: tuple[str, ...] = ()
+    if mapping.std is not None and mapping.std.add_instrument:
+        if instrument is None:
+            raise InputError(f"{grid.path}: [std] add_instrument needs the noise in [tracker]")
+        cov, words = cov + instrument, f"{words}, plus the noise in {source}"
+    else:
+        cov, notes = floored(table, cov, instrument)
+    doubt = () if instrument is None else _doubt(mapping, cov, instrument)
+    return cov, (words, *notes, *doubt)
+
+
+def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
+    """(N, k) figures of columns; every row has one.
+
+    Raises:
+        InputError: a cell without a value.
+    """
+    values = np.stack([grid.numbers(column) for column in columns], axis=1)
+    bad = np.isnan(values)
+    if bad.any():
+        i, j = divmod(int(np.argmax(bad)), values.shape[1])
+        raise InputError(
+            f"{grid.at(i, grid.name(columns[j]))}: no value; every reading needs its uncertainty "
+            f"(take the column out of the mapping to use the noise in [tracker])"
+        )
+    return values
+
+
+def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats, str]:
+    missing = [name for name in std.columns if isinstance(name, str) and name not in grid.names]
+    absent = std.optional and len(missing) == len(std.columns)
+    if absent:
+        figures = np.zeros((count, len(std.columns)))
+    elif std.columns:
+        figures = _block(grid, std.columns)
+        bad = figures < 0
+        if bad.any():
+            i, j = divmod(int(np.argmax(bad)), figures.shape[1])
+            raise InputError(
+                f"{grid.at(i, grid.name(std.columns[j]))}: {figures[i, j]:g}: a "
+                f"{'variance' if std.kind == 'variance' else 'standard deviation'} is 0 or more"
+            )
+    else:
+        figures = np.tile(np.array(std.values, dtype=float), (count, 1))
+    what = {
+        "std": "standard deviations",
+        "expanded": f"expanded uncertainties (k = {std.k:g})",
+        "variance": "variances",
+    }[std.kind]
+    sigma = np.sqrt(figures) if std.kind == "variance" else figures
+    if std.kind == "expanded":
+        sigma = sigma / std.k
+    if std.at_least is not None:
+        least = np.repeat(std.at_least, 3)
+        sigma = np.maximum(sigma, least[: sigma.shape[1]])
+        what += f" (at least {std.at_least[0]:g} {std.unit}"
+        what += f", {std.at_least[1]:g} {std.angle_unit})" if sigma.shape[1] == 6 else ")"
+    if sigma.shape[1] == 1:
+        sigma = np.repeat(sigma, 3, axis=1) / (np.sqrt(3) if std.of == "point" else 1.0)
+    scale = [units.LENGTHS[std.unit]] * 3 + [units.ANGLES[std.angle_unit]] * 3
+    sigma = sigma * np.array(scale[: sigma.shape[1]])
+    m = sigma.shape[1]
+    correlation = np.broadcast_to(np.eye(m), (count, m, m)).copy()
+    if mapping.correlation is not None:
+        upper, right = np.triu_indices(m, 1)
+        if len(mapping.correlation.columns) != len(upper):
+            raise InputError(
+                f"{grid.path}: [correlation] has {len(mapping.correlation.columns)} columns; "
+                f"{m} standard deviations need {len(upper)}"
+            )
+        value = _block(grid, mapping.correlation.columns)
+        correlation[:, upper, right] = correlation[:, right, upper] = value
+    where = "from the table" if std.columns else "the same for all readings"
+    where = f"since the table has no column '{missing[0]}'" if absent else where
+    return (
+        sigma[:, :, None] * correlation * sigma[:, None, :],
+        f"covariance: {what}, {where}",
+    )
+
+
+def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
+    figures = _block(grid, section.columns)
+    count, k = figures.shape
+    m = 3 if k <= 9 else 6
+    if k in (9, 36):
+        cov = figures.reshape(count, m, m)
+        off = np.abs(cov - np.swapaxes(cov, 1, 2)).max(axis=(1, 2))
+        bad = off > 1e-3 * np.abs(cov).max(axis=(1, 2))
+        if bad.any():
+            i = int(np.argmax(bad))
+            raise InputError(
+                f"{grid.at(i, grid.name(section.columns[0]))}: the covariance is not symmetric"
+            )
+        cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
+    else:
+        upper, right = np.triu_indices(m)
+        cov = np.zeros((count, m, m))
+        cov[:, upper, right] = cov[:, right, upper] = figures
+    scale = np.array(
+        ([units.LENGTHS[section.unit]] * 3 + [units.ANGLES[section.angle_unit]] * 3)[:m]
+    )
+    return np.asarray(scale[:, None] * cov * scale)
+
+
+def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]:
+    """Return a note where the figures fit the instrument when they are read otherwise."""
+    std = mapping.std
+    if std is None or std.kind == "expanded" or std.add_instrument:
+        return ()
+    unit = units.LENGTHS[std.unit]
+    stated = float(np.sqrt(np.median(cov[:, range(3), range(3)])))
+    usual = float(np.sqrt(np.median(instrument[:, range(3), range(3)])))
+    if 1 / FAR < stated / usual < FAR:
+        return ()
+    figure = stated / unit
+    other = unit * (figure**2 if std.kind == "variance" else np.sqrt(figure))
+    if not 1 / NEAR < other / usual < NEAR:
+        return ()
+    kind = "standard deviations" if std.kind == "variance" else "variances"
+    return (
+        f"the stated standard deviations are {1e6 * stated:.3g} µm as a rule, the instrument's in "
+        f"[tracker] {1e6 * usual:.3g} µm; read as {kind} the figures would be {1e6 * other:.3g} "
+        f"µm: check [std] kind and unit",
+    )
+
+
+def floored(
+    table: Table, covariance: Floats, instrument: Floats | None
+) -> tuple[Floats, tuple[str, ...]]:
+    """Raise variances that are zero, or far below the others, to those of the instrument.
+
+    An instrument that writes 0.000 has a scatter below its last digit, not none; such a reading
+    would outweigh all others. Adding to a diagonal element keeps a covariance positive.
+
+    Args:
+        table: for messages.
+        covariance: (N, m, m), m² and rad².
+        instrument: covariances (N, m, m) of the noise in [tracker]; None where it is not known.
+
+    Returns:
+        The covariances, and a note that counts the rows.
+
+    Raises:
+        InputError: the usual standard deviation is below 0.1 µm or 1e-7 rad; or a zero where the
+            instrument's noise is not known.
+    """
+    variance = np.diagonal(covariance, axis1=1, axis2=2)
+    m = variance.shape[1]
+    tiny = np.zeros(variance.shape, dtype=bool)
+    for block, least, unit in ((slice(0, 3), LEAST[0], "m"), (slice(3, m), LEAST[1], "rad")):
+        v = variance[:, block]
+        if not v.size:
+            continue
+        positive = v[v > 0]
+        usual = float(np.sqrt(np.median(positive))) if len(positive) else 0.0
+        if 0 < usual < least:
+            i = int(np.argmax((v > 0).any(axis=1)))
+            raise InputError(
+                f"{table.at(i)}: the stated standard deviations are {usual:.2g} {unit} as a rule; "
+                f"no instrument reaches {least:g} {unit}{_meant(usual) if unit == 'm' else ''}"
+            )
+        tiny[:, block] = (v >= 0) & (v < least**2)
+    rows: Bools = np.asarray(tiny.any(axis=1))
+    if not rows.any():
+        return covariance, ()
+    if instrument is None:
+        i = int(np.argmax(rows))
+        raise InputError(
+            f"{table.at(i)}: a stated variance is {variance[i][tiny[i]][0]:g}; it must be more "
+            f"than 0, or [tracker] must state the instrument's noise to take its place"
+        )
+    floor = np.diagonal(instrument, axis1=1, axis2=2)
+    out = covariance.copy()
+    k = np.arange(m)
+    out[:, k, k] = np.where(tiny, floor, variance)
+    note = (
+        f"{int(rows.sum())} of {len(rows)} rows state a standard deviation of zero (or below "
+        f"0.1 µm, the first is row {table.rows[np.argmax(rows)]}): the noise in [tracker] takes "
+        f"its place"
+    )
+    return out, (note,)
+
+
+def _meant(usual: float) -> str:
+    low, high = _PLAUSIBLE
+    looks = []
+    if low <= np.sqrt(usual) <= high:
+        looks.append("variances given as standard deviations")
+    if low <= 1e3 * usual <= high:
+        looks.append("a unit that is 1000 times too small")
+    if looks:
+        return f"; looks like {' or '.join(looks)}"
+    return "; expected the standard deviations, or the covariance in m², of each reading"
+
+
+def step(values: Floats) -> float:
+    """Return the power of ten of which all values are whole multiples; 0 where there is none.
+
+    Fewer than `DISTINCT` different values do not tell.
+    """
+    if len(np.unique(values)) < DISTINCT:
+        return 0.0
+    for power in range(3, -10, -1):
+        size = 10.0**power
+        count = values / size
+        if np.all(np.abs(count - np.rint(count)) < 1e-6 + 1e-15 * np.abs(count)):
+            return size
+    return 0.0
+
+
+def rounding_variance(position: Floats, unit: float) -> Floats:
+    """(3,) variance Δ²/12 of each axis, m², of positions (N, 3) that are multiples of Δ.
+
+    Args:
+        position: in the file's unit.
+        unit: metres in that unit.
+    """
+    delta = unit * np.array([step(position[:, k]) for k in range(3)])
+    return np.asarray(np.where(delta > _FINEST, delta, 0.0) ** 2 / 12)
+
+
+def with_rounding(covariance: Floats, extra: Floats) -> tuple[Floats, tuple[str, ...]]:
+    """Add what rounding does to the positions, where it counts beside the stated covariance.
+
+    Args:
+        covariance: (N, m, m), m².
+        extra: (3,) variances of the rounding, m².
+    """
+    counts: Bools = extra > COUNTS * np.median(covariance[:, range(3), range(3)], axis=0)
+    if not counts.any():
+        return covariance, ()
+    out = covariance.copy()
+    out[:, range(3), range(3)] += np.where(counts, extra, 0.0)
+    std = 1e6 * float(np.sqrt(extra[counts].max()))
+    note = (
+        f"positions are rounded to {1e3 * np.sqrt(12 * extra[counts].max()):g} mm: the rounding's "
+        f"standard deviation, {std:.3g} µm, is added"
+    )
+    return out, (note,)
+
+
+def check_joint_rounding(
+    q: Floats, unit: float, name: str, covariance: Floats, reach: float
+) -> tuple[str, ...]:
+    """Return a note where rounded joint angles move the target more than the noise does.
+
+    A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
+
+    Args:
+        q: (N, n) in the file's unit.
+        unit: radians in that unit.
+        name: of the unit.
+        covariance: (N, m, m), m².
+        reach: of the arm, m.
+    """
+    size = max(step(q[:, k]) for k in range(q.shape[1]))
+    std = unit * size / np.sqrt(12)
+    noise = float(np.sqrt(np.median(covariance[:, range(3), range(3)])))
+    if std * reach <= noise:
+        return ()
+    return (
+        f"joint angles are rounded to {size:g} {name}, up to {1e3 * std * reach:.2g} mm at the "
+        f"target, more than the noise; write more digits, or count it: [repeatability] "
+        f"joint_std_rad = {std:.2g}",
+    )

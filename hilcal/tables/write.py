@@ -1,0 +1,170 @@
+"""Tables that are written: CSV or Parquet by the name's ending, revisions, plans.
+
+Numbers keep every bit: CSV has the shortest decimals that are read back exactly, Parquet the
+doubles themselves. A unit is the end of its column's name; in Parquet it is also in the field's
+metadata, and what the table is about is in the schema's, as JSON under the key `hilcal`.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.names import csv_text, escaped
+from hilcal.store.plan import UNLOADED, Plan
+from hilcal.store.revision import RevisionRecord
+from hilcal.tables.columns import TEXT, WRENCH, joint_columns
+from hilcal.tables.files import package
+from hilcal.types import Floats
+from hilcal.whole_file import replacing
+
+UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")
+"""Ends of names that are units."""
+KEY = b"hilcal"
+ORDER = "x_order"
+"""Column of a plan that numbers its readings."""
+SUFFIXES = (".csv", ".parquet")
+
+Column = Sequence[object] | np.ndarray
+"""Numbers, or words; None for a cell without a value."""
+
+
+def check_suffix(path: Path) -> None:
+    """Refuse names of other kinds of files.
+
+    Raises:
+        InputError: names the valid ones.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{path}: unknown kind of table; valid: {' or '.join(SUFFIXES)}")
+
+
+def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str, object]) -> None:
+    """Write columns of equal length; a file of that name is replaced when the new one is complete.
+
+    Args:
+        path: ends in .csv or .parquet.
+        columns: by name.
+        about: what the table is about, for the metadata of Parquet; CSV has no place for it.
+
+    Raises:
+        InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
+    """
+    check_suffix(path)
+    plain = {
+        escaped(k): v.tolist() if isinstance(v, np.ndarray) else list(v) for k, v in columns.items()
+    }
+    if path.suffix.lower() == ".parquet":
+        table = _arrow(path, plain, about)
+        parquet = package(path, "pyarrow.parquet", "Parquet")
+        with replacing(path) as new:
+            parquet.write_table(table, new)
+        return
+    with replacing(path) as new, new.open("w", encoding="utf-8", newline="") as stream:
+        out = csv.writer(stream, lineterminator="\n")
+        out.writerow(map(csv_text, plain))
+        cells = [[_cell(v) for v in values] for values in plain.values()]
+        out.writerows(zip(*cells, strict=True))
+
+
+def unit_of(name: str) -> str | None:
+    """Return the unit that a column's name ends in."""
+    if name.startswith("cov_"):
+        parts = ["rad" if part.startswith("r") else "m" for part in name.split("_")[1:3]]
+        return f"{parts[0]}2" if parts[0] == parts[1] else "m rad"
+    end = name.rpartition("_")[2]
+    return end if end in UNITS else None
+
+
+def _cell(value: object) -> object:
+    """Return a cell as CSV writes it."""
+    if isinstance(value, str):
+        return csv_text(value)
+    return "" if value is None else repr(value) if isinstance(value, float) else value
+
+
+def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
+    arrow = package(path, "pyarrow", "Parquet")
+    texts = ([escaped(v) if isinstance(v, str) else v for v in c] for c in columns.values())
+    arrays = [arrow.array(values) for values in texts]
+    fields = []
+    for name, array in zip(columns, arrays, strict=True):
+        unit = unit_of(name)
+        fields.append(arrow.field(name, array.type, metadata={"unit": unit} if unit else None))
+    schema = arrow.schema(fields, metadata={KEY: json.dumps(dict(about)).encode()})
+    return arrow.table(arrays, schema=schema)
+
+
+def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dict[str, Column]:
+    """Return what was fitted in each revision, and how well; SI.
+
+    Args:
+        records: all revisions.
+        in_use: number of the one that is used.
+    """
+    rows = [_row(r, r.number == in_use) for r in records]
+    return {name: [row[name] for row in rows] for name in (rows[0] if rows else {})}
+
+
+def _row(r: RevisionRecord, used: bool) -> dict[str, object]:
+    fitted: Mapping[str, Any] = r.result_json["identify"]
+    judged: Mapping[str, Any] = r.result_json.get("diagnose", {})
+    row: dict[str, object] = {
+        "revision": r.number,
+        "in_use": int(used),
+        "created": r.created,
+        "hilcal": r.program_version,
+        "model": " + ".join(r.effects),
+        "added": r.added,
+        "removed": r.removed,
+        "made_from": r.made_from,
+        "readings": r.options["readings"],
+        "scaling": r.options["scaling"],
+        "n_readings": int(fitted["n_readings"]),
+        "n_parameters": len(fitted["parameters"]),
+        "variance_factor": _number(fitted["variance_factor"]),
+        "verdict": judged.get("verdict"),
+    }
+    for what in ("fit", "holdout"):
+        block = fitted["error"][what]
+        for key in ("mean_m", "rms_m", "max_m"):
+            row[f"{what}_{key}"] = _number(block[key])
+        row[f"{what}_rms_sigma"] = _number(block["rms_sigma"])
+    row["readings_sha256"] = r.data_hash
+    return row
+
+
+def _number(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def plan_csv(plan: Plan, wrenches: Mapping[str, Floats] | None = None) -> str:
+    """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
+
+    The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
+    imports it.
+
+    Args:
+        plan: poses and steps.
+        wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
+
+    Raises:
+        KeyError: a load of the plan has no wrench.
+    """
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    forces = WRENCH if wrenches is not None else ()
+    writer.writerow((ORDER, *TEXT, "cycle", *joint_columns(plan.q.shape[1]), *forces))
+    for k, step in enumerate(plan.steps, start=1):
+        texts = csv_text(step.pose), csv_text(step.load)
+        row: list[object] = [k, *texts, step.cycle, *plan.joints(step.pose).tolist()]
+        if wrenches is not None:
+            free = step.load == UNLOADED
+            row += (np.zeros(6) if free else np.asarray(wrenches[step.load])).tolist()
+        writer.writerow(row)
+    return out.getvalue()
