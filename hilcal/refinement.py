@@ -5,9 +5,7 @@ from dataclasses import dataclass, replace
 
 from hilcal import limits
 from hilcal.diagnosis.background_evidence import (
-    MUCH,
     TOGETHER,
-    WORTH,
     background_evidence,
     background_is_better,
     p_value_of_others,
@@ -302,10 +300,10 @@ class Path:
     def take_background(self) -> bool:
         """Fit all other effects of the catalogue together; whether they are in the model now.
 
-        They stay as its background where the error on poses left out falls by a share worth it, and
-        more where the readings do not prove them together; where the verdict is `unknown_effect`,
-        by more than it scatters from pose to pose, since effects of the catalogue may resemble one
-        that it does not have. Where the stated noise explains the residual, and the readings do not
+        They stay as its background where the error on poses left out falls by a share worth it;
+        where the readings do not prove them together, or the verdict is `unknown_effect`, so that
+        they may resemble one that the catalogue does not have, also by more than it scatters from
+        pose to pose. Where the stated noise explains the residual, and the readings do not
         prove them, they are not tried. Those that the readings prove beside all others are then
         named, in the order of their evidence, whatever was added before.
         """
@@ -324,11 +322,10 @@ class Path:
             return False
         self._say("fitting all effects of the catalogue together")
         found = with_background(last.fit, self._given)
-        worth = WORTH if proved_together else MUCH
-        if found is None or not background_is_better(last.fit, found, worth):
+        if found is None or not background_is_better(last.fit, found):
             return False
-        unknown = last.diagnosis.verdict == "unknown_effect"
-        if unknown and not predicts_better(last.fit, found):
+        doubtful = not proved_together or last.diagnosis.verdict == "unknown_effect"
+        if doubtful and not predicts_better(last.fit, found):
             return False
         self._say("the background of all effects predicts better; diagnosing")
         self._name(found)

@@ -31,11 +31,6 @@ choice: that something is there has been shown by poses left out."""
 WORTH = 0.05
 """Share by which the rms error on poses left out must fall for a background; a choice: it has
 hundreds of parameters, and those that name an effect alone are easier to understand."""
-MUCH = 0.1
-"""The same where the readings do not prove other effects: those that were named have explained what
-they can, flat, or the arm's scatter has. A choice: of 30 poses of simulated arms whose effects are
-all named it falls by -3 to 3 %, and by 4 to 9 % where one is a transmission error; of 60 poses of a
-real UR5 by 13 to 23 %."""
 TOGETHER = 0.05
 """Chance of trying a background where nothing but noise of another size, or the arm's scatter, is
 there; a choice: the error on poses left out has to fall, too."""
@@ -93,7 +88,7 @@ def p_value_of_others(of: Fit) -> float:
     return evidence(problem, numbers, np.random.default_rng(SEED), start).p_value
 
 
-def background_is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
+def background_is_better(before: Fit, after: Fit) -> bool:
     """Whether a background belongs to the model.
 
     The error on poses left out must fall by a share, both weighted by the noise of the latter.
@@ -101,11 +96,10 @@ def background_is_better(before: Fit, after: Fit, worth: float = WORTH) -> bool:
     Args:
         before: the fit of the named effects alone.
         after: the fit of all, each with its standard deviation.
-        worth: the share.
     """
     raw, w = all_left_out(after)
     one, other = (float(np.sum(w.whiten(r) ** 2)) for r in (all_left_out(before)[0], raw))
-    return other <= (1 - worth) ** 2 * one
+    return other <= (1 - WORTH) ** 2 * one
 
 
 def background_evidence(fit: Fit) -> tuple[BackgroundEffect, ...]:
