@@ -175,7 +175,8 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
             return measured(with_new_names(more, plan, 2), 2, last + BREAK)
 
         def missing(of: CampaignFile, epoch: float | None = None) -> None:
-            log, number = RunLog(of), len(of.path.name)
+            # Campaigns beside the first one are told by what their names have beyond its own.
+            log, number = RunLog(of), 3 + len(of.path.stem) - len(told.output.stem)
             begun = last_time(campaign.readings()) + number * BREAK
             drawn = read_plan(secret, log.plan, [told.seed, number], begun).readings
             for k, step in enumerate(log.plan.steps):
