@@ -3,8 +3,8 @@
 At given variances rows that are predicted without their fold are off by e with the variance v (see
 `mixed.prediction.left_out`). With x = (log s, η) drawn from its posterior, by weights from the
 normal approximation at its maximum x̂, the mean square is E[Σ v] + E|e − E e|². The factor is its
-ratio to Σ v at x̂. Source: Kackar and Harville, *Approximations for standard errors
-of estimators of fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
+ratio to Σ v at x̂. Source: Kackar and Harville, *Approximations for standard errors of estimators of
+fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
 """
 
 import numpy as np
@@ -20,10 +20,10 @@ from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
 
 MOST_ROWS = 600
-"""Elements of readings beyond which the variances are taken for known: 500 of them widen a
-prediction by 2 to 5 %, and a draw costs the cube of the rows. A choice."""
+"""Elements of readings beyond which the variances are taken for known: of 200 poses of a real UR10
+the factor is 1.00 to 1.06, and a draw costs the cube of the rows. A choice."""
 DRAWS = 30
-"""Of the posterior; a choice: the factor then varies by 3 %."""
+"""Of the posterior; a choice: of 20 poses of a real UR10 the factor is 1.19 to 1.43 by the seed."""
 HEAVIEST = 2.0
 """log of the largest weight of a draw over the median: the normal approximation is not exact in its
 tails. A choice."""
