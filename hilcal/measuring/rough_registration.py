@@ -46,6 +46,7 @@ class RoughRegistration:
         self._target: list[int] = []
         self._step: list[Step | None] = []
         self._doubted: list[int] = []
+        self._repeated: list[tuple[Step, str]] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
         """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
@@ -62,13 +63,16 @@ class RoughRegistration:
         self._step.append(step)
 
     def late_doubts(self) -> list[tuple[Step, str]]:
-        """Return the stored readings that cannot be of their target, each once, and why.
+        """Return the stored readings that may not be of their target, each once, and why.
 
-        They were stored while nothing told where the tracker stands. Empty until it is known.
+        They were stored while nothing told where the tracker stands: those that do not fit as soon
+        as that is known, and until then the one that the next reading repeated, which may be of
+        something at rest itself.
         """
         pose = self.pose()
         if pose is None:
-            return []
+            told, self._repeated = self._repeated, []
+            return told
         far = _far(pose, np.array(self._held), np.array(self._seen))
         out = []
         for k, step in enumerate(self._step):
@@ -80,6 +84,20 @@ class RoughRegistration:
                 )
                 out += [] if step is None else [(step, why)]
         return out
+
+    def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
+        """Doubt the reading that a refused one repeats, unless the tracker's place vouches for it.
+
+        The arguments are those of `add`.
+        """
+        if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
+            return
+        last = max(k for k, t in enumerate(self._target) if t == target)
+        step = self._step[last]
+        if step is not None and last not in self._doubted:
+            self._doubted.append(last)
+            why = "the next reading saw the same place from another pose; a reflector at rest?"
+            self._repeated.append((step, why))
 
     def pose(self) -> tuple[Floats, Floats] | None:
         """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.

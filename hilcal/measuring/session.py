@@ -334,6 +334,10 @@ class Session:
         if wrong is not None:
             for told in details:
                 self._event("doubted", {"why": str(wrong), "reading": told})
+            for one in found:
+                position = one.measured.mean.value[:3]
+                self._state.registration.doubt_repeated(one.measured.q, position, one.target or 0)
+            self._look_back()
             raise wrong
 
     def _look_back(self) -> None:

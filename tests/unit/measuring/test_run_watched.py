@@ -1,6 +1,6 @@
 """A person beside the arm: it is moved, leaned on, a load falls; and devices that repeat."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -555,6 +555,28 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named_with_its_fi
         measure(b)
     assert len(b.store.rows) == 2
     assert "why" in b.store.last("doubted")
+    doubted = [told["reading"] for kind, told in b.store.events if told.get("stored")]
+    # it may be of something at rest itself: nothing tells yet where the tracker stands
+    assert doubted == [asdict(b.store.rows[1][0])]
+
+
+def test_a_reading_that_is_repeated_is_not_doubted_where_the_place_of_the_tracker_vouches_for_it() -> (
+    None
+):
+    b = Bench()
+    place = b.world.position
+    kept: list[Any] = []
+
+    def stuck() -> Any:
+        if len(b.store.rows) < 8:
+            kept[:] = [place()]
+        return kept[0]
+
+    b.world.position = stuck  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="repeats an old reading"):
+        measure(b)
+    assert len(b.store.rows) == 8
+    assert not [told for _, told in b.store.events if told.get("stored")]
 
 
 def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on() -> None:
