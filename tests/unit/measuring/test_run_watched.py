@@ -560,9 +560,7 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named_with_its_fi
     assert doubted == [asdict(b.store.rows[1][0])]
 
 
-def test_a_reading_that_is_repeated_is_not_doubted_where_the_place_of_the_tracker_vouches_for_it() -> (
-    None
-):
+def test_a_repeated_reading_is_not_doubted_where_the_tracker_s_place_vouches_for_it() -> None:
     b = Bench()
     place = b.world.position
     kept: list[Any] = []
