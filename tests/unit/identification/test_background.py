@@ -13,6 +13,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import baseline
+from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
@@ -99,3 +100,20 @@ def test_what_it_moves_is_told_by_effect(found: Refinement) -> None:
     assert set(of.effects) == set(found.fit.model.background)
     listed = {p.name for p in found.fit.parameters}
     assert not any(name.split(".")[0] in found.fit.model.background for name in listed)
+
+
+def test_the_sizes_of_its_families_are_told_with_intervals(found: Refinement) -> None:
+    sizes = family_sizes(found.fit)
+    effects = {s.effect for s in sizes}
+    model = found.fit.model
+    assert effects == set(model.names) - {"base_frame", "target_offset"}
+    assert {s.effect for s in sizes if s.named} == effects & set(model.named)
+    assert all(0.0 < s.low < s.std < s.high for s in sizes)
+    assert sizes[0].moves_m == max(s.moves_m for s in sizes)
+    assert sizes[0].effect in {"link_geometry", "transmission_error"}
+    waves = {s.name: s.unit for s in sizes if s.effect == "transmission_error"}
+    assert set(waves.values()) == {"rad"}
+    # what moves nothing is known by its prior alone
+    widths = [s.high / s.low for s in sizes]
+    assert widths[0] < 0.2 * max(widths)
+    assert family_sizes(found.steps[0].fit) == ()
