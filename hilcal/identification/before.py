@@ -5,10 +5,9 @@ from functools import lru_cache
 import numpy as np
 
 from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.identification.errors import ErrorBlock, error_block
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.residual import residual
+from hilcal.identification.residual import ErrorBlock, error_block, residual
 from hilcal.model.model import Model
 from hilcal.readings.whitening import whitening
 

@@ -1,8 +1,8 @@
 """Which readings are gross errors: data snooping (Baarda) from a robust start.
 
-Least trimmed squares (`robust_start`) finds the readings, more than half, that agree best on the
-model. What a model without some effect leaves of them sizes smooth nuisance functions that stand in
-for it, as random effects. Then readings join or leave by their distance t² from the fit to the
+Least trimmed squares finds the readings, more than half, that agree best on the model. What a model
+without some effect leaves of them sizes smooth nuisance functions that stand in for it, as random
+effects. Then readings join or leave by their distance t² from the fit to the
 others, which is χ²_m of a good reading (`reading_model`), until none does.
 
 Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
@@ -15,13 +15,19 @@ from typing import Literal
 import numpy as np
 from scipy.stats import binom, chi2
 
+from hilcal.identification.common_cause import along_one_site, off_alike, site_columns
 from hilcal.identification.gauss_newton import Solution
-from hilcal.identification.off_alike import off_alike
-from hilcal.identification.outliers import MISFIT, bulk, limit
+from hilcal.identification.least_trimmed_squares import (
+    MISFIT,
+    MOST,
+    bulk,
+    limit,
+    nearest,
+    robust_start,
+    variance,
+)
 from hilcal.identification.priors import scales_of
 from hilcal.identification.reading_model import ReadingModel
-from hilcal.identification.robust_start import MOST, nearest, robust_start, variance
-from hilcal.identification.single_site import along_one_site, site_columns
 from hilcal.identification.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.reading_groups import deflection_groups

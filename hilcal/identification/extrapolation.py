@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.predictive import Predictive
+from hilcal.identification.residual import ErrorBlock
+from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import Validation
-from hilcal.identification.whole_turns import whole_turns
 from hilcal.readings.ranges import ranges_of, turning_variables, variables
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, inverse_root

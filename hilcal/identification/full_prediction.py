@@ -2,9 +2,8 @@
 
 from dataclasses import dataclass
 
-from hilcal.identification.errors import noise_floor
 from hilcal.identification.fit import Fit, mahalanobis2
-from hilcal.identification.residual import residual
+from hilcal.identification.residual import noise_floor, residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening

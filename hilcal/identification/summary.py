@@ -1,7 +1,7 @@
 """A fit as plain text, for an interactive session; `hilcal.present` writes it for a terminal."""
 
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.estimates import Estimates
+from hilcal.identification.residual import ErrorBlock
 
 
 def summary(

@@ -27,16 +27,16 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.coordinates import coordinates_of
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.estimates import Estimates
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.gauss_newton import over_all_parameters, prior_coordinates
+from hilcal.identification.least_trimmed_squares import bulk, limit
 from hilcal.identification.minimise import Point, Problem, linear_problem, minimise
-from hilcal.identification.outliers import bulk, limit
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.regularisation import LinearProblem, Regularisation, spent_parameters
+from hilcal.identification.residual import ErrorBlock
 from hilcal.identification.uncertainty import (
     MISFIT_CHANCE,
     identifiable_parameters,

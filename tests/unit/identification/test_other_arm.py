@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.identification.other_arm import BEYOND_NOISE, other_arm, other_arm_of
+from hilcal.identification.misdescription import BEYOND_NOISE, other_arm, other_arm_of
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot.catalogue import load_arm, robot_names
