@@ -10,7 +10,6 @@ from hilcal.config import CellConfig, Tracker
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.registration import register
 from hilcal.readings.covariance import (
-    COVERS,
     INSTRUMENT,
     WHOLE,
     arrival_factors,
@@ -20,7 +19,6 @@ from hilcal.readings.covariance import (
 )
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
-from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.uncertainty import rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -36,21 +34,12 @@ CovarianceParts = Literal[
 """
 
 
-def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) -> Readings:
-    """Return all readings of a campaign with their full covariance, see `readings.covariance`.
-
-    The arm's repeatability is added where the stored covariances cover the instrument alone.
-
-    Raises:
-        InputError: there are no readings yet, or they are damaged.
-    """
-    return full_readings(campaign.readings(), campaign.about(COVERS), cell, config)
-
-
 def full_readings(
     readings: Readings, covers: str | None, cell: Cell, config: CellConfig
 ) -> Readings:
-    """Return readings with their full covariance.
+    """Return readings with their full covariance, see `readings.covariance`.
+
+    The arm's repeatability is added where the covariances cover the instrument alone.
 
     Args:
         readings: with the covariance of a file or a table.

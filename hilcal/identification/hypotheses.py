@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Any
 
 import numpy as np
 
@@ -141,13 +142,20 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
-def _turned(d: Described, turn: Callable[[Floats], Floats]) -> Described:
-    return d if d.turn is None else replace(d, turn=turn(d.turn))
+def _mapped(name: str, by: Callable[[Any], object]) -> Callable[[Described, Hypothesis], Described]:
+    """Return what maps one attribute of the description, where there is one."""
+
+    def applied(d: Described, _: Hypothesis) -> Described:
+        given = getattr(d, name)
+        return d if given is None else replace(d, **{name: by(given)})
+
+    return applied
 
 
 def _mirrored(d: Described, _: Hypothesis) -> Described:
     # D exp(w) D = exp(−D w) for a reflection D
-    return _turned(replace(d, value=d.value * MIRROR), lambda w: -w * MIRROR)
+    turn = None if d.turn is None else -d.turn * MIRROR
+    return replace(d, value=d.value * MIRROR, turn=turn)
 
 
 def _inverse(d: Described, _: Hypothesis) -> Described:
@@ -193,52 +201,40 @@ KINDS: dict[str, Kind] = {
     "joint": Kind(_recounted, _joint_words, ""),
     "coupling": Kind(_recounted, _coupling_words, ""),
     "base_unknown": Kind(
-        lambda d, _: replace(d, base_unknown=True),
+        _mapped("base_unknown", lambda _: True),
         "the base stands elsewhere than [tracker] says",
         "leave out [tracker] base_xyz_m and base_rotvec_rad",
     ),
     "target_unknown": Kind(
-        lambda d, _: replace(d, target_unknown=True),
+        _mapped("target_unknown", lambda _: True),
         "the target sits elsewhere than [tool] says",
         "leave out [tool] target_m",
     ),
     "millimetres": Kind(
-        lambda d, _: replace(d, value=1e-3 * d.value),
-        "the positions are millimetres, not metres",
+        _mapped("value", lambda p: 1e-3 * p), "the positions are millimetres, not metres"
     ),
     "metres": Kind(
-        lambda d, _: replace(d, value=1e3 * d.value),
+        _mapped("value", lambda p: 1e3 * p),
         "the positions are metres, and were taken for millimetres",
     ),
-    "joint_degrees": Kind(
-        lambda d, _: replace(d, q=np.radians(d.q)),
-        "the joint values are degrees, not radians",
-    ),
+    "joint_degrees": Kind(_mapped("q", np.radians), "the joint values are degrees, not radians"),
     "joint_radians": Kind(
-        lambda d, _: replace(d, q=np.degrees(d.q)),
-        "the joint values are radians, and were taken for degrees",
+        _mapped("q", np.degrees), "the joint values are radians, and were taken for degrees"
     ),
-    "turn_degrees": Kind(
-        lambda d, _: _turned(d, np.radians),
-        "the attitudes are degrees, not radians",
-    ),
+    "turn_degrees": Kind(_mapped("turn", np.radians), "the attitudes are degrees, not radians"),
     "turn_radians": Kind(
-        lambda d, _: _turned(d, np.degrees),
-        "the attitudes are radians, and were taken for degrees",
+        _mapped("turn", np.degrees), "the attitudes are radians, and were taken for degrees"
     ),
     "mirrored": Kind(
         _mirrored, "the axes of the readings are left-handed: one coordinate has the other sign"
     ),
     "mirrored_positions": Kind(
-        lambda d, _: replace(d, value=d.value * MIRROR),
-        "one coordinate of the positions has the other sign",
+        _mapped("value", lambda p: p * MIRROR), "one coordinate of the positions has the other sign"
     ),
     "inverse": Kind(
         _inverse, "the poses are the inverse ones, of the tracker in the target's axes"
     ),
-    "inverse_attitude": Kind(
-        lambda d, _: _turned(d, np.negative), "the attitudes are the inverse ones"
-    ),
+    "inverse_attitude": Kind(_mapped("turn", np.negative), "the attitudes are the inverse ones"),
     "shift": Kind(
         lambda d, h: replace(d, q=np.roll(d.q, -h.shift, axis=0), shift=d.shift + h.shift),
         _shift_words,

@@ -87,11 +87,6 @@ def limit(m: int, count: int, scale: float = 1.0) -> float:
     return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
-def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> Bools:
-    """(N,) the h readings of least squared distance (N,), and centres."""
-    return _nearest(of, d2, centre)[0]
-
-
 def _trusted(of: ReadingModel, n: int) -> int:
     """Return h, how many of n readings that are no centres."""
     wrong = int(MOST * np.count_nonzero(of.tested))
@@ -105,7 +100,8 @@ def variance(of: ReadingModel, d2: Floats, centre: Bools) -> float:
     return float(others[half - 1] / chi2.ppf(half / (len(others) + 1), of.m))
 
 
-def _nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
+def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
+    """(N,) the h readings of least squared distance (N,), and centres; and the sum of these."""
     others = np.flatnonzero(of.tested & ~centre)
     h = _trusted(of, len(others))
     chosen = others[np.argpartition(d2[others], h - 1)[:h]] if h else others
@@ -123,12 +119,12 @@ def _trimmed(of: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]
     tried = []
     for _ in range(int(min(np.ceil(starts), STARTS))):
         near = part.near(_from_few(part, rng))
-        tried.append(_nearest(part, *near))
+        tried.append(nearest(part, *near))
     tried.sort(key=lambda each: each[1])
     best = [_concentrated(part, used, LAST) for used, _ in tried[:BEST]]
     _, used, delta = min(best, key=lambda each: each[0])
     if part is not of:
-        _, used, delta = _concentrated(of, nearest(of, *of.near(delta)), LAST)
+        _, used, delta = _concentrated(of, nearest(of, *of.near(delta))[0], LAST)
     return used, delta
 
 
@@ -137,7 +133,7 @@ def _concentrated(of: ReadingModel, used: Bools, steps: int) -> tuple[float, Boo
     total = np.inf
     for _ in range(steps):
         delta = of.fitted(used)[0]
-        used, now = _nearest(of, *of.near(delta))
+        used, now = nearest(of, *of.near(delta))
         if now >= total * (1 - 1e-9):
             break
         total = now

@@ -17,9 +17,11 @@ errors would be larger than 2/3 |d|, and lie along d.
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError, InputError
@@ -33,6 +35,7 @@ from hilcal.identification.hypotheses import (
     pairs,
 )
 from hilcal.identification.registration import Registration, register
+from hilcal.identification.residual import noise_floor
 from hilcal.identification.rigid_frames import (
     Frames,
     Placement,
@@ -88,8 +91,9 @@ HALF = 0.5
 """Share of the described arm's misfit that another one may leave to be named. A choice: of 900
 simulated arms off by 1 and 3 mm and mrad none was named another one
 (`tests/unit/identification/test_other_arm.py` keeps a part of them)."""
-STEP, ZERO_STEPS = 1e-4, 20
-"""Finite difference of a zero, rad; and most steps from each start. Choices."""
+ZEROS = tuple(np.radians([0.0, 45.0, -45.0, 135.0, -135.0]).tolist())
+ZERO_WIDTH, ZERO_EXACT = np.pi / 4, 1e-7
+"""Zeros of a joint that the search begins at, how far it goes from them, and its end, rad."""
 BEYOND_NOISE = 3.0
 """Misfit in standard deviations of the readings from which on other arms are tried; a choice."""
 ARM_ROWS, ARM_STEPS = 100, 10
@@ -229,7 +233,7 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     cell, gate = registered.cell, gate_of(registered.cell.arm.reach)
     # A base that is told shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
-    far, rms, noise = registered.far, _size(registered.off), _noise(readings)
+    far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
     nothing = np.zeros_like(far)
     if far.any():
         others = _size(registered.off[~far])
@@ -237,83 +241,26 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
         shifted = search.shifted()
         if shifted:
             return Finding(rms, gate, shifted, nothing, (), search.tried)
-        swapped = search.swapped(search.robust(()), np.flatnonzero(far))
+        swapped = search.swapped(far)
         return Finding(rms if swapped else others, gate, (), far, swapped, 1)
     if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)
     search = _Search(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
-    whole = search.robust(())
-    bad = whole.far
+    near, bad, _ = search.robust(())
     if bad.any() and (shifted := search.shifted()):
         return Finding(rms, gate, shifted, nothing, (), search.tried)
     few = bool(bad.any() and bad.mean() <= WRONG_ROWS)
-    if few and whole.rms <= search.enough:
-        return Finding(rms, gate, (), bad, search.swapped(whole, np.flatnonzero(bad)), 1)
+    if few and near <= search.enough:
+        return Finding(rms, gate, (), bad, search.swapped(bad), 1)
     found = search.explain(gate, DEPTH if rms > gate else 1)
     if not found and rms <= gate:
         return None
-    if not found and few and whole.rms <= gate:
+    if not found and few and near <= gate:
         return Finding(rms, gate, (), bad, (), search.tried)
-    rows = search.robust(found[0].changes).far if found else nothing
+    rows = search.robust(found[0].changes)[1] if found else nothing
     rows = rows if rows.mean() <= WRONG_ROWS else nothing
     return Finding(rms, gate, found, rows, (), search.tried)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Robust:
-    """A registration by most of the rows.
-
-    Attributes:
-        rms: of the rows that fit, m.
-        far: (N,) those that do not.
-        at: the frames, of the rows that have a position.
-    """
-
-    rms: float
-    far: Bools
-    at: Placement
-
-
-@dataclass(frozen=True, eq=False)
-class _WithZero:
-    """Frames and the zero of a joint: a point of `solver.minimise`.
-
-    Attributes:
-        search: has the readings.
-        way: what is otherwise beside the zero.
-        joint: its number.
-        zero: rad.
-        frames: base and targets.
-    """
-
-    search: "_Search"
-    way: Way
-    joint: int
-    zero: float
-    frames: Frames
-
-    @cached_property
-    def at(self) -> Placement:
-        """The frames beside the readings."""
-        return self._placed(self.zero)
-
-    @property
-    def residual(self) -> Floats:
-        return self.at.residual
-
-    def jacobian(self) -> Floats:
-        ahead = self._placed(self.zero + STEP).residual
-        return np.column_stack([self.at.jacobian(), (self.residual - ahead) / STEP])
-
-    def moved(self, step: Floats) -> "_WithZero":
-        zero = self.zero + float(np.clip(step[-1], -0.5, 0.5))
-        return replace(self, zero=_wrapped(zero), frames=self.at.moved(step[:-1]).frames)
-
-    def _placed(self, zero: float) -> Placement:
-        way = (*self.way, Hypothesis("joint", self.joint, 1, zero))
-        seen, _, free = self.search.problem(way, self.search.few)
-        return Placement(seen, self.frames, free)
 
 
 class _Search:
@@ -330,10 +277,11 @@ class _Search:
             not cell.registration_known,
             not all(cell.known_targets),
         )
-        self.few = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
+        self._few = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
         flange = chains.evaluate(cell.arm, self._whole.q).position[-1]
         self._extent = min(_extent(readings.value[:, :3]), _extent(flange))
         self.score = lru_cache(maxsize=None)(self._score)
+        self.robust = lru_cache(maxsize=None)(self._robust)
 
     def explain(self, gate: float, most: int) -> tuple[Explanation, ...]:
         """Return the shortest combination that explains the readings, and its likes."""
@@ -409,11 +357,17 @@ class _Search:
         def zeroed(zero: float) -> Way:
             return (*way, Hypothesis("joint", joint, 1, zero))
 
-        grid = [float(np.radians(d)) for d in (0.0, 45.0, -45.0, 135.0, -135.0)]
-        begin = min(grid, key=lambda zero: self.score(zeroed(zero), True))
-        frames = self._best(*self.problem(zeroed(begin), self.few), rough=True).frames
-        found = minimise(_WithZero(self, way, joint, begin, frames), ZERO_STEPS)
-        return found.zero, _rms(found.at)
+        def placed(zero: float) -> Placement:
+            return self._best(*self._problem(zeroed(zero), self._few), rough=True)
+
+        begin = min(ZEROS, key=lambda zero: self.score(zeroed(zero), True))
+        found = minimize_scalar(
+            lambda zero: placed(zero).square,
+            bounds=(begin - ZERO_WIDTH, begin + ZERO_WIDTH),
+            method="bounded",
+            options={"xatol": ZERO_EXACT},
+        )
+        return _wrapped(found.x), _rms(placed(found.x))
 
     def _score(self, way: Way, rough: bool = False) -> float:
         """Misfit of the nominal arm under some hypotheses, m; in units of the positions as given.
@@ -423,14 +377,14 @@ class _Search:
             rough: in few steps from few starts.
         """
         self.tried += 1
-        at = self._best(*self.problem(way, self.few), rough)
+        at = self._best(*self._problem(way, self._few), rough)
         return _rms(at) * max(1.0, self._extent / max(_extent(at.seen.value), 1e-12))
 
     def _best(self, seen: Seen, given: Frames, free: Bools, rough: bool = False) -> Placement:
         steps, rotated = (6, 0) if rough else (15, 2)
         return best_placement(seen, given, free, self.enough, steps, rotated)
 
-    def problem(self, way: Way, rows: Ints) -> tuple[Seen, Frames, Bools]:
+    def _problem(self, way: Way, rows: Ints) -> tuple[Seen, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
         d = self._described(way)
         rows = rows[d.paired[rows]]
@@ -459,9 +413,13 @@ class _Search:
             d = h.applied(d)
         return d
 
-    def robust(self, way: Way) -> _Robust:
-        """Registration by most of the rows: reweighted until the others do not matter."""
-        seen, given, free = self.problem(way, np.arange(len(self._readings)))
+    def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
+        """Registration by most of the rows: reweighted until the others do not matter.
+
+        Returns:
+            Rms of the rows that fit, m; (N,) those that do not; and the frames.
+        """
+        seen, given, free = self._problem(way, np.arange(len(self._readings)))
         at = self._best(seen, given, free)
         scale = np.inf
         for _ in range(12):
@@ -475,17 +433,17 @@ class _Search:
         far = distance > 8.0 * max(float(np.median(distance)), self.enough / 10)
         everywhere = np.zeros(len(self._readings), dtype=bool)
         everywhere[self._described(way).paired] = far
-        return _Robust(float(np.sqrt(np.mean(distance[~far] ** 2))), everywhere, at)
+        return float(np.sqrt(np.mean(distance[~far] ** 2))), everywhere, at
 
-    def swapped(self, whole: _Robust, rows: Ints) -> tuple[tuple[int, int], ...]:
-        """Pairs of rows whose readings fit each other's place."""
-        out: list[tuple[int, int]] = []
-        for k, i in enumerate(rows[:30]):
-            for j in rows[k + 1 : 30]:
-                there, back = whole.at.seen[np.array([i, j])], whole.at.seen[np.array([j, i])]
-                crossed = replace(there, value=back.value, attitude=back.attitude)
-                if _size(crossed.misfit(whole.at.frames)) <= 3.0 * max(self.enough, whole.rms):
-                    out.append((int(i), int(j)))
+    def swapped(self, far: Bools) -> tuple[tuple[int, int], ...]:
+        """Pairs of rows that do not fit (N,) whose readings fit each other's place."""
+        near, _, at = self.robust(())
+        out = []
+        for i, j in combinations(np.flatnonzero(far)[:30].tolist(), 2):
+            there, back = at.seen[np.array([i, j])], at.seen[np.array([j, i])]
+            crossed = replace(there, value=back.value, attitude=back.attitude)
+            if _size(crossed.misfit(at.frames)) <= 3.0 * max(self.enough, near):
+                out.append((i, j))
         return tuple(out)
 
 
@@ -526,11 +484,6 @@ def _extent(positions: Floats) -> float:
     return float(np.sqrt(np.mean(np.sum((positions - positions.mean(axis=0)) ** 2, axis=1))))
 
 
-def _noise(readings: Readings) -> float:
-    """Rms of the stated 3-D noise, m."""
-    return float(np.sqrt(np.mean(np.trace(readings.covariance[:, :3, :3], axis1=1, axis2=2))))
-
-
 @dataclass(frozen=True, slots=True)
 class OtherArm:
     """An arm of the catalogue that fits better than the described one.
@@ -558,7 +511,7 @@ def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
         readings: the readings.
     """
     cell = registered.cell
-    if registered.rms <= BEYOND_NOISE * _noise(readings):
+    if registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None
     spread = np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))
     tried = [(_left(cell, arm, readings[spread]), arm) for arm in _others(cell)]

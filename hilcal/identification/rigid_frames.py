@@ -10,7 +10,7 @@ a shift and a turn, flange axes; all in ordinary sizes.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -99,14 +99,8 @@ class Seen:
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Seen":
         """Return the chosen readings."""
-        return Seen(
-            self.rotation[rows],
-            self.position[rows],
-            self.value[rows],
-            None if self.attitude is None else self.attitude[rows],
-            self.root[rows],
-            self.target[rows],
-        )
+        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
+        return replace(self, **{name: a[rows] for name, a in given.items()})
 
     def points(self, frames: Frames) -> Floats:
         """(N, 3) predicted positions of the targets, base axes, m."""

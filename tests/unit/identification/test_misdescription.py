@@ -12,8 +12,7 @@ from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
-from tests.unit.identification.test_registration import CELL, pose_of, told
-from tests.unit.identification.test_registration_undetermined import BASE, OFFSET
+from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
 
 def readings_of(change: Hypothesis | None, m: int, noise: float = 5e-5):
