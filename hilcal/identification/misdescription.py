@@ -48,10 +48,9 @@ from hilcal.identification.rigid_frames import (
 from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
-from hilcal.robot import chain as chains
-from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
 from hilcal.types import Bools, Floats, Ints
 
@@ -278,7 +277,7 @@ class _Search:
             not all(cell.known_targets),
         )
         self._few = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
-        flange = chains.evaluate(cell.arm, self._whole.q).position[-1]
+        flange = evaluate(cell.arm, self._whole.q).position[-1]
         self._extent = min(_extent(readings.value[:, :3]), _extent(flange))
         self.score = lru_cache(maxsize=None)(self._score)
         self.robust = lru_cache(maxsize=None)(self._robust)
@@ -316,7 +315,8 @@ class _Search:
 
         Where a pose has many readings, only its last one is wrong, and looks like a gross error.
         """
-        tried = {(h,): self.score((h,)) for h in hypotheses(self._whole) if h.kind == "shift"}
+        ways: list[Way] = [(h,) for h in hypotheses(self._whole) if h.kind == "shift"]
+        tried = {way: self.score(way) for way in ways}
         return _explained(tried, min(self.enough, self.score(()) / FACTOR))
 
     def _enough(self, tried: dict[Way, float], base: float) -> tuple[Explanation, ...]:
@@ -388,16 +388,9 @@ class _Search:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
         d = self._described(way)
         rows = rows[d.paired[rows]]
-        chain = chains.evaluate(d.arm, d.q[rows])
-        m = 3 if d.turn is None else 6
-        seen = Seen(
-            np.ascontiguousarray(chain.rotation[-1]),
-            np.ascontiguousarray(chain.position[-1]),
-            d.value[rows],
-            None if d.turn is None else se3.rotation(d.turn[rows]),
-            np.broadcast_to(np.diag(_levers(m)), (len(rows), m, m)),
-            self._readings.target[rows],
-        )
+        turn, m = (None, 3) if d.turn is None else (d.turn[rows], 6)
+        root = np.broadcast_to(np.diag(_levers(m)), (len(rows), m, m))
+        seen = Seen.at(d.arm, d.q[rows], d.value[rows], turn, root, self._readings.target[rows])
         cell = self._cell
         # What was estimated with the wrong description is no start for another one.
         base = cell.registration if cell.registration_known else np.eye(4)

@@ -78,14 +78,23 @@ class Seen:
     @classmethod
     def of(cls, arm: Arm, readings: Readings) -> "Seen":
         """Return the readings beside the flange poses of a nominal arm."""
-        chain = evaluate(arm, angles(readings))
+        value, root = readings.value, inverse_roots(readings.covariance)
+        turn = value[:, 3:] if readings.m == 6 else None
+        return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
+
+    @classmethod
+    def at(
+        cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
+    ) -> "Seen":
+        """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
+        chain = evaluate(arm, q)
         return cls(
             np.ascontiguousarray(chain.rotation[-1]),
             np.ascontiguousarray(chain.position[-1]),
-            readings.value[:, :3],
-            se3.rotation(readings.value[:, 3:]) if readings.m == 6 else None,
-            inverse_roots(readings.covariance),
-            readings.target,
+            value,
+            None if turn is None else se3.rotation(turn),
+            root,
+            target,
         )
 
     @property

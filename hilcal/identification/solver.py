@@ -65,7 +65,7 @@ def minimise(at: P, steps: int = STEPS, damping: float = DAMPING, settled: float
         # In units of each column as well, so that nothing runs away.
         largest = h.diagonal().max()
         guard = damping * (h.diagonal() + 1e-6 * largest) + 1e-12 * largest + 1e-300
-        step = np.linalg.solve(h + np.diag(guard), gradient)
+        step: Floats = np.asarray(np.linalg.solve(h + np.diag(guard), gradient), dtype=float)
         try:
             trial = at.moved(step)
             now = float(trial.residual @ trial.residual)
