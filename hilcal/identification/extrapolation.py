@@ -117,11 +117,5 @@ def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:
     """Errors of some measurements, each whitened by itself."""
     if not mine.any():
         return None
-    distance = np.linalg.norm(raw[mine, :3], axis=1)
     white = np.einsum("dij,dj->di", inverse_root(w.covariance[mine]), raw[mine])
-    return ErrorBlock(
-        rms_m=float(np.sqrt(np.mean(distance**2))),
-        mean_m=float(distance.mean()),
-        max_m=float(distance.max()),
-        rms_sigma=float(np.sqrt(np.mean(white**2))),
-    )
+    return ErrorBlock.of(raw[mine], white, white.size)

@@ -6,9 +6,8 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identification.background import background_of
-from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.identification.gross_errors import disagreement_words, gross_errors
 from hilcal.identification.registration import register
 from hilcal.identification.weight import weight_note

@@ -45,6 +45,17 @@ class ErrorBlock:
     max_m: float
     rms_sigma: float
 
+    @classmethod
+    def of(cls, raw: Floats, white: Floats, rank: int) -> "ErrorBlock":
+        """Summarise residuals (D, m), by their whitened elements, of which `rank` tell anything."""
+        distance = np.linalg.norm(raw[:, :3], axis=1)
+        return cls(
+            rms_m=float(np.sqrt(np.mean(distance**2))),
+            mean_m=float(distance.mean()),
+            max_m=float(distance.max()),
+            rms_sigma=float(np.linalg.norm(white) / np.sqrt(max(rank, 1))),
+        )
+
     def to_json(self) -> dict[str, float]:
         """Keys and values of the contract."""
         return asdict(self)
@@ -52,13 +63,7 @@ class ErrorBlock:
 
 def error_block(raw: Floats, w: Whitening) -> ErrorBlock:
     """Summarise residuals (D, m) and their whitened elements."""
-    distance = np.linalg.norm(raw[:, :3], axis=1)
-    return ErrorBlock(
-        rms_m=float(np.sqrt(np.mean(distance**2))),
-        mean_m=float(distance.mean()),
-        max_m=float(distance.max()),
-        rms_sigma=float(np.linalg.norm(w.whiten(raw)) / np.sqrt(max(w.rank, 1))),
-    )
+    return ErrorBlock.of(raw, w.whiten(raw), w.rank)
 
 
 def noise_floor(covariance: Floats) -> float:
