@@ -143,7 +143,7 @@ def linear_problem(
     return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)
 
 
-def minimise(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
+def minimum(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
     """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
     model, of = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
