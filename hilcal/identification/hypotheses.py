@@ -142,7 +142,7 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
-def _mapped(name: str, by: Callable[[Any], object]) -> Callable[[Described, Hypothesis], Described]:
+def _mapped(name: str, by: Callable[[Any], Any]) -> Callable[[Described, Hypothesis], Described]:
     """Return what maps one attribute of the description, where there is one."""
 
     def applied(d: Described, _: Hypothesis) -> Described:
