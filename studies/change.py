@@ -27,7 +27,7 @@ from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.earlier import Earlier, earlier_fit
 from hilcal.identification.fit import fit
-from hilcal.identification.remeasured import setting
+from hilcal.identification.later_readings import setting
 from hilcal.readings.readings import Readings
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats

@@ -7,8 +7,8 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.extrapolation import Beyond, Extrapolation
+from hilcal.identification.residual import ErrorBlock
 from hilcal.identification.validation import Validation
 from hilcal.present.document import Block, Table, note, table
 from hilcal.store.plan import UNLOADED

@@ -7,9 +7,8 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import names
+from hilcal.identification.full_prediction import error_before, names
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
 from hilcal.present.verdict import headline, message

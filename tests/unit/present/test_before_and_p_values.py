@@ -11,10 +11,9 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
 from hilcal.identification.baseline import baseline
-from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.diagnosis import diagnosis_report, suspects_table
 from hilcal.present.diagnosis_json import to_json as diagnosis_json

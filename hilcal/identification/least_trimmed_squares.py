@@ -8,6 +8,8 @@ make good ones look wrong. A fit to the h readings that are nearest to a model h
 (concentration); it is begun from many random subsets that just determine the model, and the lowest
 sum of all is taken.
 
+From the bulk of the distances follows the limit from which on a reading is a gross error (`limit`).
+
 Source: Rousseeuw and Van Driessen, *Computing LTS regression for large data sets*, Data Mining and
 Knowledge Discovery 12 (2006) 29-45.
 """
@@ -17,8 +19,8 @@ from typing import Protocol, Self, TypeVar
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.errors import CannotAnswerError
 from hilcal.identification.reading_model import ReadingModel
+from hilcal.identification.solver import shortened
 from hilcal.types import Bools, Floats, Ints
 
 MOST = 0.45
@@ -34,6 +36,13 @@ HALVINGS = 6
 """Shorter steps that are tried; a choice."""
 ANEW = 6
 """Most linearisations; a choice: gross errors may have led the first one far off."""
+FALSE_ALARMS = 1e-3
+"""Expected number of good readings set aside per campaign under the right model; a choice."""
+MISFIT_FACTOR = 6.25
+"""Factor of the limit with a misfit, 2.5 in distance: its tails are heavier. A choice, no study set
+it ..."""
+MISFIT = (1.25, 1.5)
+"""... reached gradually between these scales of the bulk, of noise alone and of a sure misfit."""
 
 
 class Linearised(Protocol):
@@ -54,7 +63,7 @@ def robust_start(at: L, rng: np.random.Generator) -> tuple[L, Bools]:
     """Return the linearisation that most readings agree on, and which readings do (N,)."""
     used, delta = _trimmed(at.linear, rng)
     for _ in range(ANEW):
-        at = _moved(at, delta)
+        at = shortened(at.moved, delta, HALVINGS) or at
         _, now, delta = _concentrated(at.linear, used, LAST)
         if np.array_equal(now, used):
             break
@@ -62,19 +71,20 @@ def robust_start(at: L, rng: np.random.Generator) -> tuple[L, Bools]:
     return at, used
 
 
-def _moved(at: L, delta: Floats) -> L:
-    """Step by δ (K,), half as far each time while there is no static equilibrium."""
-    for halving in range(HALVINGS):
-        try:
-            return at.moved(0.5**halving * delta)
-        except CannotAnswerError:
-            continue
-    return at
+def bulk(distance2: Floats, m: int) -> float:
+    """Scale of most squared distances: their median over that of χ²_m."""
+    return float(np.median(distance2) / chi2.median(m))
 
 
-def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> Bools:
-    """(N,) the h readings of least squared distance (N,), and centres."""
-    return _nearest(of, d2, centre)[0]
+def limit(m: int, count: int, scale: float = 1.0) -> float:
+    """Squared distance from which on one of `count` measurements is a gross error.
+
+    It is the χ²_m quantile that a good reading exceeds in one of a thousand campaigns, times the
+    scale of the bulk where that is wider than the stated noise.
+    """
+    far = float(chi2.isf(FALSE_ALARMS / count, m)) * max(1.0, scale)
+    chance, sure = MISFIT
+    return far * float(MISFIT_FACTOR ** np.clip((scale - chance) / (sure - chance), 0.0, 1.0))
 
 
 def _trusted(of: ReadingModel, n: int) -> int:
@@ -90,7 +100,8 @@ def variance(of: ReadingModel, d2: Floats, centre: Bools) -> float:
     return float(others[half - 1] / chi2.ppf(half / (len(others) + 1), of.m))
 
 
-def _nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
+def nearest(of: ReadingModel, d2: Floats, centre: Bools) -> tuple[Bools, float]:
+    """(N,) the h readings of least squared distance (N,), and centres; and the sum of these."""
     others = np.flatnonzero(of.tested & ~centre)
     h = _trusted(of, len(others))
     chosen = others[np.argpartition(d2[others], h - 1)[:h]] if h else others
@@ -108,12 +119,12 @@ def _trimmed(of: ReadingModel, rng: np.random.Generator) -> tuple[Bools, Floats]
     tried = []
     for _ in range(int(min(np.ceil(starts), STARTS))):
         near = part.near(_from_few(part, rng))
-        tried.append(_nearest(part, *near))
+        tried.append(nearest(part, *near))
     tried.sort(key=lambda each: each[1])
     best = [_concentrated(part, used, LAST) for used, _ in tried[:BEST]]
     _, used, delta = min(best, key=lambda each: each[0])
     if part is not of:
-        _, used, delta = _concentrated(of, nearest(of, *of.near(delta)), LAST)
+        _, used, delta = _concentrated(of, nearest(of, *of.near(delta))[0], LAST)
     return used, delta
 
 
@@ -122,7 +133,7 @@ def _concentrated(of: ReadingModel, used: Bools, steps: int) -> tuple[float, Boo
     total = np.inf
     for _ in range(steps):
         delta = of.fitted(used)[0]
-        used, now = _nearest(of, *of.near(delta))
+        used, now = nearest(of, *of.near(delta))
         if now >= total * (1 - 1e-9):
             break
         total = now

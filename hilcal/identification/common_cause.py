@@ -1,11 +1,16 @@
-"""Readings that are off along what one site of the arm can do: a misfit, and no gross errors.
+"""Readings that are off for one cause, and so are no gross errors.
 
-What a law of a joint, of a link that bends or of the force sensor does to a reading goes along one
-direction there, whatever the law depends on; a gross error goes anywhere. Of a random error in m
-dimensions the share beside a direction is sin² ~ Beta((m − 1)/2, 1/2), with p its distribution
-function uniform. So n of F gross errors are as near to a site's direction as p_(n), ascending,
-with the binomial probability P(B(F, p_(n)) ≥ n), times F and the number of sites for the least of
-all. Where that is too small, what is along the site, at two poses at least, is a law's.
+In a row, by the same shift: another reflector, a target that was moved on the tool, a tracker that
+was bumped. From one reading to another one all are off alike, in the axes of the sensor or of the
+target (`off_alike`).
+
+Along what one site of the arm can do: what a law of a joint, of a link that bends or of the force
+sensor does to a reading goes along one direction there, whatever the law depends on; a gross error
+goes anywhere. Of a random error in m dimensions the share beside a direction is
+sin² ~ Beta((m − 1)/2, 1/2), with p its distribution function uniform. So n of F gross errors are as
+near to a site's direction as p_(n), ascending, with the binomial probability P(B(F, p_(n)) ≥ n),
+times F and the number of sites for the least of all. Where that is too small, what is along the
+site, at two poses at least, is a law's (`along_one_site`).
 """
 
 from collections.abc import Iterator
@@ -14,13 +19,20 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import beta, binom, chi2
 
-from hilcal.identification.off_alike import SAME
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
+SAME = 0.25
+"""Largest difference of two shifts that are the same one, as a share of the larger; a choice."""
+BETWEEN = 1
+"""Readings between two alike ones that may be off otherwise; a choice."""
+RUN = 4
+"""Fewest readings that are off alike; a choice: two in a row agree by chance."""
+ACCIDENTAL = 0.05
+"""Share of the readings up to which those that are off alike count as gross errors; a choice."""
 CHANCE = 1e-2
 """Probability that so many gross errors are along any one site, below which they are none; and that
 the noise moves a reading so far beside its law's direction. Choices."""
@@ -28,6 +40,42 @@ FEWEST = 2
 """Poses that a law moves at least: an axis of a site and one of the sensor may agree at a pose."""
 ROUGH = 0.05
 """Share of a law's shift that may be beside its direction, as the model is linear; a choice."""
+
+
+def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
+    """Return the rows that are off alike, more than `ACCIDENTAL` of the tested ones, or none.
+
+    Args:
+        readings: N readings, in their order.
+        tested: (N,) which take part.
+        off: (F,) rows that are far off, ascending.
+        shift: (F, 3) by how much, sensor axes.
+        axes: (F, 3, 3) orientation of the target, sensor axes.
+    """
+    order = np.zeros(len(readings), dtype=np.int64)
+    found = np.zeros(len(off), dtype=np.bool_)
+    target = readings.target
+    for k in np.unique(target[off]):
+        mine = tested & (target == k)
+        order[mine] = np.arange(np.count_nonzero(mine))
+        at = np.flatnonzero(target[off] == k)
+        turned = (shift[at, None] @ axes[at])[:, 0]
+        found[at] = _in_a_row(order[off[at]], shift[at]) | _in_a_row(order[off[at]], turned)
+    few = np.count_nonzero(found) <= ACCIDENTAL * np.count_nonzero(tested)
+    return off[:0] if few else off[found]
+
+
+def _in_a_row(order: Ints, shift: Floats) -> Bools:
+    """(F,) which shifts (F, 3) are the same as `RUN` in a row, all readings between off as well."""
+    count = len(shift)
+    run, size = np.arange(count), np.linalg.norm(shift, axis=1)
+    for ahead in range(1, BETWEEN + 2):
+        for k in range(count - ahead):
+            then = k + ahead
+            apart = np.linalg.norm(shift[then] - shift[k])
+            if order[then] - order[k] == ahead and apart <= SAME * max(size[k], size[then]):
+                run[run == run[then]] = run[k]
+    return np.asarray(np.bincount(run, minlength=count)[run] >= RUN)
 
 
 def site_columns(model: Model, theta: Floats, prediction: Prediction, readings: Readings) -> Floats:

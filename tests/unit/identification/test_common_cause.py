@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import binom
 
 from hilcal.identification.baseline import baseline
+from hilcal.identification.common_cause import CHANCE, along_one_site, site_columns
 from hilcal.identification.fit import fit
-from hilcal.identification.single_site import CHANCE, along_one_site, site_columns
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.types import Floats

@@ -7,17 +7,15 @@ import pytest
 
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.description import Change, Described
-from hilcal.identification.description_words import words
-from hilcal.identification.gate import examine
+from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
-from tests.unit.identification.test_registration import CELL, pose_of, told
-from tests.unit.identification.test_registration_undetermined import BASE, OFFSET
+from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
 
-def readings_of(change: Change | None, m: int, noise: float = 5e-5):
+def readings_of(change: Hypothesis | None, m: int, noise: float = 5e-5):
     """Readings by an arm that is otherwise than the catalogue's, at the same joint values."""
     rng = np.random.default_rng(2)
     q = rng.uniform(-2, 2, (40, 6))
@@ -45,16 +43,16 @@ def test_a_right_description_passes(m):
     ("change", "said"),
     [
         (
-            Change("joint", 4, -1),
+            Hypothesis("joint", 4, -1),
             "joint 4 turns the other way in these data: .* in CELL.toml: "
             r"\[robot\] joint_sign = \[1, 1, 1, -1, 1, 1\]",
         ),
         (
-            Change("joint", 3, 1, np.radians(7.0)),
+            Hypothesis("joint", 3, 1, np.radians(7.0)),
             r"joint 3's zero is 7.*° elsewhere .*joint_offset_deg = \[0.0, 0.0, [67]\.\d+, 0.0",
         ),
         (
-            Change("coupling", 3, follows=2, factor=1.0),
+            Hypothesis("coupling", 3, follows=2, factor=1.0),
             r"joint_coupling = \[\{ joint = 3, follows = 2, factor = 1.0 \}\]",
         ),
     ],
@@ -70,13 +68,13 @@ def test_millimetres_and_swapped_rows_are_named():
     good = readings_of(None, 3)
     scaled = replace(good, value=1e3 * good.value)
     finding, cell = found_in(scaled)
-    assert "the positions are millimetres" in words(finding, cell, scaled)
+    assert "the positions are millimetres" in finding.words(cell, scaled)
     value = good.value.copy()
     value[[4, 19]] = value[[19, 4]]
     crossed = replace(good, value=value)
     finding, cell = found_in(crossed)
     assert finding.swapped == ((4, 19),)
-    assert "rows are swapped (p5/none with p20/none)" in words(finding, cell, crossed)
+    assert "rows are swapped (p5/none with p20/none)" in finding.words(cell, crossed)
 
 
 @pytest.mark.parametrize("shift", [1, -2])
@@ -87,14 +85,14 @@ def test_positions_of_other_rows_are_named(shift):
     finding, cell = found_in(off)
     way = "after" if shift > 0 else "before"
     rows = "1 row" if shift == 1 else "2 rows"
-    said = words(finding, cell, off)
+    said = finding.words(cell, off)
     assert finding.refused
     assert f"each position stands {rows} {way} the joint values it belongs to" in said
     assert said.endswith("correct it in the table")
     four = good[np.repeat(np.arange(40), 8)]
     off = replace(four, value=np.roll(four.value, 1, axis=0))
     finding, cell = found_in(off)
-    assert "each position stands 1 row after" in words(finding, cell, off)
+    assert "each position stands 1 row after" in finding.words(cell, off)
 
 
 def test_exchanged_columns_of_joints_are_named():
@@ -107,13 +105,13 @@ def test_exchanged_columns_of_joints_are_named():
         off = replace(good, states=replace(good.states, q=good.states.q[:, order]))
         finding, cell = found_in(off)
         assert finding.refused
-        assert said in words(finding, cell, off)
+        assert said in finding.words(cell, off)
 
 
 def test_a_gauge_is_not_proposed():
     """The zero of joint 1 goes into the base, that of the last joint into the target."""
     for joint in (1, 6):
-        assert found_in(readings_of(Change("joint", joint, 1, 0.7), 3))[0] is None
+        assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7), 3))[0] is None
 
 
 def test_nonsense_is_refused_with_what_was_tried():
@@ -122,7 +120,7 @@ def test_nonsense_is_refused_with_what_was_tried():
     finding, cell = found_in(mixed)
     assert finding.refused
     assert not finding.explanations
-    assert "Nothing that was tried explains it" in words(finding, cell, mixed)
+    assert "Nothing that was tried explains it" in finding.words(cell, mixed)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 4, 5])

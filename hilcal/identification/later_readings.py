@@ -19,6 +19,7 @@ there are elements beyond the flat parameters.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.priors import scales_of
 from hilcal.identification.registration import register
 from hilcal.identification.residual import residual
+from hilcal.identification.solver import shortened
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
@@ -96,44 +98,104 @@ class Setting:
     frames: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Remeasured:
-    """The minimum at later readings, with some changes of the arm or none.
+    """Later readings beside an earlier fit and some changes of the arm, at some coordinates.
+
+    R whitened rows, K coordinates u, b and δ, L coordinates p, P parameters.
 
     Attributes:
         setting: what the readings are explained by.
         changes: of the arm.
         model: that of the setting, and the changes.
-        theta: (P,) parameters at the minimum.
-        prediction: at the minimum.
-        raw: (D, m) residual, sensor axes.
-        projection: M, of rows in units of the noise √a.
-        target: (R,) r, with respect to the prior mean.
-        coordinates: (K,) u, b, δ and p at the minimum.
-        rss: rᵀ M r.
-        free: number of flat parameters that the readings determine.
-        sizes: (k,) δ of all changes, in order.
-        inverse: (k, k) covariance of δ in units of the noise a.
+        mean: (P,) prior mean of its parameters.
+        lift: (P, K) directions of u, b and δ.
+        ridge: (K + L,) of these and of p: 1 for those with a prior, 0 for flat ones.
+        coordinates: (K + L,) u, b, δ and p.
     """
 
     setting: Setting
     changes: tuple[Moving, ...]
     model: Model
-    theta: Floats
-    prediction: Prediction
-    raw: Floats
-    projection: Projection
-    target: Floats
+    mean: Floats
+    lift: Floats
+    ridge: Floats
     coordinates: Floats
-    rss: float
-    free: int
-    sizes: Floats
-    inverse: Floats
+
+    @cached_property
+    def theta(self) -> Floats:
+        """(P,) parameters.
+
+        Raises:
+            CannotAnswerError: they are beyond what has a static equilibrium.
+        """
+        step = self.lift @ self.coordinates[: self.lift.shape[1]]
+        if np.any(np.abs(step) > ABSURD * scales_of(self.model)):
+            raise CannotAnswerError("a change of such a size has no static equilibrium")
+        return np.asarray(self.mean + step)
+
+    @cached_property
+    def prediction(self) -> Prediction:
+        """Prediction of the readings."""
+        return self.model.predict(self.setting.readings.states, self.theta)
+
+    @cached_property
+    def raw(self) -> Floats:
+        """(D, m) residual, sensor axes."""
+        return residual(self.setting.readings, self.prediction, self.setting.w)
+
+    @cached_property
+    def white(self) -> Floats:
+        """(R,) residual in units of the noise √a."""
+        return _scaled(self.setting, self.setting.w.whiten(self.raw).reshape(-1))
+
+    @cached_property
+    def projection(self) -> Projection:
+        """M, of rows in units of the noise √a."""
+        w = self.setting.w
+        jacobian = self.model.jacobian(self.prediction, self.theta, w.m)
+        moved = _scaled(self.setting, w.whiten(w.raw(jacobian @ self.lift)))
+        return projection(np.hstack([moved, self.setting.poses]), self.ridge)
+
+    @cached_property
+    def target(self) -> Floats:
+        """(R,) r, with respect to the prior mean."""
+        count = self.lift.shape[1]
+        rows = self.projection.rows[:, :count]
+        return np.asarray(self.white + rows @ self.coordinates[:count])
+
+    @property
+    def square(self) -> float:
+        """What is minimised."""
+        left = self.white - self.setting.poses @ self.coordinates[self.lift.shape[1] :]
+        return float(left @ left + self.ridge @ self.coordinates**2)
+
+    @property
+    def rss(self) -> float:
+        """rᵀ M r."""
+        return float(self.target @ self.projection.project_out(self.target))
+
+    @property
+    def free(self) -> int:
+        """Number of flat parameters that the readings determine."""
+        determined = np.count_nonzero(np.any(self.projection.inverse_root, axis=1))
+        return int(determined) - int(np.count_nonzero(self.ridge))
 
     @property
     def dof(self) -> float:
         """Degrees of freedom of rᵀ M r."""
         return float(self.setting.w.rank - self.free)
+
+    @property
+    def sizes(self) -> Floats:
+        """(k,) δ of all changes, in order."""
+        return self.coordinates[self.setting.lift.shape[1] : self.lift.shape[1]]
+
+    @property
+    def inverse(self) -> Floats:
+        """(k, k) covariance of δ in units of the noise a."""
+        own = self.projection.inverse_root[:, self.setting.lift.shape[1] : self.lift.shape[1]]
+        return np.asarray(own.T @ own)
 
     def columns(self, moving: Moving) -> tuple[Floats, Floats]:
         """Return rows (R, k) of a change, and the motion (D, 3, k) of the target it makes, m."""
@@ -141,6 +203,10 @@ class Remeasured:
         jacobian = self.model.jacobian_of((moving.effect,), self.prediction, self.theta, w.m)
         raw = w.raw(jacobian @ moving.directions)
         return _scaled(self.setting, w.whiten(raw)), raw[:, :3]
+
+    def moved(self, step: Floats) -> "Remeasured":
+        """Return them after a step (K + L,)."""
+        return replace(self, coordinates=self.coordinates + step)
 
 
 def setting(
@@ -309,66 +375,21 @@ def remeasure(
     place = dict(zip(map(id, model.effects), model.slices(), strict=True))
     for c, end in zip(changes, np.cumsum(sizes), strict=True):
         lift[place[id(c.effect)], k + end - c.directions.shape[1] : k + end] = c.directions
-    count = lift.shape[1]
     ridge = np.concatenate([at.ridge, np.zeros(sum(sizes)), np.ones(at.poses.shape[1])])
     mean = np.concatenate([at.mean, np.zeros(len(lift) - len(at.mean))])
-    scale, x = scales_of(model), np.zeros(len(ridge))
+    x = np.zeros(len(ridge))
     if start is not None:
-        before = len(start.sizes)
-        x[: k + before] = start.coordinates[: k + before]
-        x[count:] = start.coordinates[k + before :]
-
-    def point(x: Floats) -> tuple[Floats, Prediction, Floats, Floats]:
-        step = lift @ x[:count]
-        theta = mean + step
-        if np.any(np.abs(step) > ABSURD * scale):
-            raise CannotAnswerError("a change of such a size has no static equilibrium")
-        prediction = model.predict(at.readings.states, theta)
-        raw = residual(at.readings, prediction, at.w)
-        white = _scaled(at, at.w.whiten(raw).reshape(-1))
-        return theta, prediction, raw, white
-
-    def square(white: Floats, x: Floats) -> float:
-        left = white - at.poses @ x[count:]
-        return float(left @ left + ridge @ x**2)
-
-    theta, prediction, raw, white = point(x)
+        before = k + len(start.sizes)
+        x[:before] = start.coordinates[:before]
+        x[lift.shape[1] :] = start.coordinates[before:]
+    here = Remeasured(at, tuple(changes), model, mean, lift, ridge, x)
     for _ in range(STEPS):
-        jacobian = model.jacobian(prediction, theta, at.w.m)
-        moved = _scaled(at, at.w.whiten(at.w.raw(jacobian @ lift)))
-        rows = np.hstack([moved, at.poses])
-        m = projection(rows, ridge)
-        target = white + moved @ x[:count]
-        step = m.solve(rows.T @ target) - x
-        small = float(np.linalg.norm(rows @ step)) < CONVERGED * np.sqrt(len(white))
-        if small:
+        m = here.projection
+        step = m.solve(m.rows.T @ here.target) - here.coordinates
+        if float(np.linalg.norm(m.rows @ step)) < CONVERGED * np.sqrt(len(here.target)):
             break
-        now = square(white, x)
-        for halving in range(HALVINGS):
-            trial = x + 0.5**halving * step
-            try:
-                found = point(trial)
-            except CannotAnswerError:
-                continue
-            if square(found[-1], trial) <= now:
-                break
-        else:
+        nearer = shortened(here.moved, step, HALVINGS, lambda p: p.square, here.square)
+        if nearer is None:
             break
-        x, (theta, prediction, raw, white) = trial, found
-    determined = int(np.count_nonzero(np.any(m.inverse_root, axis=1)))
-    own = m.inverse_root[:, k:count]
-    return Remeasured(
-        setting=at,
-        changes=tuple(changes),
-        model=model,
-        theta=theta,
-        prediction=prediction,
-        raw=raw,
-        projection=m,
-        target=target,
-        coordinates=x,
-        rss=float(target @ m.project_out(target)),
-        free=determined - int(np.count_nonzero(ridge)),
-        sizes=x[k:count],
-        inverse=own.T @ own,
-    )
+        here = nearer
+    return here

@@ -12,7 +12,6 @@ from typing import ClassVar, Generic, TypeVar
 
 import numpy as np
 
-from hilcal.errors import CannotAnswerError
 from hilcal.identification.coordinates import Coordinates
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.regularisation import (
@@ -21,6 +20,7 @@ from hilcal.identification.regularisation import (
     noise_factor,
     regularise,
 )
+from hilcal.identification.solver import shortened
 from hilcal.model.model import Model
 from hilcal.regression.factored import Tall, gram, written
 from hilcal.regression.normal_equations import TALL
@@ -143,7 +143,7 @@ def linear_problem(
     return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)
 
 
-def minimise(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
+def minimum(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
     """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
     model, of = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
@@ -228,21 +228,15 @@ def _line_search(
     On the way to `aim` half as far each time while the objective grows: the chain may be strongly
     nonlinear along a step in a weakly determined direction.
     """
-    now = point.objective(by)
+
+    def cost(trial: P) -> float:
+        return trial.objective(by)
+
+    now, begin = cost(point), np.where(by.prior > 0, point.y, 0.0)
+    found: P | None = None
     if shortcut is not None:
-        try:
-            trial = problem.at(shortcut)
-            if trial.objective(by) <= now:
-                return trial
-        except CannotAnswerError:
-            pass
-    begin = np.where(by.prior > 0, point.y, 0.0)
-    for halving in range(HALVINGS):
-        share = 0.5**halving
-        try:
-            trial = problem.at(aim if share == 1 else begin + share * (aim - begin))
-        except CannotAnswerError:
-            continue
-        if trial.objective(by) <= now * (1 + 1e-9) + 1e-12:
-            return trial
-    return problem.at(begin)
+        found = shortened(problem.at, shortcut, 1, cost, now)
+    if found is None:
+        limit = now * (1 + 1e-9) + 1e-12
+        found = shortened(lambda step: problem.at(begin + step), aim - begin, HALVINGS, cost, limit)
+    return problem.at(begin) if found is None else found

@@ -10,7 +10,7 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.gate import examine
+from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
