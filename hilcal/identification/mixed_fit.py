@@ -92,7 +92,7 @@ class MixedFit:
 
     def std(self, name: str) -> float:
         """Return the estimated standard deviation of a family or of a component of the noise."""
-        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
+        return self.variances.std(name)
 
     def prior_std(self) -> Floats:
         """(P,) standard deviations of the parameters; infinite for frames."""
