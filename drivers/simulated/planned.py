@@ -8,6 +8,7 @@ from drivers.simulated.rehearsal import CampaignStates
 from drivers.simulated.temperatures import warm_up
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.measuring.route import approach_sides, route
 from hilcal.readings.readings import States
 from hilcal.store.plan import UNLOADED, Plan
 
@@ -22,9 +23,8 @@ def planned_states(
 
     Of several targets, each is read at every step.
 
-    A joint's approach side is the direction of its last motion; the first step is reached by
-    a move in the positive direction of every joint. The joints warm up as those of the cell
-    behind the wires do.
+    The arm takes the route of a session, which tells from which sides the joints arrive. They warm
+    up as those of the cell behind the wires do.
 
     Args:
         cell: the cell.
@@ -38,9 +38,7 @@ def planned_states(
     wrench = np.array([pulls.get(step.load, np.zeros(6)) for step in plan.steps])
     load = np.array([names.index(step.load) for step in plan.steps])
     moved = np.diff(q, axis=0, prepend=q[:1] - 1.0)
-    side = np.sign(moved)
-    for k in range(1, len(side)):
-        side[k] = np.where(side[k] == 0.0, side[k - 1], side[k])
+    stops = route(plan, cell.arm, config.limits.joint_margin_rad)
     speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
     changed = np.diff(load, prepend=0) != 0
     resting = _MEASURING * len(cell.all_targets)
@@ -53,7 +51,7 @@ def planned_states(
         time=time,
         load_time=np.maximum(time - hung, 1.0),
         joint_temperature=warm_up(time, cell.arm.n),
-        approach=side,
+        approach=approach_sides(stops),
     )
     pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
     cycle = np.array([step.cycle for step in plan.steps])
