@@ -1,6 +1,6 @@
 """What must not touch: the arm, its tool, obstacles, hanging loads and cables."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,13 +33,28 @@ class Clearance:
     cell: Cell
     config: CellConfig
     scene: Scene
+    _at_hook: dict[float, frozenset[str]] = field(init=False, repr=False)
+    """What is as good as touched at the load point, by the radius of what is there, m."""
+
+    def __post_init__(self) -> None:
+        """Find what is at the load point, which is the same in every state."""
+        radii = {CABLE_RADIUS, *(load.radius_m for load in self.config.loads)}
+        found = {radius: self.near(self.cell.load_point, radius) for radius in radii}
+        object.__setattr__(self, "_at_hook", found)
 
     def load(self, name: str) -> Load | None:
         """Return a load by name; None unloaded, and for a name that the cell lacks."""
         return next((load for load in self.config.loads if load.name == name), None)
 
     def segments(self, q: Floats, load: str) -> tuple[Segment, ...]:
-        """Return what hangs or pulls at the load point in N states (N, n).
+        """Return what hangs or pulls at the load point in N states (N, n)."""
+        if self.load(load) is None:
+            return ()
+        chain = chains.evaluate(self.cell.arm, q)
+        return self.segments_at(chain.point(self.cell.load_point), load)
+
+    def segments_at(self, at: Floats, load: str) -> tuple[Segment, ...]:
+        """Return what hangs or pulls at the load point where that is (N, 3), base axes, m.
 
         A weight takes an upright capsule of the length hang_m below the load point (along
         gravity), a pull's cable goes in the pull's direction. What the flange carries, and the
@@ -49,18 +64,17 @@ class Clearance:
         known = self.load(load)
         if known is None:
             return ()
-        at = chains.evaluate(self.cell.arm, q).point(self.cell.load_point)
         out = []
         gravity, force = self.cell.gravity, np.asarray(known.force_N)
         if known.hanging_m > 0.0 and gravity.any():
             down, long = gravity / np.linalg.norm(gravity), known.hanging_m
             rim = min(known.radius_m, 0.5 * long)
             ends = at + rim * down, at + (long - rim) * down
-            near = self.near(self.cell.load_point, known.radius_m)
+            near = self._at_hook[known.radius_m]
             out.append(Segment(f"what hangs ({load})", *ends, known.radius_m, near))
         if known.cable_m > 0.0:
             end = at + known.cable_m * force / np.linalg.norm(force)
-            near = self.near(self.cell.load_point, CABLE_RADIUS)
+            near = self._at_hook[CABLE_RADIUS]
             out.append(Segment(f"the cable ({load})", at, end, CABLE_RADIUS, near))
         return tuple(out)
 
