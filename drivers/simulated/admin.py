@@ -1,8 +1,14 @@
-"""The admin line of a simulated device: JSON lines over a Unix socket, for faults and tests."""
+"""What the processes of simulated devices share: the admin line, and their end.
 
+The admin line, for faults and tests, has JSON lines over a Unix socket.
+"""
+
+import argparse
 import json
 import os
+import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -68,3 +74,28 @@ def serve(path: Path, handler: Handler) -> None:
             threading.Thread(target=talk, args=(line,), daemon=True).start()
 
     threading.Thread(target=listen, daemon=True).start()
+
+
+def device_parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return the parser of what the process of every device is told."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    return parser
+
+
+def end_with_parent() -> None:
+    """Exit at once when standard input closes (the parent holds its other end).
+
+    A pipe ends with any death, also of kill -9; asynchronous and on every platform.
+    """
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        os._exit(0)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
+    threading.Thread(target=wait, daemon=True).start()

@@ -115,7 +115,7 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
-                from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+                from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 
                 choice = config.simulation.hide or NOTHING
                 secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)

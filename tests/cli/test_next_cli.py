@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.cli import demo
 from hilcal.cli.rehearsing import RehearsalSettings
 from hilcal.config import load_config

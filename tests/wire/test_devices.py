@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.errors import DeviceError, InputError

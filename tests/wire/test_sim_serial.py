@@ -15,7 +15,7 @@ from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
-from drivers.simulated.geocom.optics import Beam, PolarPoint
+from drivers.simulated.geocom_station import Beam, PolarPoint
 from drivers.simulated.pty_port import PtyPort
 from tests.support.sim_serial_cases import Instrument, tracker
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.simulated.planned import planned_states
+from drivers.simulated.rehearsal import planned_states
 from hilcal.cell import cell_from_config
 from hilcal.design.feasible import Space
 from hilcal.design.load_blocks import Block, Stop, assembled
