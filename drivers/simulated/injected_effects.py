@@ -15,15 +15,6 @@ from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
 
-_BY_LOAD = (
-    "tool_compliance",
-    "periodic_joint_compliance",
-    "backlash",
-    "creep",
-    "wrench_bias",
-    "wrench_gain",
-    "sensor_misalignment",
-)
 _GIVE = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
 
 
@@ -67,37 +58,45 @@ class Draw:
 
     def effect(self, name: str, rng: np.random.Generator) -> Floats:
         """Return the parameters of the named effect, shaped as in `Truth`."""
-        n = self.arm.n
-        typical = typical_compliance(self.arm)
-        if name == "joint_compliance":
-            return joint_compliance(self.arm, rng)
-        if name == "joint_stiffening":
-            share = rng.uniform(0.7, 1.0, n) / 3.0
-            return np.asarray(-share * self.compliance / self.torque**2)
-        if name == "joint_tilt_compliance":
-            return 0.5 * typical * rng.uniform(0.3, 1.0, n)
-        if name == "base_compliance":
-            return 0.5 * float(typical[0]) * rng.uniform(0.3, 1.0, 3)
-        if name == "link_compliance":
-            return self._beams(rng)
-        if name == "hysteresis":
-            return 5e-5 * rng.uniform(0.3, 1.0, n)
-        if name == "encoder_offset":
-            return 2e-4 * rng.standard_normal(n)
-        if name == "joint_coupling":
-            return self._couplings(rng)
-        if name == "transmission_error":
-            decay = 1.0 / np.arange(1, self.harmonics + 1)[:, None]
-            return 1e-4 * decay * rng.standard_normal((n, self.harmonics, 2))
-        if name == "link_geometry":
-            return 3e-4 * rng.standard_normal((n + 1, 6))
-        if name in ("load_point", "target_offset"):
-            return 5e-3 * rng.standard_normal(3)
-        if name == "base_frame":
-            return 1e-3 * rng.standard_normal(6)
-        if name == "tracker_drift":
-            return np.repeat([1e-8, 3e-9], 3) * rng.standard_normal(6)
-        return self._by_load(name, rng) if name in _BY_LOAD else self._by_heat(name, rng)
+        n, typical, order = self.arm.n, typical_compliance(self.arm), self.harmonics
+        even, normal = rng.uniform, rng.standard_normal
+        decay = 1.0 / np.arange(1, order + 1)[:, None]
+        plate = 0.3 * float(typical[-1]) * np.array([0.5, 1.0])  # stiffer about its own axis
+        heavy = np.maximum(self.arm.masses, 0.1)[:, None]
+        draws: dict[str, Callable[[], Floats]] = {
+            "joint_compliance": lambda: joint_compliance(self.arm, rng),
+            "joint_stiffening": lambda: (
+                -(even(0.7, 1.0, n) / 3.0) * self.compliance / self.torque**2
+            ),
+            "joint_tilt_compliance": lambda: 0.5 * typical * even(0.3, 1.0, n),
+            "base_compliance": lambda: 0.5 * float(typical[0]) * even(0.3, 1.0, 3),
+            "link_compliance": lambda: self._beams(rng),
+            "hysteresis": lambda: 5e-5 * even(0.3, 1.0, n),
+            "encoder_offset": lambda: 2e-4 * normal(n),
+            "joint_coupling": lambda: self._couplings(rng),
+            "transmission_error": lambda: 1e-4 * decay * normal((n, order, 2)),
+            "link_geometry": lambda: 3e-4 * normal((n + 1, 6)),
+            "load_point": lambda: 5e-3 * normal(3),
+            "target_offset": lambda: 5e-3 * normal(3),
+            "base_frame": lambda: 1e-3 * normal(6),
+            "tracker_drift": lambda: np.repeat([1e-8, 3e-9], 3) * normal(6),
+            # further elasticity, and what a force sensor misreads
+            "tool_compliance": lambda: plate * even(0.5, 1.0, 2),
+            "periodic_joint_compliance": lambda: 0.1 * typical[:, None] * normal((n, 2)),
+            "backlash": lambda: 5e-5 * even(0.3, 1.0, n),
+            "creep": lambda: 0.03 * even(0.5, 1.5, 1),
+            "wrench_bias": lambda: np.repeat([1.0, 0.1], 3) * normal(6),
+            "wrench_gain": lambda: 1e-2 * normal(6),
+            "sensor_misalignment": lambda: 1e-2 * normal(3),
+            # temperature (steel to aluminium), wrong masses (centres some centimetres off), scale
+            "thermal_growth": lambda: even(11e-6, 24e-6, 1),
+            "thermal_joint_drift": lambda: 5e-6 * normal(n),
+            "link_mass": lambda: 0.03 * heavy * normal((n, 3)),
+            "tracker_scale": lambda: (
+                5e-6 * rng.choice(np.array([-1.0, 1.0]), 1) * even(0.5, 1.5, 1)
+            ),
+        }
+        return np.asarray(draws[name]())
 
     def _couplings(self, rng: np.random.Generator) -> Floats:
         """Draw k (n, n) of joints that the one before, or the last but two, takes along."""
@@ -106,38 +105,6 @@ class Draw:
         if n > 2:
             out[n - 1, n - 3] = rng.standard_normal()
         return np.asarray(2e-4 * out)
-
-    def _by_load(self, name: str, rng: np.random.Generator) -> Floats:
-        """Draw what depends on the load: further elasticity, and what its sensor misreads."""
-        n = self.arm.n
-        typical = typical_compliance(self.arm)
-        if name == "tool_compliance":  # a flange plate and its bolts: stiffer about its own axis
-            plate = 0.3 * float(typical[-1]) * np.array([0.5, 1.0])
-            return np.asarray(plate * rng.uniform(0.5, 1.0, 2))
-        if name == "periodic_joint_compliance":
-            return np.asarray(0.1 * typical[:, None] * rng.standard_normal((n, 2)))
-        if name == "backlash":
-            return 5e-5 * rng.uniform(0.3, 1.0, n)
-        if name == "creep":
-            return 0.03 * rng.uniform(0.5, 1.5, 1)
-        if name == "wrench_bias":
-            return np.repeat([1.0, 0.1], 3) * rng.standard_normal(6)
-        if name == "wrench_gain":
-            return 1e-2 * rng.standard_normal(6)
-        return 1e-2 * rng.standard_normal(3)  # sensor_misalignment
-
-    def _by_heat(self, name: str, rng: np.random.Generator) -> Floats:
-        """Draw what comes from temperature, from wrong masses, or from the instrument."""
-        n = self.arm.n
-        if name == "thermal_growth":  # steel to aluminium
-            return rng.uniform(11e-6, 24e-6, 1)
-        if name == "thermal_joint_drift":
-            return 5e-6 * rng.standard_normal(n)
-        if name == "link_mass":  # centres of mass some centimetres off
-            heavy = np.maximum(self.arm.masses, 0.1)
-            return np.asarray(0.03 * heavy[:, None] * rng.standard_normal((n, 3)))
-        side = rng.choice(np.array([-1.0, 1.0]), 1)
-        return np.asarray(5e-6 * side * rng.uniform(0.5, 1.5, 1))  # tracker_scale
 
     def _beams(self, rng: np.random.Generator) -> Floats:
         """Draw 1/EI and 1/GJ (b, 2): a tube that gives as much as half a drive over its length."""
@@ -237,6 +204,14 @@ def nothing_hidden(
     )
 
 
+def softened(world: World, effect: object) -> World:
+    """Return a world with softer drives where `effect` is that they stiffen, as real ones do."""
+    if effect != "joint_stiffening":
+        return world
+    softer = _SOFTER * world.physics.joint_compliance
+    return replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+
+
 def hide(
     effect: str | OwnLaw,
     cell: Cell,
@@ -281,10 +256,7 @@ def hide(
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:
-        world = nothing_hidden(cell, rng)
-        if effect == "joint_stiffening":
-            softer = _SOFTER * world.physics.joint_compliance
-            world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+        world = softened(nothing_hidden(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
     hidden, reference = (

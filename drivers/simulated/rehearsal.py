@@ -9,7 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
+from drivers.simulated.injected_effects import (
+    DEFLECTION_EFFECTS,
+    EFFECTS,
+    hide,
+    nothing_hidden,
+    softened,
+)
 from drivers.simulated.own_law import own_law, own_names
 from drivers.simulated.truth import warm_up
 from drivers.simulated.world import SimulatedNoise, World
@@ -30,7 +36,6 @@ INVENTED = "invented"
 """A law that the catalogue lacks; see `invented_law`."""
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
-_SOFTER = 1.5  # a gear that stiffens starts softer than its mean
 
 
 def choices() -> tuple[str, ...]:
@@ -173,9 +178,7 @@ def simulation_case(
     strength = 0.0
     if hidden != NOTHING:
         strength = config.simulation.strength_sigma
-        if hidden == "joint_stiffening":
-            softer = _SOFTER * world.physics.joint_compliance
-            world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+        world = softened(world, hidden)
         what = own or hidden
         world = hide(
             what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle

@@ -4,7 +4,7 @@ What a state brings about beside its load (sides, temperatures, time, the joint 
 force sensor misreads what acts.
 """
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -110,33 +110,15 @@ class Truth:
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
         """Return the truth of an arm that is perfect and rigid."""
         n = arm.n
-        return Truth(
-            joint_compliance=np.zeros(n),
-            joint_stiffening=np.zeros(n),
-            joint_tilt_compliance=np.zeros(n),
-            base_compliance=np.zeros(3),
-            link_compliance=np.zeros((len(long_links(arm)), 2)),
-            hysteresis=np.zeros(n),
-            encoder_offset=np.zeros(n),
-            joint_coupling=np.zeros((n, n)),
-            transmission_error=np.zeros((n, harmonics, 2)),
-            link_geometry=np.zeros((n + 1, 6)),
-            load_point=np.zeros(3),
-            target_offset=np.zeros(3),
-            base_frame=np.zeros(6),
-            tracker_drift=np.zeros(6),
-            tool_compliance=np.zeros(2),
-            periodic_joint_compliance=np.zeros((n, 2)),
-            backlash=np.zeros(n),
-            creep=np.zeros(1),
-            thermal_growth=np.zeros(1),
-            thermal_joint_drift=np.zeros(n),
-            link_mass=np.zeros((n, 3)),
-            wrench_bias=np.zeros(6),
-            wrench_gain=np.zeros(6),
-            sensor_misalignment=np.zeros(3),
-            tracker_scale=np.zeros(1),
-        )
+        shapes = {name: (len(labels),) for name, labels in _LABELS.items()} | {
+            "link_compliance": (len(long_links(arm)), 2),
+            "joint_coupling": (n, n),
+            "transmission_error": (n, harmonics, 2),
+            "link_geometry": (n + 1, 6),
+            "periodic_joint_compliance": (n, 2),
+            "link_mass": (n, 3),
+        }  # all others have one parameter per joint
+        return Truth(**{f.name: np.zeros(shapes.get(f.name, (n,))) for f in fields(Truth)})
 
     def with_effect(self, effect: str, value: Floats) -> "Truth":
         """Return the same truth with one effect's parameters replaced."""
@@ -154,31 +136,23 @@ class Truth:
         return out
 
 
-def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> Iterator[str]:
-    """Yield the labels of one effect's parameters in the order of their array."""
-    if effect == "transmission_error":
-        for j in range(shape[0]):
-            for k in range(shape[1]):
-                yield from (f"j{j + 1}.cos{k + 1}", f"j{j + 1}.sin{k + 1}")
-    elif effect == "joint_coupling":
-        for j in range(shape[0]):
-            yield from (f"j{j + 1}.q{i + 1}" for i in range(shape[1]))
-    elif effect == "link_geometry":
-        for k in range(shape[0]):
-            yield from (f"link{k}.{part}" for part in _TWIST)
-    elif effect == "link_compliance":
-        for k in long_links(arm):
-            yield from (f"link{k}.bend", f"link{k}.twist")
-    elif effect == "link_mass":
-        for k in range(shape[0]):
-            yield from (f"link{k + 1}.{axis}" for axis in _AXES)
-    elif effect == "periodic_joint_compliance":
-        for j in range(shape[0]):
-            yield from (f"j{j + 1}.cos2", f"j{j + 1}.sin2")
-    elif effect in _LABELS:
-        yield from _LABELS[effect]
-    else:
-        yield from (f"j{j + 1}" for j in range(shape[0]))
+def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
+    """Return the labels of one effect's parameters in the order of their array."""
+    if effect in _LABELS:
+        return list(_LABELS[effect])
+    joints, slots = [f"j{j + 1}" for j in range(arm.n)], [f"link{k}" for k in range(arm.n + 1)]
+    harmonics = range(1, shape[1] + 1 if effect == "transmission_error" else 1)
+    parts: dict[str, tuple[list[str], Sequence[str]]] = {
+        "transmission_error": (joints, [f"{x}{k}" for k in harmonics for x in ("cos", "sin")]),
+        "joint_coupling": (joints, [f"q{i + 1}" for i in range(arm.n)]),
+        "link_geometry": (slots, _TWIST),
+        "link_compliance": ([slots[k] for k in long_links(arm)], ("bend", "twist")),
+        "link_mass": (slots[1:], _AXES),
+        "periodic_joint_compliance": (joints, ("cos2", "sin2")),
+    }
+    if effect not in parts:
+        return joints
+    return [f"{name}.{part}" for name in parts[effect][0] for part in parts[effect][1]]
 
 
 LINK_REFERENCE = 20.0

@@ -19,7 +19,7 @@ import os
 import sys
 import threading
 import time
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,6 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
             f"simulated world: its cell and the configuration differ in {', '.join(other)}; "
             "valid: the configuration that the world was made from"
         )
-    noise = world.noise
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -76,11 +75,7 @@ def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | N
         "joint_reference": world.joint_reference,
         "offsets": None if world.offsets is None else _listed(world.offsets),
         "own": None if world.own is None else world.own.to_json(),
-        "noise": {
-            "range_std": list(noise.range_std),
-            "transverse_std": list(noise.transverse_std),
-            "orientation_std": noise.orientation_std,
-        },
+        "noise": asdict(world.noise),
     }
     replace_file(path, json.dumps(content, indent=1))
 
@@ -105,20 +100,14 @@ def read_world(path: Path) -> tuple[World, CellConfig]:
         config = CellConfig.from_json(json.dumps(data["config"]))
         base_dir = None if data["base_dir"] is None else Path(data["base_dir"])
         noise = data["noise"]
+        along, by, across, more = map(float, (*noise["range_std"], *noise["transverse_std"]))
         cell = cell_from_config(config, base_dir)
         world = World(
             cell=cell,
             physics=_physics(cell, data["physics"]),
             registration=_array(data["registration"]),
             station=_array(data["station"]),
-            noise=SimulatedNoise(
-                range_std=(float(noise["range_std"][0]), float(noise["range_std"][1])),
-                transverse_std=(
-                    float(noise["transverse_std"][0]),
-                    float(noise["transverse_std"][1]),
-                ),
-                orientation_std=float(noise["orientation_std"]),
-            ),
+            noise=SimulatedNoise((along, by), (across, more), float(noise["orientation_std"])),
             joint_std=_array(data["joint_std"]),
             joint_reference=float(data["joint_reference"]),
             offsets=_array(data["offsets"]) if data.get("offsets") else None,
