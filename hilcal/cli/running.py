@@ -37,10 +37,9 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.connect import ConnectionResult, connect
+from hilcal.measuring.connect import ConnectionResult, Rig, connect
+from hilcal.measuring.devices import Clock
 from hilcal.measuring.progress import Watcher
-from hilcal.measuring.rig import Rig
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted

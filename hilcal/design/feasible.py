@@ -6,9 +6,9 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.measuring.clearance import UNKNOWN
 from hilcal.measuring.feasibility import STATE, Feasibility, Margins
 from hilcal.measuring.route import beside
-from hilcal.measuring.sight import UNKNOWN
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats

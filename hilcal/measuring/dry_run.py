@@ -7,9 +7,9 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.measuring.clearance import UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.measuring.route import Stop, duration, home, route
-from hilcal.measuring.sight import UNKNOWN
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.toml import suggest
 

@@ -8,8 +8,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.measuring.clearance import clearance_of
-from hilcal.measuring.sight import sight_of
+from hilcal.measuring.clearance import clearance_of, sight_of
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, is_known
