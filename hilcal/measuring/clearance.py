@@ -112,7 +112,7 @@ def _tool(cell: Cell) -> tuple[Capsule, ...]:
     )
 
 
-UNKNOWN = (
+TRACKER_UNKNOWN = (
     "the tracker's place is not known: whether it sees the target is not checked; give [sight] "
     "tracker_m"
 )
