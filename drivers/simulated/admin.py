@@ -10,7 +10,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,38 @@ def serve(path: Path, handler: Handler) -> None:
             threading.Thread(target=talk, args=(line,), daemon=True).start()
 
     threading.Thread(target=listen, daemon=True).start()
+
+
+class Operations:
+    """What can be asked of a device by name: its faults and its state, a function each.
+
+    Arguments are given by name. What returns nothing is answered with the state. `die` ends the
+    process at once, as a crash does.
+    """
+
+    def __init__(
+        self, functions: Mapping[str, Callable[..., Any]], state: Callable[[], Any] | None = None
+    ) -> None:
+        """Take the functions, and one that returns the state."""
+        self._state = state or (lambda: None)
+        self.functions = {**functions, "die": _die}
+        if state is not None:
+            self.functions["state"] = state
+
+    def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
+        """Carry out an operation.
+
+        Raises:
+            ValueError: an unknown one; lists the valid ones.
+        """
+        if op not in self.functions:
+            raise ValueError(f"unknown op {op!r}; valid: {', '.join(self.functions)}")
+        result = self.functions[op](**arguments)
+        return self._state() if result is None else result
+
+
+def _die() -> None:
+    threading.Timer(0.02, os._exit, (70,)).start()
 
 
 def device_parser(doc: str | None) -> argparse.ArgumentParser:

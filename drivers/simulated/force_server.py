@@ -3,7 +3,7 @@
     python -m drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
         [--rate HZ] [--on S]
 
-Admin operations besides those of the line (`pty_port.FAULTS`): `overload {force}` adds a wrench
+Admin operations besides those of the line (`PtyPort.faults`): `overload {force}` adds a wrench
 (6 numbers, N and N·m), `freeze {on}` repeats one reading, `stall {on}` stops sending while the
 sensor's clock goes on, `state`; Bota: `saturate {on}` and `clock {us}`.
 """
@@ -11,6 +11,7 @@ sensor's clock goes on, `state`; Bota: `saturate {on}` and `clock {us}`.
 import binascii
 import struct
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -84,6 +85,17 @@ class Gauge:
         mean = truth + self.bias + self.drift * since + self.overload
         return np.asarray(mean + self.noise * self.rng.standard_normal((count, 6)))
 
+    def add(self, force: Sequence[float]) -> None:
+        """Add a wrench (6,) to what it feels, N and N·m."""
+        wrench = np.asarray(force, dtype=np.float64)
+        if wrench.shape != (6,):
+            raise ValueError(f"force has the shape {wrench.shape}; valid: 6 numbers")
+        self.overload = wrench
+
+    def freeze(self, on: bool) -> None:
+        """Repeat one reading, or no longer."""
+        self.frozen = self.read(1)[0] if on else None
+
     def _own_heat(self, time: float) -> float:
         """Return by how much it is warmer than the air at a world time (s), K."""
         return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
@@ -122,9 +134,9 @@ class ForceSensor:
         """Take in what the client sent and return the answer, empty where there is none."""
         return b""
 
-    def admin(self, op: str, arguments: dict[str, Any]) -> bool:
-        """Carry out an admin operation of this sensor's own; False where there is none such."""
-        return False
+    def operations(self) -> dict[str, Callable[..., object]]:
+        """Return the admin operations of this sensor's own."""
+        return {}
 
 
 _MIRRORED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
@@ -165,15 +177,12 @@ class Bota(ForceSensor):
         body = self._body.pack(self.over_range if over else 0, *inside, time_us, temperature)
         return b"\xaa" + body + struct.pack("<H", crc16_x25(body))
 
-    def admin(self, op: str, arguments: dict[str, Any]) -> bool:
+    def operations(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
-        if op == "saturate":
-            self.saturated = bool(arguments["on"])
-        elif op == "clock":
-            self._start_us = int(arguments["us"])
-        else:
-            return False
-        return True
+        return {
+            "saturate": lambda on: setattr(self, "saturated", bool(on)),
+            "clock": lambda us: setattr(self, "_start_us", int(us)),
+        }
 
 
 class Hex(ForceSensor):
@@ -374,23 +383,17 @@ class Stream:
         self.number += count
         self.due += count * period
 
-    def operate(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out an admin operation and return the state."""
-        match op:
-            case "overload":
-                force = np.asarray(arguments["force"], dtype=np.float64)
-                if force.shape != (6,):
-                    raise ValueError(f"force has the shape {force.shape}; valid: 6 numbers")
-                self.gauge.overload = force
-            case "freeze":
-                self.gauge.frozen = self.gauge.read(1)[0] if arguments["on"] else None
-            case "stall":
-                self.stalled = bool(arguments["on"])
-            case "state":
-                pass
-            case _:
-                if not self.sensor.admin(op, arguments):
-                    self.port.admin(op, arguments)
+    def operations(self) -> admin.Operations:
+        """Return what can be asked."""
+        own: dict[str, Callable[..., object]] = {
+            "overload": self.gauge.add,
+            "freeze": self.gauge.freeze,
+            "stall": lambda on: setattr(self, "stalled", bool(on)),
+        }
+        return admin.Operations(own | self.sensor.operations() | self.port.faults(), self.state)
+
+    def state(self) -> dict[str, Any]:
+        """Return sensor, line and faults."""
         return self.port.state() | {
             "bias": list(self.gauge.bias),
             "noise": list(self.gauge.noise),
@@ -417,7 +420,7 @@ def main() -> None:
     gauge = Gauge.draw(board, sensor.noise, measuring, options.on)
     port = PtyPort(options.directory / "force", sensor.baud, faults)
     stream = Stream(sensor, gauge, port, due=time.monotonic())
-    admin.serve(options.directory / "force.sock", stream.operate)
+    admin.serve(options.directory / "force.sock", stream.operations())
     while True:
         stream.step()
 

@@ -3,7 +3,7 @@
     python -m drivers.simulated.geocom_server --directory DIR --range-std A B
         --transverse-std C E --seed N [--baud 115200]
 
-Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `hide
+Admin operations besides those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
 `stray {on}` follows a reflector at rest 0.2 m behind the target,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
@@ -17,7 +17,7 @@ CRC-16/ARC over the line without the checksum and its comma.
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
@@ -321,9 +321,6 @@ _PROCEDURES: dict[int, Procedure] = {
 
 
 LONGEST_LINE = 1024
-WARNINGS = (0, 1283, 1284)
-BEHIND_M = 0.2
-"""Two reflectors are at two places."""
 
 
 def respond(station: Station, line: str) -> bytes:
@@ -348,49 +345,39 @@ def respond(station: Station, line: str) -> bytes:
     return reply(OK, transaction, code, values, checked=request.checked)
 
 
-def operate(station: Station, port: PtyPort, op: str, arguments: dict[str, Any]) -> Any:
-    """Carry out an admin operation and return the state (`log`: the last requests)."""
-    match op:
-        case "beam":
-            station.broken = bool(arguments["on"])
-        case "hide":
-            station.hidden = {int(k) for k in arguments["targets"]}
-            station.locked = station.locked and station.number not in station.hidden
-        case "lock_lost":
-            station.locked = False
-        case "freeze":
-            station.stuck = station.seen if arguments["on"] else None
-        case "stray":
-            seen = station.target() if arguments["on"] else None
-            station.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
-        case "dist_error":
-            station.dist_error = bool(arguments["on"])
-        case "warn":
-            if arguments["code"] not in WARNINGS:
-                raise ValueError(f"code = {arguments['code']}; valid: {WARNINGS}")
-            station.warning = int(arguments["code"])
-        case "busy":
-            station.busy = bool(arguments["on"])
-        case "delay":
-            count = int(arguments.get("count", 1))
-            station.delays[int(arguments["rpc"])] = float(arguments["seconds"]), count
-        case "wrong_trid":
-            station.wrong_transactions = int(arguments.get("count", 1))
-        case "meas_s":
-            station.meas_s = float(arguments["seconds"])
-        case "log":
-            return [[number, *values] for number, values in list(station.requests)]
-        case "state":
-            pass
-        case _:
-            port.admin(op, arguments)
-    return port.state() | {
-        "locked": station.locked,
-        "beam": station.broken,
-        "measured": station.measured,
-        "requests": len(station.requests),
-        "meas_s": station.meas_s,
+def operations(station: Station, port: PtyPort) -> admin.Operations:
+    """Return what can be asked of the station."""
+
+    def put(name: str) -> Callable[..., None]:
+        return lambda on: setattr(station, name, bool(on))
+
+    def delay(rpc: int, seconds: float, count: int = 1) -> None:
+        station.delays[int(rpc)] = float(seconds), int(count)
+
+    def state() -> dict[str, Any]:
+        return port.state() | {
+            "locked": station.locked,
+            "beam": station.broken,
+            "measured": station.measured,
+            "requests": len(station.requests),
+            "meas_s": station.meas_s,
+        }
+
+    own: dict[str, Callable[..., object]] = {
+        "beam": put("broken"),
+        "hide": station.hide,
+        "lock_lost": lambda: setattr(station, "locked", False),
+        "freeze": lambda on: setattr(station, "stuck", station.seen if on else None),
+        "stray": station.follow_stray,
+        "dist_error": put("dist_error"),
+        "warn": station.warn,
+        "busy": put("busy"),
+        "delay": delay,
+        "wrong_trid": lambda count=1: setattr(station, "wrong_transactions", int(count)),
+        "meas_s": lambda seconds: setattr(station, "meas_s", float(seconds)),
+        "log": lambda: [[number, *values] for number, values in list(station.requests)],
     }
+    return admin.Operations(own | port.faults(), state)
 
 
 def serve(station: Station, port: PtyPort) -> None:
@@ -426,10 +413,7 @@ def main() -> None:
         measuring,
     )
     port = PtyPort(options.directory / "tracker", options.baud, faults)
-    admin.serve(
-        options.directory / "tracker.sock",
-        lambda op, arguments: operate(station, port, op, arguments),
-    )
+    admin.serve(options.directory / "tracker.sock", operations(station, port))
     serve(station, port)
 
 

@@ -2,7 +2,8 @@
 
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -74,6 +75,9 @@ class Beam:
         return PolarPoint(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))
 
 
+WARNINGS = (0, 1283, 1284)
+BEHIND_M = 0.2
+"""Two reflectors are at two places."""
 AIM_S = 0.3
 """World time of a search, a fine adjustment, a lock-in or a turn, s."""
 FIELD_OF_VIEW = 0.026
@@ -151,6 +155,22 @@ class Station:
     seen: PolarPoint | None = None
     stuck: PolarPoint | None = None
     stray: PolarPoint | None = None
+
+    def hide(self, targets: Iterable[int]) -> None:
+        """Cover these targets by number, and no others."""
+        self.hidden = {int(k) for k in targets}
+        self.locked = self.locked and self.number not in self.hidden
+
+    def follow_stray(self, on: bool) -> None:
+        """Follow a reflector at rest behind where the target is now, or the target again."""
+        seen = self.target() if on else None
+        self.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
+
+    def warn(self, code: int) -> None:
+        """Give a warning with every good measurement, or none (0)."""
+        if code not in WARNINGS:
+            raise ValueError(f"code = {code}; valid: {WARNINGS}")
+        self.warning = code
 
     def targets(self) -> dict[int, PolarPoint]:
         """Return where the targets that can be seen truly are at this moment, by number."""

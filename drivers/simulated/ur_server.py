@@ -4,15 +4,24 @@
         [--version 5.11.6.1010327] [--seed N]
 
 Ports as on a real one: RTDE 30004, dashboard 29999 (none from PolyScope X, version 10, on),
-script 30003. Admin operations: see `OPERATIONS`.
+script 30003.
+
+Admin operations: `state`, `protective_stop`, `emergency_stop`, `release_emergency_stop`,
+`local_mode`, `remote_mode`, `kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`,
+`rtde_half_frame`, `dashboard_mute {on}`, `dashboard_drop`, `refuse {on}` new RTDE clients,
+`refuse_motion {on}`, `freeze {on}` the joint angles that are told while all else goes on, `jog {q}`
+as somebody who moves the arm by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
+`log`
 """
 
 import argparse
 import asyncio
+import inspect
 import math
 import os
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -149,20 +158,49 @@ def read_version(text: str) -> Version:
     raise InputError(f"version {text!r}; valid: four numbers, e.g. 5.11.6.1010327")
 
 
-OPERATIONS = (
-    "state, protective_stop, emergency_stop, release_emergency_stop, local_mode, remote_mode, "
-    "kill_script, rtde_drop, rtde_stall {on}, rtde_mute {on}, rtde_half_frame, "
-    "dashboard_mute {on}, dashboard_drop, refuse {on}, refuse_motion {on}, freeze {on}, jog {q}, "
-    "set {version, slider, speed_scaling, unlock_s}, die, log"
-)
-
-
 class AdminOperations:
-    """What may be asked and switched, see `OPERATIONS`; answers with the state, or the log."""
+    """What may be asked and switched; answers with the state, or the log."""
 
     def __init__(self, server: Server, loop: asyncio.AbstractEventLoop) -> None:
         """Serve from other threads than that of the loop."""
         self._server, self._loop = server, loop
+        arm, controller, links = server.arm, server.controller, server.rtde.links
+
+        def switch(name: str) -> Callable[..., object]:
+            return lambda on=True: setattr(server.faults, name, bool(on))
+
+        def drop() -> None:
+            for link in list(links):
+                link.writer.transport.abort()
+
+        def half_frame() -> None:
+            for link in list(links):
+                link.half()
+
+        def freeze(on: bool = True) -> None:
+            arm.frozen_q = arm.trajectory.q.copy() if on else None
+
+        self._functions: dict[str, Callable[..., object]] = {
+            "state": lambda: None,
+            "protective_stop": lambda: controller.protective_stop("admin"),
+            "emergency_stop": controller.emergency_stop,
+            "release_emergency_stop": controller.release_emergency_stop,
+            "local_mode": lambda: controller.set_remote(False),
+            "remote_mode": lambda: controller.set_remote(True),
+            "kill_script": lambda: controller.stop_program("killed"),
+            "rtde_drop": drop,
+            "rtde_stall": switch("rtde_stall"),
+            "rtde_mute": switch("rtde_mute"),
+            "rtde_half_frame": half_frame,
+            "dashboard_mute": switch("dashboard_mute"),
+            "dashboard_drop": server.dashboard.drop,
+            "refuse": lambda on=True: server.accept(not on),
+            "refuse_motion": lambda on=True: setattr(arm, "refuses_motion", bool(on)),
+            "freeze": freeze,
+            "jog": lambda q: arm.trajectory.place(_joints(q)),
+            "set": self._set,
+            "log": lambda: None,
+        }
 
     def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
         """Carry out an operation in the controller's own thread."""
@@ -173,59 +211,21 @@ class AdminOperations:
 
     async def _do(self, op: str, arguments: dict[str, Any]) -> Any:
         server, arm = self._server, self._server.arm
+        if op not in self._functions:
+            raise InputError(f"unknown op {op!r}; valid: {', '.join((*self._functions, 'die'))}")
         if op not in ("state", "log", "set", "release_emergency_stop", "remote_mode"):
             if arguments.get("on", True):
                 arm.fault_ns = time.monotonic_ns()
             arm.note(f"admin: {op} {arguments or ''}".strip())
-        if op == "log":
-            return list(arm.log)
-        if op == "set":
-            self._set(arguments)
-        else:
-            await self._switch(op, arguments)
+        done = self._functions[op](**arguments)
+        if inspect.isawaitable(done):
+            await done
         server.controller.step()
-        return self._state()
+        return list(arm.log) if op == "log" else self._state()
 
-    async def _switch(self, op: str, arguments: dict[str, Any]) -> None:
-        server, controller = self._server, self._server.controller
-        match op:
-            case "state":
-                pass
-            case "protective_stop":
-                controller.protective_stop("admin")
-            case "emergency_stop":
-                controller.emergency_stop()
-            case "release_emergency_stop":
-                controller.release_emergency_stop()
-            case "local_mode" | "remote_mode":
-                controller.set_remote(op == "remote_mode")
-            case "kill_script":
-                controller.stop_program("killed")
-            case "rtde_drop":
-                for link in list(server.rtde.links):
-                    link.writer.transport.abort()
-            case "rtde_half_frame":
-                for link in list(server.rtde.links):
-                    link.half()
-            case "rtde_stall" | "rtde_mute" | "dashboard_mute":
-                setattr(server.faults, op, bool(arguments.get("on", True)))
-            case "dashboard_drop":
-                server.dashboard.drop()
-            case "refuse":
-                await server.accept(not arguments.get("on", True))
-            case "refuse_motion":
-                server.arm.refuses_motion = bool(arguments.get("on", True))
-            case "freeze":  # the joint angles that are told stand still, all else goes on
-                on = bool(arguments.get("on", True))
-                server.arm.frozen_q = server.arm.trajectory.q.copy() if on else None
-            case "jog":  # somebody moves the arm by hand
-                server.arm.trajectory.place(_joints(arguments["q"]))
-            case _:
-                raise InputError(f"no operation {op!r}; valid: {OPERATIONS}")
-
-    def _set(self, arguments: dict[str, Any]) -> None:
+    def _set(self, **settings: Any) -> None:
         arm = self._server.arm
-        for key, value in arguments.items():
+        for key, value in settings.items():
             match key:
                 case "version":
                     arm.version = read_version(str(value))

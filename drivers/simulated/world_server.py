@@ -15,10 +15,9 @@ The world comes as a JSON file, exactly.
 """
 
 import json
-import os
 import sys
-import threading
 import time
+from collections.abc import Callable
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Any
@@ -150,7 +149,6 @@ def _differences(a: Cell, b: Cell) -> list[str]:
     ]
 
 
-OPS = ("hang", "mistake", "push", "swing", "state", "log", "die")
 _POLL = 0.0025  # s, real time between two looks at the arm
 
 
@@ -163,30 +161,6 @@ def open_board(directory: Path, scale: float, begun: float = 0.0) -> Blackboard:
         new.replace(path)  # the mapping goes with the file
         return board
     return Blackboard.attach(path)
-
-
-def handler(living: WorldState) -> admin.Handler:
-    """Return what answers the requests."""
-
-    def answer(op: str, given: dict[str, Any]) -> Any:
-        if op == "hang":
-            return living.hang(given.get("name"))
-        if op == "mistake":
-            return living.mistake(given.get("name"))
-        if op == "push":
-            return living.push(given["wrench"])
-        if op == "swing":
-            return living.swing(given["wrench"], float(given["period"]), float(given["decay"]))
-        if op == "state":
-            return living.state()
-        if op == "log":
-            return living.log()
-        if op == "die":
-            threading.Timer(0.02, os._exit, (70,)).start()
-            return None
-        raise ValueError(f"unknown op {op!r}; valid: {', '.join(OPS)}")
-
-    return answer
 
 
 def main() -> int:
@@ -202,7 +176,15 @@ def main() -> int:
         print(error, file=sys.stderr)
         return error.exit_code
     living.step(time.monotonic_ns())
-    admin.serve(arguments.directory / "world.sock", handler(living))
+    asked: dict[str, Callable[..., Any]] = {
+        "hang": living.hang,
+        "mistake": living.mistake,
+        "push": living.push,
+        "swing": living.swing,
+        "state": living.state,
+        "log": living.log,
+    }
+    admin.serve(arguments.directory / "world.sock", admin.Operations(asked))
     while True:
         living.step(time.monotonic_ns())
         time.sleep(_POLL)

@@ -106,6 +106,6 @@ def test_a_clock_that_wraps_loses_nothing(kind, simulated) -> None:
 def test_it_dies_when_told_to(kind) -> None:
     with force_sensor(kind) as sensor, serial.Serial(str(sensor.port), 19200) as line:
         sensor.admin("die")
-        assert sensor.process.wait(10) == 1
+        assert sensor.process.wait(10) == 70
         with pytest.raises(serial.SerialException):
             line.read(10_000_000)
