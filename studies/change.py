@@ -13,8 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.simulated.draw import Draw, joint_compliance, typical_torque
-from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.injected_effects import (
+    Draw,
+    joint_compliance,
+    nothing_hidden,
+    typical_torque,
+)
 from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config

@@ -12,8 +12,16 @@ from typing import Annotated
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import case_of_plan, read_plan, simulated_cell
-from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, SimulationCase, as_told
+from drivers.simulated.rehearsal import (
+    NOTHING,
+    RANDOM,
+    Rehearsal,
+    SimulationCase,
+    as_told,
+    case_of_plan,
+    read_plan,
+    simulated_cell,
+)
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import (
     POSES,

@@ -12,9 +12,8 @@ from hilcal.design.next import PairPower
 from hilcal.design.summary import PlanSummary
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import InputError
-from hilcal.measuring.clearance import Clearance, clearance_of
+from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
 from hilcal.measuring.route import Stop, route
-from hilcal.measuring.sight import LineOfSight, sight_of
 from hilcal.robot import chain as chains
 from hilcal.robot.body import body_poses
 from hilcal.store.plan import Plan

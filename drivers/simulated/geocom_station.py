@@ -1,14 +1,83 @@
-"""The state of a GeoCOM laser station, and the procedures of `rpc.py` by number."""
+"""What a laser station is: its state, its optics, and the target that it holds."""
 
 import time
 from collections import deque
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from drivers.simulated.blackboard import Blackboard, settled_truth
-from drivers.simulated.geocom.optics import Beam, PolarPoint
+from hilcal.types import Floats
 
+
+@dataclass(frozen=True, slots=True)
+class PolarPoint:
+    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV.
+
+    Attributes:
+        hz: horizontal angle, 0 to 2 pi, rad.
+        v: zenith angle, 0 to pi, rad.
+        distance: m.
+    """
+
+    hz: float
+    v: float
+    distance: float
+
+    @staticmethod
+    def of(point: Floats) -> "PolarPoint":
+        """Return the polar coordinates of a point (3,), m."""
+        x, y, z = map(float, point)
+        level = float(np.hypot(x, y))
+        hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(level, z)
+        return PolarPoint(float(hz), float(v), float(np.hypot(level, z)))
+
+    def angle_to(self, other: "PolarPoint") -> float:
+        """Return the angle between two directions, rad."""
+        return float(np.arccos(np.clip(self.direction() @ other.direction(), -1.0, 1.0)))
+
+    def direction(self) -> Floats:
+        """Return the unit vector (3,)."""
+        level = np.sin(self.v)
+        return np.array([level * np.sin(self.hz), level * np.cos(self.hz), np.cos(self.v)])
+
+
+@dataclass(frozen=True, slots=True)
+class Beam:
+    """Noise of one measurement at the distance d.
+
+        sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
+        sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
+
+    Attributes:
+        range_std: (a, b) in m and m/m.
+        transverse_std: (c, e) in m and m/m.
+    """
+
+    range_std: tuple[float, float]
+    transverse_std: tuple[float, float]
+
+    def angle_std(self, distance: float) -> float:
+        """Return sigma_transverse / d, rad."""
+        return self.transverse_std[0] / distance + self.transverse_std[1]
+
+    def observe(self, true: PolarPoint, rng: np.random.Generator) -> PolarPoint:
+        """Return one measurement of a target; every call draws anew."""
+        across = self.angle_std(true.distance)
+        draw = rng.standard_normal(3)
+        # straight above the station the horizontal angle is arbitrary
+        hz = true.hz + draw[0] * min(across / max(np.sin(true.v), 1e-12), np.pi)
+        v = true.v + draw[1] * across
+        if not 0.0 <= v <= np.pi:  # over the zenith or the nadir
+            hz, v = hz + np.pi, (-v if v < 0.0 else 2 * np.pi - v)
+        along = self.range_std[0] + self.range_std[1] * true.distance
+        return PolarPoint(float(hz % (2 * np.pi)), float(v), float(true.distance + draw[2] * along))
+
+
+WARNINGS = (0, 1283, 1284)
+BEHIND_M = 0.2
+"""Two reflectors are at two places."""
 AIM_S = 0.3
 """World time of a search, a fine adjustment, a lock-in or a turn, s."""
 FIELD_OF_VIEW = 0.026
@@ -86,6 +155,22 @@ class Station:
     seen: PolarPoint | None = None
     stuck: PolarPoint | None = None
     stray: PolarPoint | None = None
+
+    def hide(self, targets: Iterable[int]) -> None:
+        """Cover these targets by number, and no others."""
+        self.hidden = {int(k) for k in targets}
+        self.locked = self.locked and self.number not in self.hidden
+
+    def follow_stray(self, on: bool) -> None:
+        """Follow a reflector at rest behind where the target is now, or the target again."""
+        seen = self.target() if on else None
+        self.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
+
+    def warn(self, code: int) -> None:
+        """Give a warning with every good measurement, or none (0)."""
+        if code not in WARNINGS:
+            raise ValueError(f"code = {code}; valid: {WARNINGS}")
+        self.warning = code
 
     def targets(self) -> dict[int, PolarPoint]:
         """Return where the targets that can be seen truly are at this moment, by number."""
