@@ -119,9 +119,9 @@ class LoadWatch:
     d = |R (f - f_tool) - f_load| with f the force felt, sensor axes, f_tool that of the tool and R
     the sensor's orientation. A load that is a moment alone is compared by its moment, acting at
     `MOMENT_LEVER_M`. The limit is `ALLOWED` times the one of `[operator]` when a load is hung, and
-    more for a pull (`PULL`) and in motion for what swings (`SWING`) and is accelerated. A tool that
-    is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at its pose, so
-    the limit grows by how far the sensor has turned against gravity since.
+    more for a pull (`PULL`) and in motion for what swings to the side (`SWING`) and is accelerated.
+    A tool that is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at
+    its pose, so the limit grows by how far the sensor has turned against gravity since.
 
     Attributes:
         watching: whether anything is compared now.
@@ -177,7 +177,11 @@ class LoadWatch:
         return self._words(tared) if difference - noise > limit else ""
 
     def _compared(self, tared: TaredWrench, *, moving: bool) -> tuple[float, float]:
-        """How far force (or moment) is from what should hang, and how far it may be, N."""
+        """How far force (or moment) is from what should hang, and how far it may be, N.
+
+        A weight that swings pulls to the side; its vertical force changes by little, and is
+        compared by itself in motion.
+        """
         load, operator, cell = self._load, self._config.operator, self._cell
         hung = np.zeros(6) if load is None else load.wrench(cell.gravity)
         beyond = self._meter.load_wrench(tared) - hung
@@ -196,7 +200,12 @@ class LoadWatch:
             motion = self._config.motion
             brief = motion.speed_rad_s < HOLD_S * motion.acceleration_rad_s2
             ramp = 0.0 if brief else motion.acceleration_rad_s2  # over before it has lasted enough
-            limit += SWING * size + mass * cell.arm.reach * (ramp + motion.speed_rad_s**2)
+            limit += mass * cell.arm.reach * (ramp + motion.speed_rad_s**2)
+            down = abs(float(beyond[:3] @ cell.gravity)) / float(np.linalg.norm(cell.gravity))
+            lifted = limit + SWING**2 / 2 * size
+            limit += SWING * size
+            if load is not None and not pulled and down / lifted > unlike / limit:
+                return down, lifted
         return unlike, limit
 
     def _words(self, tared: TaredWrench) -> str:

@@ -11,6 +11,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase, Remark
+from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
 from tests.support.run_cases import measure, rows
@@ -489,6 +490,28 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
     b.rig.force.latest = swings  # type: ignore[union-attr, method-assign]
     measure(b)
     assert [name for name, _ in b.operator.asked] == ["none", "3kg", "none", "pull", "none"]
+
+
+def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing() -> None:
+    """30 N from below a weight of 59 N: less than it may pull to the side while it swings."""
+    b = Bench()
+    latest, borne = b.rig.force.latest, []  # type: ignore[union-attr]
+
+    def bears() -> WrenchSample:
+        one = latest()
+        b.world.hurry = 1.0 if b.world.load == "6kg" else 20.0
+        asked = [name for name, _ in b.operator.asked].count("6kg")
+        if b.world.load == "6kg" and b.world.is_moving and asked == 1:
+            borne.append(b.world.time)
+            turned = evaluate(b.cell.arm, b.world.joints()[None]).rotation[-1][0]
+            one.wrench[:3] += turned.T @ np.array([0.0, 0.0, 30.0])
+        return one
+
+    b.rig.force.latest = bears  # type: ignore[union-attr, method-assign]
+    measure(b, plan_of(("p1", "none", 0), ("p1", "6kg", 0), ("p2", "6kg", 0)))
+    assert borne
+    assert borne[-1] - borne[0] < 1.0
+    assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
 
 
 def test_a_load_that_stays_wrong_ends_the_run() -> None:
