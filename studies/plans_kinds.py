@@ -123,8 +123,10 @@ def optimal(
         rng: generator.
         robust: whether it keeps power against the potential terms.
     """
-    of_plan = of.robust if robust and of.robust is not None else of.exact
-    asked = compound_objective(of_plan, of.config, criterion, of.work, float(budget), rng)
+    of_plan, config = of.exact, without_potential(of.config)
+    if robust and of.robust is not None:
+        of_plan, config = of.robust, of.config
+    asked = compound_objective(of_plan, config, criterion, of.work, float(budget), rng)
     design = choose(asked, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
     told = predicted(of_plan, counts, work=of.work)

@@ -212,9 +212,9 @@ def _turned(known: Floats, flat: Bools, every: _Every) -> _Turned:
     gram, elements = np.zeros((len(held), len(held))), 0
     candidates = every.of.candidates
     for _, rows in every.rows(candidates, max(1, len(candidates) // SAMPLE)):
-        moved = (rows @ root).reshape(-1, len(held))
-        gram += moved.T @ moved
-        elements += len(moved)
+        moved = rows @ root
+        gram += np.einsum("kri,krj->ij", moved, moved, optimize=True)
+        elements += moved.shape[0] * moved.shape[1]
     values, vectors = np.linalg.eigh(gram / max(elements, 1))
     kept = np.flatnonzero(values > LEAST**2)[-DIRECTIONS:]
     prior = known[np.ix_(free, free)] - g @ lifted

@@ -112,7 +112,8 @@ def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
         beta = supported[p.effect][rng.integers(DRAWS, size=trials)] / of.scale[where]
         for rows, promised in ((before, p.now), (every, p.then)):
             y = rows[:, where] @ beta.T + rng.standard_normal((len(rows), trials))
-            spanned = [sl.orth(rows[:, c]) for c in (fitted, np.append(fitted, where))]
+            both = (fitted, np.append(fitted, where))
+            spanned = [sl.orth(rows[:, c], rcond=1e-7) for c in both]  # roots of rounding, 1e-8
             less, more = (np.sum((basis.T @ y) ** 2, axis=0) for basis in spanned)
             added = spanned[1].shape[1] - spanned[0].shape[1]
             rejected = int(np.sum(more - less > stats.chi2.isf(LEVEL, added)))
