@@ -122,6 +122,7 @@ def make(
     say: Say = lambda words: None,
     catalogue: Catalogue | None = None,
     prior: CarriedPrior | None = None,
+    reference: Floats | None = None,
 ) -> Planned:
     """Return the plan.
 
@@ -135,6 +136,8 @@ def make(
         catalogue: the effects that a model can have; the installed ones unless given, or those
             of `known`.
         prior: what another campaign taught, where nothing has been measured yet.
+        reference: (n,) joints of the reference pose of the campaign that the plan is appended to,
+            rad; a new one where None.
 
     Raises:
         InputError: numbers or names that cannot be.
@@ -145,8 +148,11 @@ def make(
     say("drawing candidate poses")
     space = Space(cell, config)
     drawn = draw(space, config.planning.candidates, rng, least=2)
-    home, poses = _reference(space, drawn, rng)
-    drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
+    if reference is None:
+        home, poses = _reference(space, drawn, rng)
+        drawn = replace(drawn, q=drawn.q[poses], allowed=drawn.allowed[poses])
+    else:
+        home = reference
     say("computing the information of each pose")
     if known is None:
         model = nominal_model(cell, config, 3, catalogue, prior)

@@ -124,7 +124,7 @@ def decide(
     verdict: str = d.verdict
     further = _separating(cell, config, settings, d, error, reference, rng, say)
     if further is None or not further.measures:
-        sharper = _sharpening(cell, config, settings, d, error, rng, say)
+        sharper = _sharpening(cell, config, settings, d, error, reference, rng, say)
         if sharper is not None and (further is None or sharper.measures):
             further = sharper
     if further is None:
@@ -210,6 +210,7 @@ def _sharpening(
     settings: Settings,
     d: Diagnosis,
     error: PredictedError,
+    reference: Floats | None,
     rng: np.random.Generator,
     say: Say,
 ) -> Decision | None:
@@ -223,7 +224,8 @@ def _sharpening(
     planning = config.planning.model_copy(update={"readings": d.fit.mode})
     own = config.model_copy(update={"planning": planning})
     try:
-        planned = make(cell, own, Request(settings.poses), rng, d.fit, say)
+        wanted = Request(settings.poses)
+        planned = make(cell, own, wanted, rng, d.fit, say, reference=reference)
     except (CannotAnswerError, InputError):
         return Decision("no_gain", d.verdict, error)
     before = predicted(planned.problem, work=planned.work).position

@@ -20,6 +20,7 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.measuring.dry_run import dry_run
 from hilcal.readings.covariance import WHOLE
+from hilcal.store.appended import with_new_names
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints
@@ -68,6 +69,15 @@ def test_the_plan_may_be_run_and_is_the_same_every_time(usual: Planned) -> None:
     again = planned(config, readings=25).ordered.plan
     assert again.to_json() == plan.to_json()
     assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
+
+
+def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual: Planned) -> None:
+    config = small()
+    cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
+    rng = np.random.default_rng(8)
+    made = make(cell, config, Request(5), rng, reference=reference).ordered.plan
+    np.testing.assert_array_equal(made.joints(REFERENCE), reference)
+    assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
 
 def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
