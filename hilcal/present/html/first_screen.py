@@ -4,12 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import names
+from hilcal.identification.variance_factor import CONFIDENCE
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
 from hilcal.present.verdict import headline, message
@@ -94,15 +96,31 @@ def how_good(m: ReportContent) -> str:
 
 def where_wrong(m: ReportContent) -> str:
     """Say in a sentence where it is worst, and what the misfit follows."""
-    d = m.diagnosis
-    if d is not None and d.residual_is_noise:
-        return "Nowhere beyond the noise: all poses and loads are predicted within it."
-    fit, error = m.fit, left_out_errors(m.fit)
+    d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
     furthest = int(fit.whitening.reading[np.argmax(error)])
     pose, load = names(fit.readings[~fit.outlier], furthest)
     at = "unloaded" if load == UNLOADED else f"under {load}"
     said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
-    return said if d is None else f"{said} {follows(d.misfit_breakdown)}"
+    if d is None:
+        return said
+    if not d.residual_is_noise:
+        return f"{said} {follows(d.misfit_breakdown)}"
+    if not beyond_noise(fit):
+        return "Nowhere beyond the noise: all poses and loads are predicted within it."
+    return (
+        "Nowhere in particular: what is left of the fitted poses is noise. But poses left out are "
+        f"off by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance: more poses "
+        f"would make the parameters surer. {said}"
+    )
+
+
+def beyond_noise(fit: Fit) -> bool:
+    """Whether poses left out are further off than the noise alone leaves them by chance.
+
+    With R whitened elements of standard deviation 1 their sum of squares is χ²(R).
+    """
+    count = fit.whitening.rank
+    return bool(fit.holdout.rms_sigma**2 * count > chi2.isf((1 - CONFIDENCE) / 2, count))
 
 
 def missing(d: Diagnosis | None) -> str:
