@@ -122,7 +122,7 @@ def write_report(
         first, verdict = comparison_screen(found, run.path.name), None
     else:
         from hilcal.present.html.first_screen import first_screen
-        from hilcal.present.html.page import page
+        from hilcal.present.html.sections import page
 
         with ExitStack() as stack:
             beside = Files(run.path).validation

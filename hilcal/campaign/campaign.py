@@ -24,6 +24,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
 from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
@@ -42,7 +43,6 @@ from hilcal.identification.predictive import Predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
 from hilcal.present.build_story import Chapter
-from hilcal.present.diagnosis_json import to_json
 from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, usual_mode

@@ -13,6 +13,7 @@ from hilcal.identification.parameter_differences import Differences
 from hilcal.identification.remeasured import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identification.validation import Validation
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +48,7 @@ class Today:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class Comparison(Shown):
     """An earlier campaign and a later one of the same arm; what `compare` returns.
 
     Attributes:

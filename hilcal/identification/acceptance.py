@@ -1,7 +1,7 @@
 """Prediction errors by load and by pose, against the stated uncertainty and against a limit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -105,6 +105,24 @@ class Acceptance:
     def undecided(self) -> bool:
         """Whether the limit is not kept, and the readings are too noisy to show that it could."""
         return self.passed is False and self.limit_m is not None and self.limit_m < self.noise_m
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `validate --json` on loads, poses and the limit."""
+        limit = self.limit_m
+
+        def document(s: Share, own: str, other: str) -> dict[str, object]:
+            d = {own if k == "name" else k: v for k, v in asdict(s).items()}
+            d[f"worst_{other}"] = d.pop("worst")
+            return d if limit is None else {**d, "passed": s.passes(limit)}
+
+        return {
+            "within_95": self.everything.within,
+            "loads": [document(s, "load", "pose") for s in self.loads],
+            "poses": [document(s, "pose", "load") for s in self.poses],
+            "limit": None
+            if limit is None
+            else {"limit_m": limit, "passed": self.passed, "n_over": self.over},
+        }
 
 
 def acceptance(

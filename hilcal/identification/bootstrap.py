@@ -36,6 +36,7 @@ from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Scaling, whitening
+from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
 DRAWS = 200
@@ -74,7 +75,7 @@ class _Campaign:
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
+class Bootstrap(Shown):
     """Parameters of a model, fitted to B draws of whole poses.
 
     Attributes:

@@ -1,7 +1,6 @@
 """The first screen: is the model good, where is it wrong, what is missing; before, after, limit."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -14,39 +13,10 @@ from hilcal.identification.full_prediction import names
 from hilcal.identification.variance_factor import CONFIDENCE
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
+from hilcal.present.html.page import Card, FirstScreen
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Card:
-    """One number of the first screen: `label`, `value` with unit, and a note."""
-
-    label: str
-    value: str
-    note: str
-
-
-@dataclass(frozen=True, slots=True)
-class FirstScreen:
-    """What the first screen says.
-
-    Attributes:
-        headline: the verdict in a few words.
-        tone: "good", "doubt" or "bad", for the colour; the headline says it in words.
-        answers: question and answer: is it good, where is it wrong, what is missing.
-        cards: before and after.
-        limit: "PASSED" or "FAILED" and why; empty without a limit.
-        passed: whether the limit is kept; None without one.
-    """
-
-    headline: str
-    tone: str
-    answers: tuple[tuple[str, str], ...]
-    cards: tuple[Card, ...]
-    limit: str
-    passed: bool | None
 
 
 def first_screen(m: ReportContent) -> FirstScreen:

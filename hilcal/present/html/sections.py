@@ -40,7 +40,10 @@ from hilcal.present.document import (
     table,
 )
 from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
+from hilcal.present.html.certificate import certificate
 from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import first_screen
+from hilcal.present.html.page import render
 from hilcal.present.registration import covariance_words
 from hilcal.present.story import REVISION_HEADS
 from hilcal.present.validation import worst_table
@@ -52,6 +55,13 @@ MOST_LISTED = 6
 """Suspects that stand on the page; a choice, as the others are."""
 MOST_PARAMETERS = 48
 MOST_LAWS = 4
+
+
+def page(m: ReportContent) -> str:
+    """Return the report of one campaign as HTML."""
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    parts = (certificate(m), *sections(m), *(appendix(m) if m.appendix else ()))
+    return render("Calibration report", about, first_screen(m), parts)
 
 
 def sections(m: ReportContent) -> tuple[Section, ...]:

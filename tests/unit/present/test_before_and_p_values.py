@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from hilcal import numbers
+from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
@@ -17,7 +18,6 @@ from hilcal.identification.fit_document import to_json
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.diagnosis import diagnosis_report, suspects_table
-from hilcal.present.diagnosis_json import to_json as diagnosis_json
 from hilcal.present.fit import before_and_after, errors, fit_report, worst_poses
 from hilcal.present.verdict import message
 from hilcal.present.viewer import words

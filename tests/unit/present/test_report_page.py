@@ -26,8 +26,9 @@ from hilcal.present.html.first_screen import (
     limit_words,
     where_wrong,
 )
-from hilcal.present.html.page import page as page_of
+from hilcal.present.html.sections import page as page_of
 from hilcal.present.html.sections import sections
+from hilcal.refinement import Refinement, Step
 from hilcal.store.overview import Instrument
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels
@@ -190,6 +191,22 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made) -> N
         said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
         assert ("all poses and loads are predicted within it" in said) == within
         assert (f"off by {sigma:.2f} times the noise" in said) != within
+
+
+def test_results_show_themselves_in_a_notebook(made) -> None:
+    m, _ = made
+    for result, words in (
+        (m.fit, numbers.length(m.fit.holdout.rms_m)),
+        (m.diagnosis, m.diagnosis.suspects[0].effect),
+        (Refinement((Step(m.fit, m.diagnosis, None),)), m.diagnosis.verdict.replace("_", " ")),
+    ):
+        text = result._repr_html_()
+        outline = Outline()
+        outline.feed(text)
+        tags = [tag for tag, _ in outline.tags]
+        assert tags.count("table") == tags.count("caption") > 0
+        assert words in text
+        assert EVIL not in text
 
 
 def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made) -> None:
