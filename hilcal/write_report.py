@@ -12,8 +12,8 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
-from hilcal.present.build_story import build_story, of_left_out
 from hilcal.present.html.content import ReportContent, Tested
+from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.readings.whitening import SCALINGS, Scaling
 from hilcal.store.overview import overview

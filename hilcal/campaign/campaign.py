@@ -42,7 +42,7 @@ from hilcal.identification.posterior import Posterior, Source
 from hilcal.identification.predictive import Predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
-from hilcal.present.build_story import Chapter
+from hilcal.present.story import Chapter
 from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, usual_mode

@@ -144,7 +144,7 @@ def fleet(
         t.show(f"{report}: the report")
         document["report"] = str(report)
     if record is not None:
-        from hilcal.present.viewer.fleet_stream import record_fleet  # loads the viewer's library
+        from hilcal.present.viewer.fleet import record_fleet  # loads the viewer's library
 
         record_fleet(found, record)
         t.notice(f"recorded {record}; open it with: {opening(record)}")

@@ -55,7 +55,6 @@ from hilcal.identification.fit_document import prior_to_json
 from hilcal.identification.frames_document import fit_to_json
 from hilcal.identification.other_arm import other_arm_of
 from hilcal.identification.weight import weight_note
-from hilcal.present.build_story import Chapter
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
@@ -70,6 +69,7 @@ from hilcal.present.discovery import refined_laws
 from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
+from hilcal.present.story import Chapter
 from hilcal.present.verdict import message
 from hilcal.refinement import Step as RefinementStep
 from hilcal.refinement import refine as refine_model

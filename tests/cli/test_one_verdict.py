@@ -17,7 +17,7 @@ from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
-from hilcal.present.build_story import build_story
+from hilcal.present.story import build_story
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

@@ -19,7 +19,7 @@ from hilcal.design.summary import (
     PredictedParameter,
 )
 from hilcal.design.timing import Duration
-from hilcal.present.viewer.plan_stream import record_plan
+from hilcal.present.viewer.plan import record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 

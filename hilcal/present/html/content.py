@@ -10,8 +10,7 @@ from hilcal.identification.extrapolation import Extrapolation
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.validation import Validation
-from hilcal.present.build_story import Chapter
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Chapter, Story, StoryRevision
 from hilcal.readings.whitening import Scaling
 from hilcal.store.overview import Overview
 from hilcal.store.plan import Plan

@@ -10,7 +10,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.fit import Fit
-from hilcal.present.build_story import curve, regressor
 from hilcal.present.campaign import info_report
 from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import (
@@ -27,7 +26,7 @@ from hilcal.present.charts.readings import (
     residual_by_time,
     workspace,
 )
-from hilcal.present.diagnosis import could_have_been_seen, doubtful, redundant_line
+from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
 from hilcal.present.document import (
     Block,
     Chart,
@@ -45,7 +44,7 @@ from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import first_screen
 from hilcal.present.html.page import render
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import REVISION_HEADS
+from hilcal.present.story import curve, regressor
 from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
 from hilcal.store.command_line import COMMAND

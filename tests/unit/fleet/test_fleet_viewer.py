@@ -9,8 +9,7 @@ from rerun.chunk import RrdReader
 
 from hilcal.identification.posterior import Posterior
 from hilcal.present.viewer import style
-from hilcal.present.viewer.fleet_scene import places, type_digest
-from hilcal.present.viewer.fleet_stream import record_fleet
+from hilcal.present.viewer.fleet import drawn_type, places, record_fleet
 from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import Pooled, pooled
@@ -42,7 +41,7 @@ def recorded(one: Posterior, path: Path, odd: float) -> Path:
 
 def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None:
     whole, of = fleet(one, 1.5)
-    d = type_digest(of, whole.members)
+    d = drawn_type(of, whole.members)
     assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
     assert d.joints == tuple(int(name[-1]) for name in d.names)
     assert (d.units.shape, d.campaigns.shape) == ((ARMS, len(d.names)), (2 * ARMS, len(d.names)))
@@ -56,7 +55,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None
 
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path: Path) -> None:
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
-    d = type_digest(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    d = drawn_type(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
     shapes = capsules(d.arm)
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     red = [k for k, c in enumerate(colors) if c == style.RED]

@@ -11,9 +11,17 @@ from rerun.chunk import RrdReader
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
 from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.viewer import live, live_digest, style
-from hilcal.present.viewer.live_digest import BALL, FLUENT, GROUPS, LIMIT, LiveDigest, judged
-from hilcal.present.viewer.live_scene import MANY, LiveScene
+from hilcal.present.viewer import live, live_scene, style
+from hilcal.present.viewer.live_scene import (
+    BALL,
+    FLUENT,
+    GROUPS,
+    LIMIT,
+    MANY,
+    LiveScene,
+    LiveTally,
+    judged,
+)
 from tests.support.live_story import BLIND, events, measuring, plan, residual
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_story import story
@@ -97,7 +105,7 @@ def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
     shown = np.sort(np.concatenate(
         [np.ravel(rows(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
     ))  # fmt: skip
-    assert LiveDigest.of(told).group == group == 8
+    assert LiveTally.of(told).group == group == 8
     assert len(shown) < 0.45 * len(sigma)
     worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
     assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
@@ -122,7 +130,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
     path = recorded(tmp_path / "two.rrd", shown)
     starts = rows(path, "/world/live/1/arrows", "Arrows3D:origins")
     last = [e for _, e in shown if isinstance(e, ReadingStored)][-1]
-    d = LiveDigest.of(told)
+    d = LiveTally.of(told)
     assert np.allclose(starts[-1], [d.place(last.step, 0), d.place(last.step, 1)], atol=1e-6)
     assert np.linalg.norm(d.place(last.step, 1) - d.place(last.step, 0)) == pytest.approx(
         float(np.linalg.norm(targets[1] - targets[0]))
@@ -134,7 +142,7 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
             d.add(e)
     assert d.judged == 2 * (len(told.plan.steps) - BLIND)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in live_digest.status(d)
+    assert " right |" in live_scene.status(d)
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
@@ -159,13 +167,13 @@ def test_the_arm_moves_through_every_place_that_is_told(measured):
 
 def test_words_say_whether_the_model_fails_and_under_which_load():
     def status(wrong: float) -> str:
-        d = LiveDigest.of(measuring())
+        d = LiveTally.of(measuring())
         for _, e in events(measuring(), wrong):
             if isinstance(e, ReadingStored):
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return live_digest.status(d)
+        return live_scene.status(d)
 
     bad, good = status(6.0), status(0.0)
     assert "✗ The simple model fails" in bad
@@ -178,7 +186,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
 
 
 def test_without_a_model_there_is_no_judgement():
-    assert "no judgement yet" in live_digest.status(LiveDigest.of(measuring()))
+    assert "no judgement yet" in live_scene.status(LiveTally.of(measuring()))
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):

@@ -17,7 +17,6 @@ from playwright.sync_api import Browser
 
 from hilcal import numbers
 from hilcal.calibration.budget import budget
-from hilcal.present.build_story import Chapter
 from hilcal.present.document import Chart, Table
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import (
@@ -28,6 +27,7 @@ from hilcal.present.html.first_screen import (
 )
 from hilcal.present.html.sections import page as page_of
 from hilcal.present.html.sections import sections
+from hilcal.present.story import Chapter
 from hilcal.refinement import Refinement, Step
 from hilcal.store.overview import Instrument
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser

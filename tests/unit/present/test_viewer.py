@@ -12,10 +12,9 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from hilcal.present.document import table
-from hilcal.present.story import worst_and_even
-from hilcal.present.viewer import charts, digest, layout, save, style
-from hilcal.present.viewer.markdown import markdown
-from hilcal.present.viewer.stream import executable
+from hilcal.present.story import levels, worst_and_even
+from hilcal.present.viewer import campaign, campaign_scene, save, style
+from hilcal.present.viewer.recording import executable
 from hilcal.robot.body import body_poses, capsules
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
@@ -89,7 +88,7 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
         assert sorted(read) == [r.revision for r in told.revisions]
         np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(values))
         (called,) = static(recording, f"/errors/{name}", "SeriesPoints:names")
-        assert called in {words for _, words, _ in charts.SERIES}
+        assert called in {words for _, words, _ in campaign.SERIES}
 
 
 def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -153,7 +152,7 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
 
 def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
     strips = column(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
-    balls = digest.digest(told).half_sizes
+    balls, _ = campaign_scene.noise_balls(told, np.arange(len(told)))
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
         dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
@@ -199,13 +198,15 @@ def test_timelines_are_revision_and_pose(recording):
 
 def test_every_reading_has_its_arrow(told, recording):
     drawn = column(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = digest.digest(told).residual_scale
+    scale = campaign_scene.residual_scale(told)
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (READINGS, 3)
         length = np.linalg.norm(r.residual, axis=1) * scale
         np.testing.assert_allclose(
-            np.linalg.norm(vectors, axis=1), np.minimum(length, digest.ARROW_CAP), rtol=1e-5
+            np.linalg.norm(vectors, axis=1),
+            np.minimum(length, campaign_scene.ARROW_CAP),
+            rtol=1e-5,
         )
 
 
@@ -270,7 +271,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 
 
 def test_user_names_cannot_break_a_table():
-    made = markdown([table("effect", "share", rows=[("a|b\nc", "50 %")])]).splitlines()
+    made = style.markdown([table("effect", "share", rows=[("a|b\nc", "50 %")])]).splitlines()
     assert len(made) == 3
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in made} == {3}
 
@@ -281,7 +282,7 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert path.stat().st_size < 20e6
     arrows = column(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = layout.residual_title(digest.digest(big))
+    title = campaign.residual_title(big)
     assert f"about {len(arrows[0])} of 3000" in title
     balls = column(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
     origins = column(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
@@ -302,7 +303,7 @@ def test_ellipsoids_give_the_covariance_back():
     rng = np.random.default_rng(3)
     a = rng.standard_normal((50, 3, 3))
     covariance = a @ a.transpose(0, 2, 1)
-    half, quaternion = digest.ellipsoids(covariance)
+    half, quaternion = campaign_scene.ellipsoids(covariance)
     x, y, z, w = quaternion.T
     rotation = np.stack(
         [
@@ -317,7 +318,7 @@ def test_ellipsoids_give_the_covariance_back():
 
 def test_levels_hold_the_share_of_noise_they_name():
     norm2 = np.random.default_rng(4).chisquare(3, 200_000)
-    share = np.bincount(style.levels(norm2), minlength=3) / len(norm2)
+    share = np.bincount(levels(norm2), minlength=3) / len(norm2)
     assert share[1] == pytest.approx(0.0099, abs=0.001)
     assert share[2] == pytest.approx(0.0001, abs=0.0001)
 

@@ -10,10 +10,10 @@ from rerun.chunk import RrdReader
 from hilcal.design.detectable import DetectableEffect
 from hilcal.design.summary import PredictedParameter
 from hilcal.errors import InputError
-from hilcal.present.viewer import plan_layout, plan_scene, style
-from hilcal.present.viewer.plan_digest import plan_digest
-from hilcal.present.viewer.plan_stream import record_plan
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer import plan, plan_scene, style
+from hilcal.present.viewer.plan import record_plan
+from hilcal.present.viewer.plan_scene import PlanView
+from hilcal.present.viewer.recording import executable
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.viewer_plan import (
@@ -35,7 +35,7 @@ __all__ = ["recording", "shadowed", "strict"]  # fixtures
 
 
 def test_the_schedule_has_every_reading_at_its_minute_in_its_loads_series(shadowed, recording):
-    minutes = plan_digest(*shadowed, PLAN, SUMMARY).time / 60.0
+    minutes = PlanView(*shadowed, PLAN, SUMMARY).time / 60.0
     colors = plan_scene.load_colors(PLAN.loads)
     drawn = {}
     for k, load in enumerate(PLAN.loads):
@@ -169,12 +169,12 @@ def test_what_does_not_fit_is_refused(shadowed, tmp_path):
 @pytest.mark.slow
 @pytest.mark.skipif(not vulkan_available(), reason="no Vulkan driver installed")
 def test_every_view_is_drawn_without_a_report(recording, shadowed, tmp_path):
-    d = plan_digest(*shadowed, PLAN, SUMMARY)
-    names = [plan_layout.STEPS, plan_layout.SCHEDULE, plan_layout.curve_title(d)]
+    d = PlanView(*shadowed, PLAN, SUMMARY)
+    names = [plan.STEPS, plan.SCHEDULE, plan.curve_title(d)]
     names += ["Plan", "This step", "How to read this", "Parameters", "Criteria"]
     shots = [Shot(tmp_path / f"{i}.png", "step", 6, name) for i, name in enumerate(names)]
     reports = pictures(recording, shots, (960, 540), 480)
     assert set(names) <= {v.name for v in reports}
-    assert any(v.name.startswith(plan_layout.TRACKER) for v in reports)
+    assert any(v.name.startswith(plan.TRACKER) for v in reports)
     assert [v for v in reports if v.problems] == []
     assert all(shot.png.stat().st_size > 1000 for shot in shots)
