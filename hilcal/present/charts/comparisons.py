@@ -11,6 +11,7 @@ from hilcal.present.charts import style
 from hilcal.present.charts.evidence import bars
 from hilcal.present.charts.readings import escaped
 from hilcal.present.comparison import words_of
+from hilcal.present.fleet import FAR
 from hilcal.present.story import Story, StoryRevision
 from hilcal.store.plan import UNLOADED
 
@@ -121,46 +122,33 @@ def changes_chart(c: Comparison) -> go.Figure:
     return bars(names, moved, hover, says, "moves the target by, rms [µm]")
 
 
-FAR = 3.0
-"""Standard deviations between which most arms lie; a choice."""
-
-
 def arms_chart(t: "Pooled") -> go.Figure:
-    """Draw each arm's parameters, over what an arm of the type is let expect.
-
-    The distance is divided by the root of the spread from arm to arm and the arm's own uncertainty.
-    """
-    between = np.array([p.between for p in t.parameters])
-    names = [p.parameter for p in t.parameters]
-    seen = np.isfinite(t.off_std)
-    off = t.off / np.sqrt(between**2 + np.where(seen, t.off_std, 1.0) ** 2)
+    """Draw each arm's parameters by their distance from the type, over what most arms have."""
+    names, off = [p.parameter for p in t.parameters], t.distance
     odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
+    told = [
+        (off[a, k], n, arm, (arm, n) in odd)
+        for k, n in enumerate(names)
+        for a, arm in enumerate(t.arms)
+        if np.isfinite(off[a, k])
+    ]
     traces = []
     for unlike, name, color, symbol in (
         (False, "like its type", style.MEASURED, "circle"),
         (True, "unlike its type", style.RED, "x"),
     ):
-        chosen = [
-            (k, a)
-            for k, parameter in enumerate(names)
-            for a, arm in enumerate(t.arms)
-            if seen[a, k] and ((arm, parameter) in odd) == unlike
-        ]
-        if not chosen:
-            continue
-        traces.append(
-            go.Scatter(
-                x=style.drawn(np.array([off[a, k] for k, a in chosen])),
-                y=[escaped(names[k]) for k, _ in chosen],
-                mode="markers",
-                name=name,
-                marker={"color": color, "symbol": symbol, "size": 9, "opacity": 0.8},
-                hovertext=[
-                    escaped(f"{t.arms[a]}, {names[k]}: {off[a, k]:+.1f} σ") for k, a in chosen
-                ],
-                hoverinfo="text",
+        if chosen := [one for one in told if one[-1] == unlike]:
+            traces.append(
+                go.Scatter(
+                    x=style.drawn(np.array([x for x, *_ in chosen])),
+                    y=[escaped(n) for _, n, *_ in chosen],
+                    mode="markers",
+                    name=name,
+                    marker={"color": color, "symbol": symbol, "size": 9, "opacity": 0.8},
+                    hovertext=[escaped(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen],
+                    hoverinfo="text",
+                )
             )
-        )
     arms = sorted({arm for arm, _ in odd})
     says = (
         f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 
 from hilcal import numbers
 from hilcal.present.document import heading
-from hilcal.present.fleet import type_report, unlike_words
+from hilcal.present.fleet import FAR, type_report, unlike_words
 from hilcal.present.viewer import arm_shapes, layout, recording, style
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, capsules
@@ -25,8 +25,6 @@ if TYPE_CHECKING:  # above this layer
     from hilcal.transfer.members import Member
     from hilcal.transfer.pooled import Odd, Pooled
 
-FAR = 3.0
-"""Standard deviations between which most arms lie; a choice."""
 _JOINT = re.compile(r"\.j(\d+)\b")
 
 
@@ -90,13 +88,11 @@ def drawn_type(t: "Pooled", members: "tuple[Member, ...]") -> DrawnType:
         odd[arms.index(o.arm), k] = True
         for c, m in enumerate(mine):
             changed[c, k] |= o.campaign == m.name
-    seen = np.isfinite(t.off_std)
-    units = np.where(seen, t.off / np.hypot(between, np.where(seen, t.off_std, 1.0)), np.nan)
     joints = tuple(int(found[1]) if (found := _JOINT.search(n)) else 0 for n in names)
     return DrawnType(
         pooled=t,
         arm=_drawn(t),
-        units=units,
+        units=t.distance,
         odd=odd,
         joints=joints,
         owner=tuple(arms.index(m.arm) for m in mine),
