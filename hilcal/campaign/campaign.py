@@ -49,6 +49,7 @@ from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import typed_now
+from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.records import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
@@ -108,6 +109,14 @@ class Campaign:
         except BaseException:
             file.close()
             raise
+
+    def _repr_html_(self) -> str:
+        from hilcal.present.campaign import info_report  # notebooks alone need them
+        from hilcal.present.html.page import fragment
+        from hilcal.present.registration import covariance_words
+
+        covariance = covariance_words(self.covariance_parts, self.noise)
+        return fragment(info_report(overview(self.file), self.path.name, covariance))
 
     @classmethod
     def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:

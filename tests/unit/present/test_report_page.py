@@ -17,6 +17,7 @@ from playwright.sync_api import Browser
 
 from hilcal import numbers
 from hilcal.calibration.budget import budget
+from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
 from hilcal.present.html.content import ReportContent
 from hilcal.present.html.first_screen import (
@@ -194,18 +195,22 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made) -> N
 
 
 def test_results_show_themselves_in_a_notebook(made) -> None:
-    m, _ = made
+    (m, path), shown = made, []
     for result, words in (
         (m.fit, numbers.length(m.fit.holdout.rms_m)),
         (m.diagnosis, m.diagnosis.suspects[0].effect),
         (Refinement((Step(m.fit, m.diagnosis, None),)), m.diagnosis.verdict.replace("_", " ")),
     ):
         text = result._repr_html_()
+        assert words in text
+        shown.append(text)
+    with Campaign.open(path.parent / "a&<b>.hilcal") as run:
+        shown.append(run._repr_html_())
+    for text in shown:
         outline = Outline()
         outline.feed(text)
         tags = [tag for tag, _ in outline.tags]
         assert tags.count("table") == tags.count("caption") > 0
-        assert words in text
         assert EVIL not in text
 
 
