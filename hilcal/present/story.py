@@ -12,15 +12,15 @@ from scipy import stats
 
 from hilcal import numbers
 from hilcal.cell import Cell
+from hilcal.diagnosis.added_variable import added_variable
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.diagnosis.effect_ranking import Suspect, candidates
+from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.drawn_law import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
-from hilcal.identification.linearisation import linearise
 from hilcal.model.model import Model
 from hilcal.present.diagnosis import (
     diagnosis_report,
@@ -444,39 +444,17 @@ def _unit_of(d: Dependence) -> tuple[str, float]:
 
 
 def regressor(fit: Fit, suspect: Suspect) -> Curve | None:
-    """Residual against what the suspect would explain, both along the suspect's own direction.
-
-    With X the suspect's columns, freed of what the fitted model can do, and s its estimated
-    parameters, c = X s is what it would explain of each measurement (3-vectors, raw). Plotted
-    are |c| and the residual along c, both with the sign of c along the direction in which
-    the c spread most. Where the suspect is right the points lie on the line of slope 1.
-    """
-    p = linearise(fit)
-    effect = next((e for e in candidates(p.fit) if e.name == suspect.effect), None)
-    if effect is None or not len(suspect.score.step):
-        return None
-    w, s = fit.whitening, fit.solution
-    scale = np.array([q.scale for q in effect.parameters])
-    jacobian = fit.model.jacobian_of((effect,), s.prediction, s.theta, w.m)
-    contribution = w.raw(jacobian @ (scale * suspect.score.step))
-    if p.rows.shape[1]:
-        z = p.projection.solve(p.rows.T @ w.whiten(contribution).reshape(-1))
-        adapted = fit.model.predict(s.prediction.situation.states, s.theta - s.transform @ z)
-        shift = adapted.observation.position - s.prediction.observation.position
-        contribution[:, :3] += w.raw(shift)
-    c = contribution[:, :3]
-    size = np.linalg.norm(c, axis=1)
-    seen = size > 1e-9 * max(float(size.max(initial=0.0)), 1e-15)
-    if not seen.any():
-        return None
-    main = np.linalg.svd(c, full_matrices=False)[2][0]
-    side = np.where(c @ main < 0, -1.0, 1.0)[seen]
-    along = np.sum(fit.raw[seen, :3] * c[seen], axis=1) / size[seen]
-    return Curve(
-        suspect.effect,
-        f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
-        1e6 * side * size[seen],
-        1e6 * side * along,
-        f"what {suspect.effect} would explain [µm]",
-        "residual along it [µm]",
+    """Return the added variable of a suspect, see `added_variable`; None where it has none."""
+    found = added_variable(fit, suspect)
+    return (
+        None
+        if found is None
+        else Curve(
+            suspect.effect,
+            f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
+            1e6 * found[0],
+            1e6 * found[1],
+            f"what {suspect.effect} would explain [µm]",
+            "residual along it [µm]",
+        )
     )
