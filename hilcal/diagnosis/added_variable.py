@@ -5,7 +5,7 @@ c = X s is what it would explain of each measurement (3-vectors, raw). Taken are
 residual along c, both with the sign of c along the direction in which the c spread most. Where the
 suspect is right the points lie on the line of slope 1.
 
-Source: Cook and Weisberg, *Residuals and Influence in Regression*, section 2.3.
+Source: Cook and Weisberg, *Residuals and Influence in Regression*, 1982.
 """
 
 import numpy as np

@@ -125,6 +125,21 @@ class StoryRevision:
     laws: tuple[Curve, ...] = ()
 
     @property
+    def size_m(self) -> Floats:
+        """(N,) lengths of the residuals, m."""
+        return np.asarray(np.linalg.norm(self.residual, axis=1))
+
+    @property
+    def sigma(self) -> Floats:
+        """(N,) Mahalanobis distances, σ."""
+        return np.sqrt(self.whitened_norm2)
+
+    @property
+    def level(self) -> Ints:
+        """(N,) index of each reading into `LEVEL_NAMES`."""
+        return levels(self.whitened_norm2)
+
+    @property
     def name(self) -> str:
         """What it changed, or its model where it is the first."""
         return self.change or (self.cells[1] if self.cells else "first model")

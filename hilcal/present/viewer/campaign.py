@@ -370,13 +370,12 @@ def place(story: Story, r: StoryRevision) -> str:
 
 def details(story: Story, r: StoryRevision) -> str:
     """Return what the verdict rests on, as the terminal has it, and the worst reading."""
-    outside = float(np.mean(levels(r.whitened_norm2) > 0))
+    outside = float(np.mean(r.level > 0))
     i = campaign_scene.worst(r)
     worst = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
-        f"{numbers.length(float(np.linalg.norm(r.residual[i])))} "
-        f"({np.sqrt(r.whitened_norm2[i]):.1f} σ)."
+        f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
     )
     head = heading(f"Revision {r.revision}: {r.name}")
     return style.markdown([head, worst, *r.panels.get("details", ())])
@@ -385,8 +384,8 @@ def details(story: Story, r: StoryRevision) -> str:
 def pose_cards(story: Story) -> list[str]:
     """Return each pose of the last revision in words: residual of each load, and joints."""
     r = story.revisions[-1]
-    length, sigma = np.linalg.norm(r.residual, axis=1).tolist(), np.sqrt(r.whitened_norm2).tolist()
-    level, rms = levels(r.whitened_norm2).tolist(), _pose_rms(story, r).tolist()
+    length, sigma, level = r.size_m.tolist(), r.sigma.tolist(), r.level.tolist()
+    rms = np.sqrt(np.bincount(story.row, r.size_m**2) / np.bincount(story.row)).tolist()
     degrees = np.rad2deg(story.q[story.first]).tolist()
     order = np.argsort(story.row, kind="stable")
     ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
@@ -409,11 +408,6 @@ def pose_cards(story: Story) -> list[str]:
         ]
         out.append(style.markdown(card))
     return out
-
-
-def _pose_rms(story: Story, r: StoryRevision) -> Floats:
-    """(P,) root mean square length of the residuals of each pose, m."""
-    return np.sqrt(np.bincount(story.row, (r.residual**2).sum(1)) / np.bincount(story.row))
 
 
 def revisions(story: Story, upto: int) -> str:

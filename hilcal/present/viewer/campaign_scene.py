@@ -4,7 +4,7 @@ import numpy as np
 import rerun as rr
 
 from hilcal import numbers
-from hilcal.present.story import Story, StoryRevision, levels, worst_and_even
+from hilcal.present.story import Story, StoryRevision, worst_and_even
 from hilcal.present.viewer import arm_shapes, style
 from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
@@ -83,7 +83,7 @@ def revision_scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> N
     far = worst(r)
     arm_shapes.stand(rec, story.bodies[story.row[far]])
     drawn = shown(story, r)
-    level = levels(r.whitened_norm2[drawn])
+    level = r.level[drawn]
     rec.log(
         "world/residual/arrows",
         rr.Arrows3D(
@@ -137,7 +137,7 @@ def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
             rr.Arrows3D.columns(
                 origins=story.anchor[far],
                 vectors=arrows(story, r, far),
-                colors=style.LEVEL_COLORS[levels(r.whitened_norm2[far])],
+                colors=style.LEVEL_COLORS[r.level[far]],
                 radii=np.full(len(far), 0.012),
             ),
         ),
@@ -161,11 +161,10 @@ def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
 
 def pose_words(story: Story, r: StoryRevision, i: int) -> str:
     """Return a reading's residual as words: length, and in σ."""
-    length = float(np.linalg.norm(r.residual[i]))
     name = ""
     if story.target is not None:
         name = f"{style.safe(story.target_names[story.target[i]])} "
-    return f"{name}{numbers.length(length)} ({np.sqrt(r.whitened_norm2[i]):.1f} σ)"
+    return f"{name}{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)"
 
 
 def leader(at: Floats, ball: Floats) -> Floats:
@@ -220,7 +219,7 @@ def _deflections(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> Non
         "world/deflection/missed",
         rr.LineStrips3D(
             list(np.stack(tips, 1)),
-            colors=style.LEVEL_COLORS[levels(r.whitened_norm2[some])],
+            colors=style.LEVEL_COLORS[r.level[some]],
             radii=rr.Radius.ui_points(1.6),
         ),
     )
