@@ -19,6 +19,7 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.drawn_law import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
+from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
 from hilcal.model.model import Model
@@ -101,8 +102,8 @@ class StoryRevision:
         residual: (N, 3) measured - predicted, base axes, m.
         predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
         whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
-        error_fit: error of the fitted readings, keys "rms_m", "mean_m", "max_m", "rms_sigma".
-        error_holdout: error of whole poses left out, same keys.
+        error: of the fitted readings.
+        holdout: of whole poses left out.
         cells: of its row in a table of revisions.
         panels: "verdict", "details" and "parameters" in words and tables.
         follows: what the residual follows: the variable that carries most of it, where the first
@@ -117,8 +118,8 @@ class StoryRevision:
     residual: Floats
     predicted: Floats
     whitened_norm2: Floats
-    error_fit: Mapping[str, float]
-    error_holdout: Mapping[str, float]
+    error: ErrorBlock
+    holdout: ErrorBlock
     cells: tuple[str, ...] = ()
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
     follows: Curve | None = None
@@ -363,8 +364,8 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
-        error_fit=c.fit.error.to_json(),
-        error_holdout=c.fit.holdout.to_json(),
+        error=c.fit.error,
+        holdout=c.fit.holdout,
         cells=revision_cells(c.number, changed, c.fit, verdict),
         panels=_panels(c),
         follows=None if d is None else _follows(d),

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from hilcal.transfer.pooled import Pooled
 
 SERIES = (
-    ("error_fit", "fitted poses", style.MEASURED),
-    ("error_holdout", "poses left out", style.HOLDOUT),
+    ("error", "fitted poses", style.MEASURED),
+    ("holdout", "poses left out", style.HOLDOUT),
 )
 
 
@@ -30,7 +30,7 @@ def error_per_revision(story: Story) -> go.Figure:
     names = [label(r, k == 0) for k, r in enumerate(story.revisions)]
     traces: list[object] = []
     for key, name, color in SERIES:
-        rms = [1e6 * float(getattr(r, key)["rms_m"]) for r in story.revisions]
+        rms = [1e6 * float(getattr(r, key).rms_m) for r in story.revisions]
         traces.append(
             go.Bar(
                 x=rms,
@@ -68,15 +68,15 @@ def label(revision: StoryRevision, first: bool) -> str:
 
 def _words(story: Story, first: StoryRevision, later: list[StoryRevision]) -> str:
     floor = f"noise alone would leave {numbers.length(story.noise_floor_m)}."
-    before = numbers.length(first.error_holdout["rms_m"])
+    before = numbers.length(first.holdout.rms_m)
     if not later:
         return f"One revision: {before} rms error on poses left out; {floor}"
-    after = numbers.length(later[-1].error_holdout["rms_m"])
+    after = numbers.length(later[-1].holdout.rms_m)
     fitted = (
-        numbers.length(first.error_fit["rms_m"]),
-        numbers.length(later[-1].error_fit["rms_m"]),
+        numbers.length(first.error.rms_m),
+        numbers.length(later[-1].error.rms_m),
     )
-    went = "fell" if later[-1].error_holdout["rms_m"] < first.error_holdout["rms_m"] else "went"
+    went = "fell" if later[-1].holdout.rms_m < first.holdout.rms_m else "went"
     return (
         f"The rms error {went} from {before} to {after} on poses left out, and from {fitted[0]} to "
         f"{fitted[1]} on the fitted ones, over {len(story.revisions)} revisions; {floor}"

@@ -242,7 +242,7 @@ def error_series(rec: rr.RecordingStream) -> None:
 
 def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
-    sizes = (r.error_fit["rms_m"], r.error_holdout["rms_m"], r.error_fit["max_m"])
+    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m)
     for (entity, *_), size in zip(SERIES, (*sizes, story.noise_floor_m), strict=True):
         rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
     pose_bars(rec, story, r)
@@ -420,8 +420,8 @@ def revisions(story: Story, upto: int) -> str:
 def log_line(story: Story, r: StoryRevision) -> str:
     """Return a revision in one line."""
     return style.safe(
-        f"revision {r.revision} ({r.name}): {numbers.length(r.error_fit['rms_m'])} rms, "
-        f"poses left out {numbers.length(r.error_holdout['rms_m'])}, "
+        f"revision {r.revision} ({r.name}): {numbers.length(r.error.rms_m)} rms, "
+        f"poses left out {numbers.length(r.holdout.rms_m)}, "
         f"noise {numbers.length(story.noise_floor_m)}: {r.verdict.replace('_', ' ')}"
     )
 

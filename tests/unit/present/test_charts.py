@@ -55,8 +55,8 @@ def points(figure, axis: str) -> np.ndarray:
 def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
     told = story()
     figure = error_per_revision(told)
-    for trace, key in zip(figure.data[:2], ("error_fit", "error_holdout"), strict=True):
-        rms = [1e6 * getattr(r, key)["rms_m"] for r in told.revisions]
+    for trace, key in zip(figure.data[:2], ("error", "holdout"), strict=True):
+        rms = [1e6 * getattr(r, key).rms_m for r in told.revisions]
         np.testing.assert_allclose(np.asarray(trace.x), rms)
         assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes

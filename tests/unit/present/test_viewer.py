@@ -78,9 +78,9 @@ def static(path: Path, entity: str, component: str) -> object:
 
 def test_every_revision_has_its_errors_in_micrometres(told, recording):
     expected = {
-        "fit": [r.error_fit["rms_m"] for r in told.revisions],
-        "holdout": [r.error_holdout["rms_m"] for r in told.revisions],
-        "largest": [r.error_fit["max_m"] for r in told.revisions],
+        "fit": [r.error.rms_m for r in told.revisions],
+        "holdout": [r.holdout.rms_m for r in told.revisions],
+        "largest": [r.error.max_m for r in told.revisions],
         "noise": [told.noise_floor_m] * len(told.revisions),
     }
     for name, values in expected.items():
