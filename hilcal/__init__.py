@@ -106,7 +106,7 @@ def __getattr__(name: str) -> object:
 
 def presenter() -> Presenter:
     """Return who writes what values say."""
-    return cast(Presenter, import_module("hilcal.present.notebook"))
+    return cast(Presenter, import_module("hilcal.present"))
 
 
 def __dir__() -> list[str]:

@@ -17,12 +17,9 @@ from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.html.page import fragment
 from hilcal.present.plan import plan_report
-from hilcal.present.verdict import message
 from hilcal.refinement import Refinement
 from hilcal.store.revision import change
 from hilcal.stream.fit import StreamFit
-
-__all__ = ["html_of", "message"]
 
 
 def html_of(value: object) -> str:
