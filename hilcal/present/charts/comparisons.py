@@ -8,8 +8,6 @@ import plotly.graph_objects as go
 from hilcal import numbers
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.present.charts import style
-from hilcal.present.charts.evidence import bars
-from hilcal.present.charts.readings import escaped
 from hilcal.present.comparison import words_of
 from hilcal.present.fleet import FAR
 from hilcal.present.story import Story, StoryRevision
@@ -63,7 +61,7 @@ def error_per_revision(story: Story) -> go.Figure:
 def label(revision: StoryRevision, first: bool) -> str:
     """Return the name of a revision on the axis: what it changed."""
     change = "" if first else revision.change
-    return escaped(f"{revision.revision}: {change or 'start'}")
+    return style.label(f"{revision.revision}: {change or 'start'}")
 
 
 def _words(story: Story, first: StoryRevision, later: list[StoryRevision]) -> str:
@@ -91,9 +89,9 @@ def error_by_pose(c: Comparison) -> go.Figure:
     stated = 1e6 * c.today.beyond.stated_m
     names = [r.pose_names[k] for k in r.pose[rows]]
     loads = ["unloaded" if n == UNLOADED else n for n in (r.load_names[k] for k in r.load[rows])]
-    poses = [escaped(n) for n in names]
+    poses = [style.label(n) for n in names]
     hover = [
-        escaped(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
+        style.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
         for n, load, e, s in zip(names, loads, error, stated, strict=True)
     ]
     traces = [
@@ -119,7 +117,7 @@ def changes_chart(c: Comparison) -> go.Figure:
     names = [words_of(x.candidate) for x in found]
     hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
     says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if found else "No change."
-    return bars(names, moved, hover, says, "moves the target by, rms [µm]")
+    return style.bars(names, moved, hover, says, "moves the target by, rms [µm]")
 
 
 def arms_chart(t: "Pooled") -> go.Figure:
@@ -138,17 +136,11 @@ def arms_chart(t: "Pooled") -> go.Figure:
         (True, "unlike its type", style.RED, "x"),
     ):
         if chosen := [one for one in told if one[-1] == unlike]:
-            traces.append(
-                go.Scatter(
-                    x=style.drawn(np.array([x for x, *_ in chosen])),
-                    y=[escaped(n) for _, n, *_ in chosen],
-                    mode="markers",
-                    name=name,
-                    marker={"color": color, "symbol": symbol, "size": 9, "opacity": 0.8},
-                    hovertext=[escaped(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen],
-                    hoverinfo="text",
-                )
-            )
+            at, names_of = np.array([x for x, *_ in chosen]), [n for _, n, *_ in chosen]
+            hover = [style.label(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen]
+            drawn = (at, [style.label(n) for n in names_of], color, symbol, 9)
+            more = {"opacity": 0.8, "hovertext": hover, "hoverinfo": "text"}
+            traces.append(style.marks(*drawn, name=name, **more))
     arms = sorted({arm for arm, _ in odd})
     says = (
         f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."

@@ -1,6 +1,5 @@
 """Charts of readings: residuals in σ over any variable, measured against predicted, in space."""
 
-import html
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -9,7 +8,6 @@ import numpy as np
 import plotly.graph_objects as go
 
 from hilcal import numbers
-from hilcal.names import escaped as without_controls
 from hilcal.present.charts import style
 from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, worst_and_even
 from hilcal.store.plan import UNLOADED
@@ -77,12 +75,7 @@ def place(story: Story, i: int) -> str:
     words = f"{story.pose_name(i)}, {'unloaded' if load == UNLOADED else load}"
     if story.target is not None and len(story.target_names) > 1:
         words += f", {story.target_names[int(story.target[i])]}"
-    return escaped(words)
-
-
-def escaped(words: str) -> str:
-    """Return words without a meaning in the HTML that plotly takes for labels."""
-    return html.escape(without_controls(words), quote=False)
+    return style.label(words)
 
 
 MOST_POSES = 16
@@ -98,7 +91,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     out = chart(d, of.reshape(-1)[d.index].astype(float), "", _by(story, revision, "pose"))
     full = [story.pose_name(int(i)) for i in first]
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
-    names = [escaped(n) for n in short]
+    names = [style.label(n) for n in short]
     step = -(-len(names) // MOST_POSES)
     out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
     return out
@@ -112,7 +105,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     # beside each other within a load, so that points do not hide each other
     beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
     out = chart(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
-    names = ["unloaded" if name == UNLOADED else escaped(name) for name in loads]
+    names = ["unloaded" if name == UNLOADED else style.label(name) for name in loads]
     out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
     return out
 
