@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from hilcal.identification.posterior import Posterior
 from hilcal.present.viewer import style
@@ -14,7 +13,8 @@ from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import Pooled, pooled
 from tests.support.picture import Shot, pictures, vulkan_available
-from tests.support.viewer_plan import entities, rgb, rows
+from tests.support.recordings import chunks, entities, rows
+from tests.support.viewer_plan import rgb
 from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readings_of
 
 
@@ -66,8 +66,7 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path:
     assert f"arm{ODD} is unlike the others" in words
     drifts = {e for e in entities(path) if e.startswith("/date0/")}
     assert [e for e in drifts if "unlike" in e] == [f"/date0/2/zunlike/{ODD}"]
-    chunks = RrdReader(path).stream().filter(content=f"/date0/2/zunlike/{ODD}").to_chunks()
-    told = [c.to_record_batch() for c in chunks]
+    told = [c.to_record_batch() for c in chunks(path, f"/date0/2/zunlike/{ODD}")]
     assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
 
 

@@ -7,6 +7,7 @@ from hilcal.present.viewer.plan import record_plan
 from hilcal.present.viewer.plan_scene import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED
+from tests.support.recordings import entities, rows
 from tests.support.viewer_plan import (
     BARE,
     PLAN,
@@ -14,10 +15,8 @@ from tests.support.viewer_plan import (
     TRACKER,
     Q,
     configured,
-    entities,
     recording,
     rgb,
-    rows,
     shadowed,
     strict,
     target,

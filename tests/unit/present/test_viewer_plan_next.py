@@ -9,7 +9,8 @@ from hilcal.design.next import PairPower
 from hilcal.present.viewer import layout
 from hilcal.present.viewer.plan import record_plan
 from hilcal.present.viewer.plan_scene import PlanView
-from tests.support.viewer_plan import PLAN, SUMMARY, configured, rows, strict
+from tests.support.recordings import rows
+from tests.support.viewer_plan import PLAN, SUMMARY, configured, strict
 
 __all__ = ["strict"]  # fixture
 POWERS = (
