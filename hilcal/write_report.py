@@ -156,14 +156,7 @@ def content_of(
     tested = None
     if validation is not None:
         found = validate(run, validation, record, limit_m, say=say)
-        tested = Tested(
-            validation.path.name,
-            _sha256(validation.path),
-            found.judged,
-            found.prediction,
-            found.beyond,
-            found.shares,
-        )
+        tested = Tested(validation.path.name, _sha256(validation.path), found)
         commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
     story = build_story(chapters)
     return ReportContent(

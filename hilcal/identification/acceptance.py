@@ -8,7 +8,9 @@ from scipy.stats import chi2
 
 from hilcal.identification.extrapolation import Extrapolation
 from hilcal.identification.validation import Validation
+from hilcal.model.model import Model
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
 BAND = 0.95
@@ -123,6 +125,25 @@ class Acceptance:
             if limit is None
             else {"limit_m": limit, "passed": self.passed, "n_over": self.over},
         }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CampaignValidation(Shown):
+    """Readings of another campaign against a revision.
+
+    Attributes:
+        model: of the revision.
+        judged: which of the readings are judged.
+        prediction: of these.
+        beyond: what the fit states of them, and which lie outside of what was measured.
+        shares: errors by load and by pose, and against a limit.
+    """
+
+    model: Model
+    judged: Judged
+    prediction: Validation
+    beyond: Extrapolation
+    shares: Acceptance
 
 
 def acceptance(

@@ -7,6 +7,7 @@ from hilcal.design.checked_plan import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery
+from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.fit import Fit
 from hilcal.present.bootstrap import bootstrap_report
@@ -17,6 +18,7 @@ from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.html.page import fragment
 from hilcal.present.plan import plan_report
+from hilcal.present.validation import opening, shares_report, validation_report
 from hilcal.refinement import Refinement
 from hilcal.store.revision import change
 from hilcal.stream.fit import StreamFit
@@ -42,6 +44,13 @@ blocks_of.register(CheckedPlan, lambda plan: plan_report(plan.summary))
 blocks_of.register(
     Comparison, lambda c: comparison_report(c, "the earlier campaign", "the later campaign")
 )
+
+
+@blocks_of.register
+def _(tested: CampaignValidation) -> Iterator[Block]:
+    yield from opening(tested.judged, tested.prediction)
+    yield from validation_report(tested.judged, tested.prediction, tested.beyond)
+    yield from shares_report(tested.shares)
 
 
 @blocks_of.register

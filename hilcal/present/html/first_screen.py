@@ -119,8 +119,8 @@ def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
         f"rms; largest {numbers.length(before.max_m)}; {what}",
     )
     if m.tested is not None:
-        e = m.tested.prediction.error
-        seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
+        e = m.tested.found.prediction.error
+        seen = "never fitted" if m.tested.found.judged.unseen else "fitted, so no test"
         yield Card(
             "After, validation",
             numbers.length(e.rms_m),
@@ -153,7 +153,7 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         return "", None
     limit = numbers.length(m.limit_m)
     if m.tested is not None:
-        a = m.tested.shares
+        a = m.tested.found.shares
         passed = bool(a.passed)
         head = "PASSED" if passed else "FAILED"
         so = f"{a.everything.count - a.over} of {a.everything.count} errors are within {limit}"

@@ -238,7 +238,7 @@ def _joints(m: ReportContent) -> Iterator[Block]:
     for j in range(m.story.arm.n):
         yield Chart(f"Over joint {j + 1}", residual_by_joint(m.story, m.left_out, j))
     if m.tested is not None:
-        yield replace(worst_table(m.tested.shares), caption="Worst poses")
+        yield replace(worst_table(m.tested.found.shares), caption="Worst poses")
 
 
 def _rejected(m: ReportContent) -> Iterator[Block]:
