@@ -14,7 +14,7 @@ from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
 from hilcal.present.viewer import campaign, campaign_scene, save, style
 from hilcal.robot.body import body_poses, capsules
-from tests.support.recordings import rows, same, texts
+from tests.support.recordings import rows, same, texts, values
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
@@ -47,10 +47,10 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
         "largest": [r.error.max_m for r in told.revisions],
         "noise": [told.noise_floor_m] * len(told.revisions),
     }
-    for name, values in expected.items():
+    for name, sizes in expected.items():
         read = rows(recording, f"/errors/{name}", "Scalars:scalars", "revision")
         assert sorted(read) == [r.revision for r in told.revisions]
-        np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(values))
+        np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(sizes))
         ((called,),) = values(recording, f"/errors/{name}", "SeriesPoints:names")
         assert called in {words for _, words, _ in campaign.SERIES}
 
