@@ -78,9 +78,9 @@ def where_wrong(m: ReportContent) -> str:
     if not beyond_noise(fit):
         return "Nowhere beyond the noise: all poses and loads are predicted within it."
     return (
-        "Nowhere in particular: what is left of the fitted poses is noise. But poses left out are "
-        f"off by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance: more poses "
-        f"would make the parameters surer. {said}"
+        "Nowhere in particular: what is left of the fitted poses is noise. Poses left out are off "
+        f"by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance; more poses would "
+        f"lower that. {said}"
     )
 
 

@@ -191,7 +191,7 @@ def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made) -> N
         fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
         said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
         assert ("all poses and loads are predicted within it" in said) == within
-        assert (f"off by {sigma:.2f} times the noise" in said) != within
+        assert (f"by {sigma:.2f} times the noise" in said) != within
 
 
 def test_results_show_themselves_in_a_notebook(made) -> None:
