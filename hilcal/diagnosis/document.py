@@ -26,10 +26,7 @@ def to_json(d: "Diagnosis") -> dict[str, object]:
         "variance_factor": d.fit.variance_factor,
         "variance_factor_interval": list(d.fit.variance_factor_interval),
         "predictable_share": d.predictable_share,
-        "where": [
-            {"variable": v.variable, "share": v.share, "p_value": v.p_value}
-            for v in d.misfit_breakdown
-        ],
+        "where": [asdict(v) for v in d.misfit_breakdown],
         "suspects": [suspect_json(s) for s in d.suspects],
         "not_shown": list(d.not_shown),
         "tests": {

@@ -1,5 +1,7 @@
 """Laws that the readings speak for, as JSON; SI."""
 
+from dataclasses import asdict
+
 from hilcal.discovery.curve import Curve
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Law
@@ -48,19 +50,14 @@ def law_json(law: Law) -> dict[str, object]:
         "latex": law.form.latex(),
         "acts_on": list(law.acts_on),
         "variables": list(law.variables),
-        "parameters": [
-            {"name": c.name, "value": c.value, "std": c.std, "unit": c.unit} for c in law.parameters
-        ],
+        "parameters": [asdict(c) for c in law.parameters],
         "holdout_share": law.holdout_share,
         "p_value": law.p_value,
         "variance_factor": law.left,
         "stability": law.stability,
-        "found_again": [
-            {"acts_on": a.acts_on, "variables": list(a.variables), "share": a.share}
-            for a in law.again
-        ],
+        "found_again": [{**asdict(a), "variables": list(a.variables)} for a in law.again],
         "alternatives": list(law.alternatives),
-        "resembles": [{"effect": r.effect, "cosine": r.cosine} for r in law.resembles],
+        "resembles": [asdict(r) for r in law.resembles],
         "ranges": [
             {"quantity": symbol, "min": low, "max": high, "unit": unit}
             for symbol, low, high, unit in law.ranges
