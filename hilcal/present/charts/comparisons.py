@@ -139,8 +139,9 @@ def arms_chart(t: "Pooled") -> go.Figure:
             at, names_of = np.array([x for x, *_ in chosen]), [n for _, n, *_ in chosen]
             hover = [style.label(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen]
             drawn = (at, [style.label(n) for n in names_of], color, symbol, 9)
-            more = {"opacity": 0.8, "hovertext": hover, "hoverinfo": "text"}
-            traces.append(style.marks(*drawn, name=name, **more))
+            traces.append(
+                style.marks(*drawn, name=name, opacity=0.8, hovertext=hover, hoverinfo="text")
+            )
     arms = sorted({arm for arm, _ in odd})
     says = (
         f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."
