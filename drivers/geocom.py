@@ -19,8 +19,7 @@ from drivers.geocom_reading import PolarReading, numbers, plausible, usable
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats

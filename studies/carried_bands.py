@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.draw import Draw, typical_torque
-from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.injected_effects import Draw, nothing_hidden, typical_torque
 from drivers.simulated.rehearsal import measurement_noise
 from drivers.simulated.world import World, stand
 from hilcal.calibration.calibration import Calibration

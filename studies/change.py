@@ -13,8 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.simulated.draw import Draw, joint_compliance, typical_torque
-from drivers.simulated.injected_effects import nothing_hidden
+from drivers.simulated.injected_effects import (
+    Draw,
+    joint_compliance,
+    nothing_hidden,
+    typical_torque,
+)
 from drivers.simulated.rehearsal import measurement_noise, simulate
 from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config
@@ -27,7 +31,7 @@ from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.earlier import Earlier, earlier_fit
 from hilcal.identification.fit import fit
-from hilcal.identification.remeasured import setting
+from hilcal.identification.later_readings import setting
 from hilcal.readings.readings import Readings
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.types import Floats

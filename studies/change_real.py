@@ -16,7 +16,7 @@ from hilcal.diagnosis.completed import completed
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.earlier import Earlier, earlier_fit
 from hilcal.identification.fit import fit
-from hilcal.identification.remeasured import setting
+from hilcal.identification.later_readings import setting
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3

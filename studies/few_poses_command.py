@@ -2,7 +2,8 @@
 
 Random poses of a public series are refined as `hilcal refine` does from the arm's type alone; 500
 others are predicted by the last fit, with its bands. `SKETCH_MM` is what the sketch of a mixed
-model leaves of the same draws, mean of ten; it knows geometry, gear waves and compliance.
+model leaves of the same draws, mean of ten; it knows geometry, gear waves and compliance. With
+`--planned` the poses are chosen by criterion I among all that are not predicted.
 """
 
 import tempfile
@@ -20,6 +21,11 @@ from scipy.stats import chi2
 from hilcal.cell import Cell
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
+from hilcal.design.choice import choose, objective_of
+from hilcal.design.information import problem
+from hilcal.design.nominal_model import nominal_model
+from hilcal.design.prediction_poses import prediction_poses
+from hilcal.design.undetermined import without_undetermined
 from hilcal.engine.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
@@ -30,6 +36,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Ints
 from hilcal.whole_file import replace_file
 from studies.records import Figure, Keep, keep
 
@@ -65,12 +72,14 @@ class Case:
         poses: how many are fitted.
         draw: of them.
         attitudes: whether attitudes are fitted, too.
+        planned: whether they are chosen by the planner, not at random.
     """
 
     path: Path
     poses: int
     draw: int
     attitudes: bool
+    planned: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +115,7 @@ def few_poses(
     poses: Annotated[str, typer.Option("--poses", help="Numbers that are fitted.")] = "20,30,60",
     draws: Annotated[int, typer.Option("--draws", help="Random draws of each number.")] = 10,
     attitudes: Annotated[bool, typer.Option("--attitudes", help="Fit attitudes, too.")] = False,
+    planned: Annotated[bool, typer.Option("--planned", help="Choose them as a plan does.")] = False,
     jobs: OneJob = None,
     scheduler: Scheduler = None,
     keep_file: Keep = None,
@@ -114,7 +124,8 @@ def few_poses(
     """Refine few random poses of real series, and predict 500 others."""
     t = terminal(as_json)
     counts = [int(n) for n in poses.split(",")]
-    cases = [Case(p, n, d, attitudes) for p, n, d in product(series, counts, range(draws))]
+    each = product(series, counts, range(draws))
+    cases = [Case(p, n, d, attitudes, planned) for p, n, d in each]
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "fits", len(cases)) as advance,
@@ -123,10 +134,11 @@ def few_poses(
     figures = []
     for path, n in product(series, counts):
         own = [f for f in done if (f.series, f.poses) == (path.parent.name, n)]
-        figures += _figures(path.parent.name, n, own, attitudes=attitudes)
+        figures += _figures(path.parent.name, n, own, attitudes=attitudes, planned=planned)
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    keep(keep_file, "Few poses of real arms", figures)
+    title = "Few poses of real arms, chosen by the planner" if planned else "Few poses of real arms"
+    keep(keep_file, title, figures)
     t.document({"cases": [asdict(f) for f in done]})
 
 
@@ -137,7 +149,10 @@ def refined(case: Case) -> Found:
         value, covariance = readings.value[:, :3], readings.covariance[:, :3, :3]
         readings = replace(readings, value=value, covariance=covariance)
     order = np.random.default_rng(3 + case.draw).permutation(len(readings))
-    test, some = readings[order[len(order) // 2 :][:TEST]], readings[order[: case.poses]]
+    tested = order[len(order) // 2 :][:TEST]
+    rest = np.setdiff1d(order, tested)
+    chosen = _planned(cell, readings[rest], case) if case.planned else order[: case.poses]
+    test, some = readings[tested], readings[rest[chosen] if case.planned else chosen]
     last = refine(baseline(cell, some, "absolute"), some, "absolute")
     f, d = last.fit, last.diagnosis
     known = predictive(
@@ -162,6 +177,19 @@ def refined(case: Case) -> Found:
     )
 
 
+def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
+    """Which of the readings a plan for predictions at all of them would take."""
+    config = cell.configured()
+    planning = config.planning.model_copy(update={"readings": "absolute"})
+    config = config.model_copy(update={"loads": [], "planning": planning})
+    q, m = readings.states.q, readings.value.shape[1]
+    of, _ = without_undetermined(problem(nominal_model(cell, config, m), config, q))
+    work = prediction_poses(of.nominal, config, q)
+    asked = objective_of(of, config, "I", work)
+    design = choose(asked, float(case.poses), np.random.default_rng(case.draw))
+    return np.flatnonzero(design.counts)
+
+
 def _series(path: Path) -> tuple[Cell, Readings]:
     """The cell and all readings of a series."""
     with path.open(encoding="utf-8") as stream:
@@ -184,8 +212,10 @@ def _series(path: Path) -> tuple[Cell, Readings]:
         return cell, read_table(table_file, cell)
 
 
-def _figures(series: str, poses: int, found: list[Found], *, attitudes: bool) -> list[Figure]:
-    what = f"{series}, {poses} {'poses' if attitudes else 'positions'}"
+def _figures(
+    series: str, poses: int, found: list[Found], *, attitudes: bool, planned: bool
+) -> list[Figure]:
+    what = f"{series}, {poses} {'planned ' * planned}{'poses' if attitudes else 'positions'}"
     mean = 1e3 * float(np.mean([f.mean_m for f in found]))
     worst = 1e3 * max(f.mean_m for f in found)
     inside = float(np.mean([f.inside for f in found]))

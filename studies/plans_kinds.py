@@ -124,7 +124,7 @@ def optimal(
         robust: whether it keeps power against the potential terms.
     """
     of_plan = of.robust if robust and of.robust is not None else of.exact
-    asked = compound_objective(of_plan, criterion, of.work, float(budget), rng)
+    asked = compound_objective(of_plan, of.config, criterion, of.work, float(budget), rng)
     design = choose(asked, float(budget), rng)
     counts = np.asarray(design.counts, dtype=float)
     told = predicted(of_plan, counts, work=of.work)

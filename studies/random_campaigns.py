@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.simulated.elastic_tree import build
-from drivers.simulated.elasticity import elasticity
-from drivers.simulated.mechanics import equilibrium
+from drivers.simulated.mechanics import build, elasticity, equilibrium
 from drivers.simulated.rehearsal import (
     CampaignStates,
     Rehearsal,

@@ -11,8 +11,8 @@ import numpy as np
 
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.description import Change, Described
-from hilcal.identification.gate import Finding, examine
+from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.misdescription import Finding, examine
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
@@ -55,7 +55,7 @@ class Case:
 
     cell: Cell
     readings: Readings
-    truth: tuple[Change, ...]
+    truth: tuple[Hypothesis, ...]
     error: str | None
     poses: str
     best: float
@@ -95,32 +95,33 @@ def random_arm(rng: np.random.Generator) -> Arm:
     return with_conventions(arm, sign, zero, coupled)
 
 
-def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Change, ...]:
+def random_error(kind: str, arm: Arm, rng: np.random.Generator) -> tuple[Hypothesis, ...]:
     """Return what is truly otherwise than described."""
     j = int(rng.integers(1, 7))
     if kind == "sign":
-        return (Change("joint", j, -1),)
+        return (Hypothesis("joint", j, -1),)
     if kind == "two signs":
         i, k = sorted(rng.choice(6, 2, replace=False) + 1)
-        return Change("joint", int(i), -1), Change("joint", int(k), -1)
+        return Hypothesis("joint", int(i), -1), Hypothesis("joint", int(k), -1)
     if kind == "quarter":
-        return (Change("joint", j, 1, float(rng.choice([1, -1, 2])) * np.pi / 2),)
+        return (Hypothesis("joint", j, 1, float(rng.choice([1, -1, 2])) * np.pi / 2),)
     if kind == "zero":
         return (
-            Change("joint", j, 1, float(np.radians(rng.uniform(3, 170)) * rng.choice([-1, 1]))),
+            Hypothesis("joint", j, 1, float(np.radians(rng.uniform(3, 170)) * rng.choice([-1, 1]))),
         )
     if kind == "coupling":
         joint, follows = may_follow(6)[int(rng.integers(1, 6))]
-        return (Change("coupling", joint, follows=follows, factor=float(rng.choice([-1.0, 1.0]))),)
+        factor = float(rng.choice([-1.0, 1.0]))
+        return (Hypothesis("coupling", joint, follows=follows, factor=factor),)
     if kind == "other arm":
         names = [n for n in robot_names() if n != arm.name]
-        return (Change("arm", arm=str(rng.choice(names))),)
+        return (Hypothesis("arm", arm=str(rng.choice(names))),)
     simple = {
-        "degrees": Change("joint_degrees"),
-        "attitude degrees": Change("turn_degrees"),
-        "millimetres": Change("millimetres"),
-        "mirrored": Change("mirrored"),
-        "inverse": Change("inverse"),
+        "degrees": Hypothesis("joint_degrees"),
+        "attitude degrees": Hypothesis("turn_degrees"),
+        "millimetres": Hypothesis("millimetres"),
+        "mirrored": Hypothesis("mirrored"),
+        "inverse": Hypothesis("inverse"),
     }
     return (simple[kind],) if kind in simple else ()
 
@@ -328,5 +329,5 @@ def judge(case: Case) -> tuple[Outcome, Finding | None]:
     return Outcome(named or (refused and fits), named, exact), found
 
 
-def _about(changes: tuple[Change, ...]) -> list[tuple[object, ...]]:
+def _about(changes: tuple[Hypothesis, ...]) -> list[tuple[object, ...]]:
     return sorted((c.kind, c.joint, c.follows, c.sign, c.factor, c.arm) for c in changes)

@@ -11,8 +11,8 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import predictive
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model
+from hilcal.readings.covariance import symmetric_root
 from hilcal.readings.readings import Readings
-from hilcal.readings.serial_noise import symmetric_root
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.refinement import Refinement, refine, refine_from
 from studies.random_campaigns import rehearsal_states

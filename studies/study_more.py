@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.planned import planned_states
-from drivers.simulated.rehearsal import simulate
+from drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.config import CellConfig
 from hilcal.config.loads import Load
 from hilcal.design.next import measure_next

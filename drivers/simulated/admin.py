@@ -1,10 +1,16 @@
-"""The admin line of a simulated device: JSON lines over a Unix socket, for faults and tests."""
+"""What the processes of simulated devices share: the admin line, and their end.
 
+The admin line, for faults and tests, has JSON lines over a Unix socket.
+"""
+
+import argparse
 import json
 import os
+import signal
 import socket
+import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -68,3 +74,60 @@ def serve(path: Path, handler: Handler) -> None:
             threading.Thread(target=talk, args=(line,), daemon=True).start()
 
     threading.Thread(target=listen, daemon=True).start()
+
+
+class Operations:
+    """What can be asked of a device by name: its faults and its state, a function each.
+
+    Arguments are given by name. What returns nothing is answered with the state. `die` ends the
+    process at once, as a crash does.
+    """
+
+    def __init__(
+        self, functions: Mapping[str, Callable[..., Any]], state: Callable[[], Any] | None = None
+    ) -> None:
+        """Take the functions, and one that returns the state."""
+        self._state = state or (lambda: None)
+        self.functions = {**functions, "die": _die}
+        if state is not None:
+            self.functions["state"] = state
+
+    def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
+        """Carry out an operation.
+
+        Raises:
+            ValueError: an unknown one; lists the valid ones.
+        """
+        if op not in self.functions:
+            raise ValueError(f"unknown op {op!r}; valid: {', '.join(self.functions)}")
+        result = self.functions[op](**arguments)
+        return self._state() if result is None else result
+
+
+def _die() -> None:
+    threading.Timer(0.02, os._exit, (70,)).start()
+
+
+def device_parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return the parser of what the process of every device is told."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random")
+    return parser
+
+
+def end_with_parent() -> None:
+    """Exit at once when standard input closes (the parent holds its other end).
+
+    A pipe ends with any death, also of kill -9; asynchronous and on every platform.
+    """
+
+    def wait() -> None:
+        while os.read(sys.stdin.fileno(), 4096):
+            pass
+        os._exit(0)
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
+    threading.Thread(target=wait, daemon=True).start()

@@ -3,34 +3,328 @@
     python -m drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
         [--rate HZ] [--on S]
 
-Admin operations besides those of the line (`pty_port.FAULTS`): `overload {force}` adds a wrench
+Admin operations besides those of the line (`PtyPort.faults`): `overload {force}` adds a wrench
 (6 numbers, N and N·m), `freeze {on}` repeats one reading, `stall {on}` stops sending while the
 sensor's clock goes on, `state`; Bota: `saturate {on}` and `clock {us}`.
 """
 
-import argparse
+import binascii
+import struct
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.force.bota import Bota
-from drivers.simulated.force.ft300 import Ft300
-from drivers.simulated.force.gauge import Gauge
-from drivers.simulated.force.hex import Hex
-from drivers.simulated.force.sensor import SensorProtocol
-from drivers.simulated.parent import end_with_parent
-from drivers.simulated.pty_port import PtyPort
+from drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.types import Floats
 
 TICK_S = 0.004
 """Frames are handed over in batches at least so far apart, as a USB adapter does."""
 LATE_S = 2.0
 """Frames that are later than this are lost: the process was suspended."""
-KINDS: dict[str, type[Bota | Ft300 | Hex]] = {"bota": Bota, "ft300": Ft300, "hex": Hex}
+
+BIAS_STD = np.repeat((4.0, 0.2), 3)
+"""The zero of a sensor as delivered and bolted on, N and N·m."""
+DRIFT_STD = np.repeat((0.05, 0.002), 3)
+"""Drift of the zero with the sensor's temperature, N/K and N·m/K."""
+WARM_K, WARM_S = 7.0, 600.0
+"""Own heat above the air and how fast it comes (world time)."""
+ROOM = 22.0
+"""Air temperature where the world does not tell, °C."""
+
+
+@dataclass(slots=True, eq=False)
+class Gauge:
+    """The sensor's measuring bridge: what strain gauges make of the true wrench.
+
+        wrench = true + bias + drift (T - T_start) + overload + noise
+
+    Attributes:
+        board: the one physical world.
+        rng: generator of the noise.
+        bias: (6,) when the world begins, N and N·m.
+        drift: (6,) per K.
+        noise: (6,) standard deviation of one frame.
+        overload: (6,) wrench added by a fault.
+        on: how long the sensor has been on when the world begins, s.
+        frozen: (6,) what it reads whatever it feels; None is the truth.
+    """
+
+    board: Blackboard
+    rng: np.random.Generator
+    bias: Floats
+    drift: Floats
+    noise: Floats
+    overload: Floats
+    on: float
+    frozen: Floats | None = None
+
+    @staticmethod
+    def draw(
+        board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
+    ) -> "Gauge":
+        """Return a sensor with a drawn zero; `noise` is of a force (N) and a moment (N·m)."""
+        bias, drift = (std * rng.standard_normal(6) for std in (BIAS_STD, DRIFT_STD))
+        return Gauge(board, rng, bias, drift, np.repeat(noise, 3), np.zeros(6), on)
+
+    def temperature(self) -> float:
+        """Return the sensor's temperature, °C: it warms up above the air."""
+        air = float(self.board.read("truth")["air_temperature"])
+        return float((air if air != 0.0 else ROOM) + self._own_heat(self.board.time))
+
+    def read(self, count: int) -> Floats:
+        """Return (count, 6) wrenches of the frames that are due now, N and N·m."""
+        if self.frozen is not None:
+            return np.tile(self.frozen, (count, 1))
+        truth = self.board.read("truth")["sensor_wrench"]
+        since = self._own_heat(self.board.time) - self._own_heat(0.0)
+        mean = truth + self.bias + self.drift * since + self.overload
+        return np.asarray(mean + self.noise * self.rng.standard_normal((count, 6)))
+
+    def add(self, force: Sequence[float]) -> None:
+        """Add a wrench (6,) to what it feels, N and N·m."""
+        wrench = np.asarray(force, dtype=np.float64)
+        if wrench.shape != (6,):
+            raise ValueError(f"force has the shape {wrench.shape}; valid: 6 numbers")
+        self.overload = wrench
+
+    def freeze(self, on: bool) -> None:
+        """Repeat one reading, or no longer."""
+        self.frozen = self.read(1)[0] if on else None
+
+    def _own_heat(self, time: float) -> float:
+        """Return by how much it is warmer than the air at a world time (s), K."""
+        return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
+
+
+class ForceSensor:
+    """A sensor's wire protocol; this one streams from power-on and takes no commands.
+
+    Attributes:
+        baud: the line's rate, Bd.
+        noise: of one frame, force in N and moment in N·m.
+        rate: frames per second.
+        streaming: whether it sends by itself.
+    """
+
+    baud = 0
+    noise = (0.0, 0.0)
+    usual_rate = 1000.0
+
+    def __init__(self, rate: float | None = None) -> None:
+        """Switch on."""
+        self.rate = self.usual_rate if rate is None else rate
+        self.streaming = True
+
+    def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
+        """Return one frame.
+
+        Args:
+            number: of the frame since power-on, lost ones counted.
+            wrench: (6,) N and N·m.
+            temperature: °C.
+        """
+        raise NotImplementedError
+
+    def receive(self, data: bytes, wrench: Floats) -> bytes:
+        """Take in what the client sent and return the answer, empty where there is none."""
+        return b""
+
+    def operations(self) -> dict[str, Callable[..., object]]:
+        """Return the admin operations of this sensor's own."""
+        return {}
+
+
+_MIRRORED = bytes(int(f"{value:08b}"[::-1], 2) for value in range(256))
+
+
+def crc16_x25(data: bytes) -> int:
+    """Return the CRC-16/X25: the mirror image of CRC-16/CCITT, start FFFF, inverted."""
+    mirrored = binascii.crc_hqx(data.translate(_MIRRORED), 0xFFFF)
+    return (_MIRRORED[mirrored & 0xFF] << 8 | _MIRRORED[mirrored >> 8]) ^ 0xFFFF
+
+
+class Bota(ForceSensor):
+    """Bota Systems Rokubi and SensONE.
+
+    Frame (Bota Systems' public Arduino and ROS drivers): `AA`, `<H6fIf` of status, wrench, device
+    time in µs and °C, then CRC-16/X25 over those 34 bytes, little-endian: 37 bytes at 460800 Bd.
+    Status bits: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
+    """
+
+    baud = 460800
+    noise = (0.05, 0.002)
+    over_range = 1 << 1
+    full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])
+    """Full scale of a SensONE, N and N·m."""
+    _body = struct.Struct("<H6fIf")
+
+    def __init__(self, rate: float | None = None) -> None:
+        """Switch on."""
+        super().__init__(rate)
+        self.saturated = False
+        self._start_us = 0
+
+    def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
+        """Return one frame, see `ForceSensor.frame`."""
+        inside = np.clip(wrench, -self.full, self.full)
+        over = self.saturated or bool(np.any(inside != wrench))
+        time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
+        body = self._body.pack(self.over_range if over else 0, *inside, time_us, temperature)
+        return b"\xaa" + body + struct.pack("<H", crc16_x25(body))
+
+    def operations(self) -> dict[str, Callable[..., object]]:
+        """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
+        return {
+            "saturate": lambda on: setattr(self, "saturated", bool(on)),
+            "clock": lambda us: setattr(self, "_start_us", int(us)),
+        }
+
+
+class Hex(ForceSensor):
+    """OptoForce (OnRobot) HEX, 10 to 1000 Hz.
+
+    Frame (OptoForce, "OptoForce General DAQ", 6-axis): `AA 07 08 10`, `>HH6h` of counter, status,
+    wrench in counts, then the sum of all bytes before it as a big-endian u16: 22 bytes at 1 MBd.
+    The counts per newton are each sensor's own; here 50 per N and 2000 per N·m.
+    """
+
+    baud = 1_000_000
+    noise = (0.05, 0.001)
+    scale = np.repeat((50.0, 2000.0), 3)
+    most, overload = 32767, 1 << 8
+
+    def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
+        """Return one frame, see `ForceSensor.frame`."""
+        counts = np.rint(wrench * self.scale)
+        inside = np.clip(counts, -self.most, self.most)
+        status = self.overload if np.any(inside != counts) else 0
+        values = struct.pack(">HH6h", number & 0xFFFF, status, *map(int, inside))
+        body = b"\xaa\x07\x08\x10" + values
+        return body + struct.pack(">H", sum(body) & 0xFFFF)
+
+
+_SLAVE = 9
+_READ, _WRITE_ONE, _WRITE_MANY = (3, 4), 6, 16
+_BAD_FUNCTION, _BAD_ADDRESS, _BAD_VALUE = 1, 2, 3
+_WRENCH_REGISTER, _STREAM_REGISTER, _STREAM = 180, 410, 0x0200
+_STOP_BYTES = 50
+
+
+class Ft300(ForceSensor):
+    """Robotiq FT 300: Modbus RTU slave 9, and a stream of its own; it tells no time.
+
+    Robotiq, "FT 300 Instruction Manual", chapters "Modbus RTU" and "Data stream": 19200 Bd 8N1,
+    100 Hz, frame `20 4E`, six int16 (N·100, N·m·1000), CRC-16/MODBUS over all before it, everything
+    little-endian. Writing 0200 to register 410 starts the stream, fifty bytes FF stop it.
+    """
+
+    baud = 19200
+    noise = (0.1, 0.005)
+    usual_rate = 100.0
+    full = np.repeat((300.0, 30.0), 3)
+    """Full scale, N and N·m."""
+    scale = np.repeat((100.0, 1000.0), 3)
+
+    def __init__(self, rate: float | None = None) -> None:
+        """Switch on: it waits for requests."""
+        super().__init__(rate)
+        self.streaming = False
+        self._stop_bytes = 0
+        self._inbox = bytearray()
+        fixed = {
+            500: _words("SIM-1.0.10\0\0"),  # firmware
+            510: [*_words("F3004242"), 2024],  # serial number and year
+            _STREAM_REGISTER: [0],
+        }
+        self._registers = {
+            start + i: word for start, words in fixed.items() for i, word in enumerate(words)
+        }
+
+    def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
+        """Return one frame, see `ForceSensor.frame`."""
+        return _checked(b"\x20\x4e" + struct.pack("<6h", *self._counts(wrench)))
+
+    def receive(self, data: bytes, wrench: Floats) -> bytes:
+        """Answer Modbus requests; while streaming only the stop bytes count."""
+        if self.streaming:
+            for byte in data:
+                self._stop_bytes = self._stop_bytes + 1 if byte == 0xFF else 0
+                if self._stop_bytes >= _STOP_BYTES:
+                    self.streaming = False
+            return b""
+        self._inbox += data
+        answer = b""
+        while not self.streaming and (request := self._request()):
+            answer += self._answer(request, wrench)
+        return answer
+
+    def _counts(self, wrench: Floats) -> list[int]:
+        inside = np.clip(wrench, -self.full, self.full)
+        return [int(value) for value in np.rint(inside * self.scale)]
+
+    def _request(self) -> bytes:
+        """Take one sound request to this slave out of the inbox; empty where there is none yet."""
+        box = self._inbox
+        while len(box) >= 8:
+            length = 9 + box[6] if box[1] == _WRITE_MANY else 8
+            if box[0] == _SLAVE and len(box) < length:
+                break
+            request = bytes(box[:length])
+            if box[0] == _SLAVE and request == _checked(request[:-2]):
+                del box[:length]
+                return request
+            del box[0]
+        return b""
+
+    def _answer(self, request: bytes, wrench: Floats) -> bytes:
+        function = request[1]
+        address, word = struct.unpack_from(">HH", request, 2)
+        if function in _READ:
+            live = {
+                _WRENCH_REGISTER + i: count & 0xFFFF for i, count in enumerate(self._counts(wrench))
+            }
+            registers = self._registers | live
+            wanted = range(address, address + word)
+            if not 1 <= word <= 125:
+                return _refusal(function, _BAD_VALUE)
+            if not all(register in registers for register in wanted):
+                return _refusal(function, _BAD_ADDRESS)
+            words = struct.pack(f">{word}H", *(registers[register] for register in wanted))
+            return _checked(bytes([_SLAVE, function, len(words)]) + words)
+        if function == _WRITE_ONE:
+            values = [word]
+        elif function == _WRITE_MANY:
+            if len(request) != 9 + 2 * word:
+                return _refusal(function, _BAD_VALUE)
+            values = list(struct.unpack_from(f">{word}H", request, 7))
+        else:
+            return _refusal(function, _BAD_FUNCTION)
+        if address != _STREAM_REGISTER or len(values) != 1:
+            return _refusal(function, _BAD_ADDRESS)
+        self._stop_bytes = 0
+        self.streaming = values[0] == _STREAM
+        return _checked(request[:6])
+
+
+def _words(text: str) -> list[int]:
+    return [ord(a) << 8 | ord(b) for a, b in zip(text[::2], text[1::2], strict=True)]
+
+
+def _checked(data: bytes) -> bytes:
+    """Return data with its CRC-16/MODBUS."""
+    return data + struct.pack("<H", crc16(data, 0xFFFF))
+
+
+def _refusal(function: int, code: int) -> bytes:
+    return _checked(bytes([_SLAVE, function | 0x80, code]))
+
+
+KINDS: dict[str, type[ForceSensor]] = {"bota": Bota, "ft300": Ft300, "hex": Hex}
 
 
 @dataclass(slots=True, eq=False)
@@ -47,7 +341,7 @@ class Stream:
         lost: frames that came too late to be sent.
     """
 
-    sensor: SensorProtocol
+    sensor: ForceSensor
     gauge: Gauge
     port: PtyPort
     stalled: bool = False
@@ -89,23 +383,17 @@ class Stream:
         self.number += count
         self.due += count * period
 
-    def operate(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out an admin operation and return the state."""
-        match op:
-            case "overload":
-                force = np.asarray(arguments["force"], dtype=np.float64)
-                if force.shape != (6,):
-                    raise ValueError(f"force has the shape {force.shape}; valid: 6 numbers")
-                self.gauge.overload = force
-            case "freeze":
-                self.gauge.frozen = self.gauge.read(1)[0] if arguments["on"] else None
-            case "stall":
-                self.stalled = bool(arguments["on"])
-            case "state":
-                pass
-            case _:
-                if not self.sensor.admin(op, arguments):
-                    self.port.admin(op, arguments)
+    def operations(self) -> admin.Operations:
+        """Return what can be asked."""
+        own: dict[str, Callable[..., object]] = {
+            "overload": self.gauge.add,
+            "freeze": self.gauge.freeze,
+            "stall": lambda on: setattr(self, "stalled", bool(on)),
+        }
+        return admin.Operations(own | self.sensor.operations() | self.port.faults(), self.state)
+
+    def state(self) -> dict[str, Any]:
+        """Return sensor, line and faults."""
         return self.port.state() | {
             "bias": list(self.gauge.bias),
             "noise": list(self.gauge.noise),
@@ -120,22 +408,19 @@ class Stream:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--directory", type=Path, required=True)
+    parser = admin.device_parser(__doc__)
     parser.add_argument("--kind", choices=sorted(KINDS), required=True)
-    parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--rate", type=float, help="frames per second")
     parser.add_argument("--on", type=float, default=1200.0, help="s that it has been on")
     options = parser.parse_args()
-    end_with_parent()
-    kind = KINDS[options.kind]
-    sensor = kind() if options.rate is None else kind(options.rate)
+    admin.end_with_parent()
+    sensor = KINDS[options.kind](options.rate)
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard.attach(options.directory / "world.bin")
     gauge = Gauge.draw(board, sensor.noise, measuring, options.on)
     port = PtyPort(options.directory / "force", sensor.baud, faults)
     stream = Stream(sensor, gauge, port, due=time.monotonic())
-    admin.serve(options.directory / "force.sock", stream.operate)
+    admin.serve(options.directory / "force.sock", stream.operations())
     while True:
         stream.step()
 

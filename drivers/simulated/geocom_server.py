@@ -3,40 +3,331 @@
     python -m drivers.simulated.geocom_server --directory DIR --range-std A B
         --transverse-std C E --seed N [--baud 115200]
 
-Admin operations besides those of the line (`pty_port.FAULTS`): `beam {on}` blocks it, `hide
+Admin operations besides those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
 {targets}` covers reflectors by number, `lock_lost`, `freeze {on}` repeats the last measurement,
 `stray {on}` follows a reflector at rest 0.2 m behind the target,
 `dist_error {on}`, `warn {code}` (1283 or 1284, 0 is none), `busy {on}`, `delay {rpc, seconds,
 count}` in real time, `wrong_trid {count}`, `meas_s {seconds}` of world time, `log`, `state`.
+
+Sources: Leica Geosystems, "TPS1200+ GeoCOM Reference Manual"; its chapter "ASCII protocol" has the
+lines `%R1Q,<rpc>,<trid>[,<crc>]:<p>` and `%R1P,<com>,<trid>[,<crc>]:<rc>,<p>`, whose checksum is
+CRC-16/ARC over the line without the checksum and its comma.
 """
 
-import argparse
+import re
 import time
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.geocom import protocol, rpc
-from drivers.simulated.geocom.optics import Beam
-from drivers.simulated.geocom.station import Station
-from drivers.simulated.parent import end_with_parent
-from drivers.simulated.pty_port import PtyPort
+from drivers.simulated.geocom_station import AIM_S, Beam, Station
+from drivers.simulated.pty_port import PtyPort, crc16
+
+OK = 0
+CANNOT_DECODE = 3080  # COM_CANT_DECODE_REQ
+UNKNOWN_PROCEDURE = 3081  # COM_PROC_UNAVAIL
+BAD_CHECKSUM = 3101  # COM_SRVR_RX_CHECKSUM_ERROR
+
+_REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
+
+
+@dataclass(frozen=True, slots=True)
+class GeocomRequest:
+    """One request, taken apart.
+
+    Attributes:
+        rpc: number of the procedure.
+        transaction: number that the answer repeats.
+        parameters: as written.
+        checked: whether it came with a checksum, so the answer carries one too.
+        error: code of the communication, `OK` where the request is sound.
+    """
+
+    rpc: int
+    transaction: int
+    parameters: tuple[str, ...]
+    checked: bool
+    error: int = OK
+
+
+def parse(line: str) -> GeocomRequest | None:
+    """Take a line apart; None where it is no request at all."""
+    if not line.startswith("%R1Q,"):
+        return None
+    match = _REQUEST.fullmatch(line)
+    if match is None:
+        return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
+    rpc, transaction, crc, rest = match.groups()
+    parameters = tuple(rest.split(",")) if rest else ()
+    error = OK
+    if crc is not None:
+        bare = f"%R1Q,{rpc},{transaction}:{rest}"
+        error = OK if int(crc) == crc16(bare.encode("ascii", "replace"), 0) else BAD_CHECKSUM
+    return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
+
+
+def reply(
+    com: int, transaction: int, code: int, parameters: Sequence[str], *, checked: bool
+) -> bytes:
+    """Return the line of an answer."""
+    body = ",".join([str(code), *parameters])
+    head = f"%R1P,{com},{transaction}"
+    if checked:
+        head += f",{crc16(f'{head}:{body}'.encode(), 0)}"
+    return f"{head}:{body}\r\n".encode()
+
+
+INVALID_PARAMETER = 2
+ANGLES_ONLY = 1285  # TMC_ANGLE_OK: no distance, which is given as 0
+DISTANCE_ERROR = 1292
+BUSY = 1293
+NO_TARGET = 8710
+NOT_ENABLED = 8714
+
+Answer = tuple[int, list[str]]
+Procedure = Callable[[Station, tuple[str, ...]], Answer]
+
+NAME = "SIM LASER STATION"
+SERIAL = 123456
+
+
+def answer(station: Station, rpc: int, parameters: tuple[str, ...]) -> Answer:
+    """Carry out a procedure; takes the time that it takes."""
+    procedure = _PROCEDURES.get(rpc)
+    if procedure is None:
+        return UNKNOWN_PROCEDURE, []
+    try:
+        return procedure(station, parameters)
+    except (ValueError, IndexError):  # too few parameters or no numbers
+        return INVALID_PARAMETER, []
+
+
+def _number(station: Station, *values: float) -> list[str]:
+    return [f"{value:.{station.digits}f}" for value in values]
+
+
+def _constant(*values: str) -> Procedure:
+    return lambda station, parameters: (OK, list(values))
+
+
+def _setting(number: int) -> Procedure:
+    def store(station: Station, parameters: tuple[str, ...]) -> Answer:
+        station.settings[number] = str(int(parameters[0]))
+        return OK, []
+
+    return store
+
+
+def _stored(number: int) -> Procedure:
+    return lambda station, parameters: (OK, [station.settings[number]])
+
+
+def _set_precision(station: Station, parameters: tuple[str, ...]) -> Answer:
+    digits = int(parameters[0])
+    if not 0 <= digits <= 15:
+        return INVALID_PARAMETER, []
+    station.digits = digits
+    return OK, []
+
+
+def _date(station: Station, parameters: tuple[str, ...]) -> Answer:
+    now = datetime.now(UTC)
+    rest = (now.month, now.day, now.hour, now.minute, now.second)
+    return OK, [str(now.year), *(f"'{value:02x}'" for value in rest)]
+
+
+def _set_atmosphere(station: Station, parameters: tuple[str, ...]) -> Answer:
+    wavelength, pressure, dry, wet = map(float, parameters)
+    station.atmosphere = (wavelength, pressure, dry, wet)
+    return OK, []
+
+
+def _switch_atr(station: Station, parameters: tuple[str, ...]) -> Answer:
+    station.atr_enabled = bool(int(parameters[0]))
+    return OK, []
+
+
+def _switch_lock(station: Station, parameters: tuple[str, ...]) -> Answer:
+    station.lock_enabled = bool(int(parameters[0]))
+    if not station.lock_enabled:
+        station.locked = False
+    return OK, []
+
+
+def _lock_in(station: Station, parameters: tuple[str, ...]) -> Answer:
+    if not station.lock_enabled:
+        return NOT_ENABLED, []
+    return _acquire(station, parameters)
+
+
+def _acquire(station: Station, parameters: tuple[str, ...]) -> Answer:
+    return (OK if station.acquire() else NO_TARGET), []
+
+
+def _fine_adjust(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
+    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+    return (OK if station.acquire(window) else NO_TARGET), []
+
+
+def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
+    hz, v = float(parameters[0]), float(parameters[1])
+    station.turn(hz, v)
+    if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: find it there
+        return _acquire(station, parameters)
+    station.wait(AIM_S)
+    return OK, []
+
+
+def _lock_state(station: Station, parameters: tuple[str, ...]) -> Answer:
+    return OK, [str(int(station.locked))]
+
+
+def _lock_quality(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
+    return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
+
+
+def _start_measuring(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """TMC_DoMeasure: 0 stop, 1 distance, 2 track, 3 clear, 6 restart."""
+    if station.busy:
+        return BUSY, []
+    command = int(parameters[0])
+    station.tracking = command == 2
+    if command in (1, 2, 6):
+        station.start_ranging()
+    elif command in (0, 3):
+        station.ranging = None
+        station.distance = 0.0 if command == 3 else station.distance
+    else:
+        return INVALID_PARAMETER, []
+    return OK, []
+
+
+def _angles(station: Station, parameters: tuple[str, ...]) -> Answer:
+    if station.busy:
+        return BUSY, []
+    seen = station.look() or station.pointing
+    return station.warning, _number(station, seen.hz, seen.v)
+
+
+def _with_distance(station: Station, patience: float) -> tuple[int, float, float, float]:
+    """Return code, hz, v and distance of the measurement that 2008 has started."""
+    if station.busy:
+        return BUSY, 0.0, 0.0, 0.0
+    if station.tracking and station.ranging is None:
+        station.start_ranging()
+    station.finish_ranging(patience)
+    if station.dist_error:
+        return DISTANCE_ERROR, 0.0, 0.0, 0.0
+    seen = station.look() or station.pointing
+    code = station.warning if station.distance > 0.0 else ANGLES_ONLY
+    return code, seen.hz, seen.v, station.distance
+
+
+def _simple(station: Station, parameters: tuple[str, ...]) -> Answer:
+    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
+    if code in (BUSY, DISTANCE_ERROR):
+        return code, []
+    return code, _number(station, hz, v, distance)
+
+
+def _full(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """TMC_GetFullMeas: hz, v, their accuracy, inclinations and theirs, distance, its time in ms."""
+    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
+    if code in (BUSY, DISTANCE_ERROR):
+        return code, []
+    accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
+    cross, length, inclination = station.inclination()
+    values = (hz, v, accuracy, cross, length, inclination, distance)
+    return code, [*_number(station, *values), str(station.distance_ms)]
+
+
+def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
+    """BAP_MeasDistanceAngle: 0 last values, 1 angles, 2 to 4 distance, 5 clear, 6 stop."""
+    if station.busy:
+        return BUSY, []
+    mode = int(parameters[0])
+    if not 0 <= mode <= 6:
+        return INVALID_PARAMETER, []
+    if mode in (5, 6):
+        station.ranging, station.tracking = None, False
+        station.distance = 0.0 if mode == 5 else station.distance
+        return OK, [*_number(station, station.pointing.hz, station.pointing.v, 0.0), str(mode)]
+    distance = 0.0
+    if mode >= 2:
+        if not station.locked:
+            station.wait(AIM_S)
+            return NO_TARGET, []
+        station.start_ranging()
+        station.finish_ranging(station.meas_s)
+        if station.dist_error:
+            return DISTANCE_ERROR, []
+        distance = station.distance
+        seen = station.pointing
+    else:
+        seen = station.look() or station.pointing
+        distance = station.distance if mode == 0 else 0.0
+    code = station.warning if distance > 0.0 or mode == 1 else ANGLES_ONLY
+    return code, [*_number(station, seen.hz, seen.v, distance), str(mode)]
+
+
+_PROCEDURES: dict[int, Procedure] = {
+    0: _constant(),
+    107: _set_precision,
+    108: lambda station, parameters: (OK, [str(station.digits)]),
+    110: _constant("1", "50", "0"),
+    2007: _constant("1"),
+    2008: _start_measuring,
+    2020: _setting(2020),
+    2021: _stored(2020),
+    2022: lambda station, parameters: (OK, [*_number(station, 80.0), str(int(station.board.time))]),
+    2026: _constant("0"),
+    2028: _set_atmosphere,
+    2029: lambda station, parameters: (OK, _number(station, *station.atmosphere)),
+    2107: _angles,
+    2108: _simple,
+    2167: _full,
+    5003: _constant(str(SERIAL)),
+    5004: _constant(f'"{NAME}"'),
+    5008: _date,
+    5011: lambda station, parameters: (OK, _number(station, station.temperature())),
+    5034: _constant("6", "20", "0"),
+    5039: _constant("100", "1", "1"),
+    6021: _lock_quality,
+    9013: _lock_in,
+    9018: _switch_atr,
+    9019: lambda station, parameters: (OK, [str(int(station.atr_enabled))]),
+    9020: _switch_lock,
+    9021: _lock_state,
+    9027: _turn,
+    9037: _fine_adjust,
+    11001: _constant(),
+    11004: _constant(),
+    17008: _setting(17008),
+    17009: _stored(17008),
+    17017: _measure,
+    17018: _stored(17019),
+    17019: _setting(17019),
+    17020: _acquire,
+    17021: _setting(17021),
+    17022: _stored(17021),
+}
+
 
 LONGEST_LINE = 1024
-WARNINGS = (0, 1283, 1284)
-BEHIND_M = 0.2
-"""Two reflectors are at two places."""
 
 
 def respond(station: Station, line: str) -> bytes:
     """Return the answer to one line, empty where it is none of the protocol's."""
     if line == "c":  # abort: there is never anything left to abort
         return b"?\r\n"
-    request = protocol.parse(line)
+    request = parse(line)
     if request is None:
         return b""
     station.requests.append((request.rpc, request.parameters))
@@ -44,59 +335,49 @@ def respond(station: Station, line: str) -> bytes:
     if station.wrong_transactions > 0:
         station.wrong_transactions -= 1
         transaction = (transaction + 1) % 2**15
-    if request.error != protocol.OK:
-        return protocol.reply(request.error, transaction, 0, [], checked=request.checked)
-    code, values = rpc.answer(station, request.rpc, request.parameters)
+    if request.error != OK:
+        return reply(request.error, transaction, 0, [], checked=request.checked)
+    code, values = answer(station, request.rpc, request.parameters)
     pause, count = station.delays.pop(request.rpc, (0.0, 0))
     if count > 1:
         station.delays[request.rpc] = pause, count - 1
     time.sleep(pause)
-    return protocol.reply(protocol.OK, transaction, code, values, checked=request.checked)
+    return reply(OK, transaction, code, values, checked=request.checked)
 
 
-def operate(station: Station, port: PtyPort, op: str, arguments: dict[str, Any]) -> Any:
-    """Carry out an admin operation and return the state (`log`: the last requests)."""
-    match op:
-        case "beam":
-            station.broken = bool(arguments["on"])
-        case "hide":
-            station.hidden = {int(k) for k in arguments["targets"]}
-            station.locked = station.locked and station.number not in station.hidden
-        case "lock_lost":
-            station.locked = False
-        case "freeze":
-            station.stuck = station.seen if arguments["on"] else None
-        case "stray":
-            seen = station.target() if arguments["on"] else None
-            station.stray = seen and replace(seen, distance=seen.distance + BEHIND_M)
-        case "dist_error":
-            station.dist_error = bool(arguments["on"])
-        case "warn":
-            if arguments["code"] not in WARNINGS:
-                raise ValueError(f"code = {arguments['code']}; valid: {WARNINGS}")
-            station.warning = int(arguments["code"])
-        case "busy":
-            station.busy = bool(arguments["on"])
-        case "delay":
-            count = int(arguments.get("count", 1))
-            station.delays[int(arguments["rpc"])] = float(arguments["seconds"]), count
-        case "wrong_trid":
-            station.wrong_transactions = int(arguments.get("count", 1))
-        case "meas_s":
-            station.meas_s = float(arguments["seconds"])
-        case "log":
-            return [[number, *values] for number, values in list(station.requests)]
-        case "state":
-            pass
-        case _:
-            port.admin(op, arguments)
-    return port.state() | {
-        "locked": station.locked,
-        "beam": station.broken,
-        "measured": station.measured,
-        "requests": len(station.requests),
-        "meas_s": station.meas_s,
+def operations(station: Station, port: PtyPort) -> admin.Operations:
+    """Return what can be asked of the station."""
+
+    def put(name: str) -> Callable[..., None]:
+        return lambda on: setattr(station, name, bool(on))
+
+    def delay(rpc: int, seconds: float, count: int = 1) -> None:
+        station.delays[int(rpc)] = float(seconds), int(count)
+
+    def state() -> dict[str, Any]:
+        return port.state() | {
+            "locked": station.locked,
+            "beam": station.broken,
+            "measured": station.measured,
+            "requests": len(station.requests),
+            "meas_s": station.meas_s,
+        }
+
+    own: dict[str, Callable[..., object]] = {
+        "beam": put("broken"),
+        "hide": station.hide,
+        "lock_lost": lambda: setattr(station, "locked", False),
+        "freeze": lambda on: setattr(station, "stuck", station.seen if on else None),
+        "stray": station.follow_stray,
+        "dist_error": put("dist_error"),
+        "warn": station.warn,
+        "busy": put("busy"),
+        "delay": delay,
+        "wrong_trid": lambda count=1: setattr(station, "wrong_transactions", int(count)),
+        "meas_s": lambda seconds: setattr(station, "meas_s", float(seconds)),
+        "log": lambda: [[number, *values] for number, values in list(station.requests)],
     }
+    return admin.Operations(own | port.faults(), state)
 
 
 def serve(station: Station, port: PtyPort) -> None:
@@ -119,14 +400,12 @@ def serve(station: Station, port: PtyPort) -> None:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--directory", type=Path, required=True)
+    parser = admin.device_parser(__doc__)
     parser.add_argument("--range-std", type=float, nargs=2, required=True)
     parser.add_argument("--transverse-std", type=float, nargs=2, required=True)
-    parser.add_argument("--seed", type=int, required=True)
     parser.add_argument("--baud", type=int, default=115200)
     options = parser.parse_args()
-    end_with_parent()
+    admin.end_with_parent()
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     station = Station(
         Blackboard.attach(options.directory / "world.bin"),
@@ -134,10 +413,7 @@ def main() -> None:
         measuring,
     )
     port = PtyPort(options.directory / "tracker", options.baud, faults)
-    admin.serve(
-        options.directory / "tracker.sock",
-        lambda op, arguments: operate(station, port, op, arguments),
-    )
+    admin.serve(options.directory / "tracker.sock", operations(station, port))
     serve(station, port)
 
 

@@ -1,21 +1,118 @@
-"""Hide an effect in the simulated world at a chosen strength."""
+"""Hide an effect in the simulated world: a plausible direction, at a chosen strength."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.conditions import joint_temperature
-from drivers.simulated.draw import Draw, joint_compliance, typical_torque
+from drivers.simulated.mechanics import rotation_vector
 from drivers.simulated.own_law import OwnLaw
-from drivers.simulated.rigid import rotation_vector
-from drivers.simulated.tracker import SimulatedNoise
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import IdealReading, World, stand
+from drivers.simulated.truth import Truth, joint_temperature, long_links
+from drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
 from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
+from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
+
+_GIVE = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
+
+
+def joint_compliance(arm: Arm, rng: np.random.Generator) -> Floats:
+    """Draw the (n,) compliances of the drives, rad/(N·m), ±30 % per joint.
+
+    A drive gives about 2 mrad at its torque limit, whatever its size: 6 to 40 µrad/(N·m) on
+    an arm of the UR10e's size (order of magnitude of harmonic drives, e.g. the stiffnesses
+    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue).
+    """
+    return typical_compliance(arm) * rng.uniform(0.7, 1.3, arm.n)
+
+
+def typical_compliance(arm: Arm) -> Floats:
+    """Return the (n,) middle of the compliances that are drawn, rad/(N·m)."""
+    give = _GIVE if arm.n == len(_GIVE) else np.full(arm.n, 1.9e-3)
+    return np.asarray(give / typical_torque(arm))
+
+
+def typical_torque(arm: Arm) -> Floats:
+    """Return the (n,) torque limits of the drives; 100 N·m where none is known."""
+    limit = np.asarray(arm.torque_max, dtype=float)
+    return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, 100.0))
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Draws one effect's parameters in a plausible direction and of a plausible size.
+
+    Attributes:
+        arm: the arm.
+        compliance: (n,) the drives' compliances, which stiffening belongs to, rad/(N·m).
+        torque: (n,) the largest torque at each drive in the states at hand, N·m.
+        harmonics: number of harmonics of the transmission error.
+    """
+
+    arm: Arm
+    compliance: Floats
+    torque: Floats
+    harmonics: int = 6
+
+    def effect(self, name: str, rng: np.random.Generator) -> Floats:
+        """Return the parameters of the named effect, shaped as in `Truth`."""
+        n, typical, order = self.arm.n, typical_compliance(self.arm), self.harmonics
+        even, normal = rng.uniform, rng.standard_normal
+        decay = 1.0 / np.arange(1, order + 1)[:, None]
+        plate = 0.3 * float(typical[-1]) * np.array([0.5, 1.0])  # stiffer about its own axis
+        heavy = np.maximum(self.arm.masses, 0.1)[:, None]
+        draws: dict[str, Callable[[], Floats]] = {
+            "joint_compliance": lambda: joint_compliance(self.arm, rng),
+            "joint_stiffening": lambda: (
+                -(even(0.7, 1.0, n) / 3.0) * self.compliance / self.torque**2
+            ),
+            "joint_tilt_compliance": lambda: 0.5 * typical * even(0.3, 1.0, n),
+            "base_compliance": lambda: 0.5 * float(typical[0]) * even(0.3, 1.0, 3),
+            "link_compliance": lambda: self._beams(rng),
+            "hysteresis": lambda: 5e-5 * even(0.3, 1.0, n),
+            "encoder_offset": lambda: 2e-4 * normal(n),
+            "joint_coupling": lambda: self._couplings(rng),
+            "transmission_error": lambda: 1e-4 * decay * normal((n, order, 2)),
+            "link_geometry": lambda: 3e-4 * normal((n + 1, 6)),
+            "load_point": lambda: 5e-3 * normal(3),
+            "target_offset": lambda: 5e-3 * normal(3),
+            "base_frame": lambda: 1e-3 * normal(6),
+            "tracker_drift": lambda: np.repeat([1e-8, 3e-9], 3) * normal(6),
+            # further elasticity, and what a force sensor misreads
+            "tool_compliance": lambda: plate * even(0.5, 1.0, 2),
+            "periodic_joint_compliance": lambda: 0.1 * typical[:, None] * normal((n, 2)),
+            "backlash": lambda: 5e-5 * even(0.3, 1.0, n),
+            "creep": lambda: 0.03 * even(0.5, 1.5, 1),
+            "wrench_bias": lambda: np.repeat([1.0, 0.1], 3) * normal(6),
+            "wrench_gain": lambda: 1e-2 * normal(6),
+            "sensor_misalignment": lambda: 1e-2 * normal(3),
+            # temperature (steel to aluminium), wrong masses (centres some centimetres off), scale
+            "thermal_growth": lambda: even(11e-6, 24e-6, 1),
+            "thermal_joint_drift": lambda: 5e-6 * normal(n),
+            "link_mass": lambda: 0.03 * heavy * normal((n, 3)),
+            "tracker_scale": lambda: (
+                5e-6 * rng.choice(np.array([-1.0, 1.0]), 1) * even(0.5, 1.5, 1)
+            ),
+        }
+        return np.asarray(draws[name]())
+
+    def _couplings(self, rng: np.random.Generator) -> Floats:
+        """Draw k (n, n) of joints that the one before, or the last but two, takes along."""
+        n = self.arm.n
+        out = np.diag(rng.standard_normal(n - 1), -1) if n > 1 else np.zeros((n, n))
+        if n > 2:
+            out[n - 1, n - 3] = rng.standard_normal()
+        return np.asarray(2e-4 * out)
+
+    def _beams(self, rng: np.random.Generator) -> Floats:
+        """Draw 1/EI and 1/GJ (b, 2): a tube that gives as much as half a drive over its length."""
+        which = long_links(self.arm)
+        length = np.linalg.norm(self.arm.links[which, :3, 3], axis=1)
+        size = 0.5 * typical_compliance(self.arm)[:3].mean() / length
+        return np.asarray(size[:, None] * [1.0, 1.3] * rng.uniform(0.5, 1.5, (len(which), 2)))
+
 
 DEFLECTION_EFFECTS = (
     "joint_compliance",
@@ -107,6 +204,14 @@ def nothing_hidden(
     )
 
 
+def softened(world: World, effect: object) -> World:
+    """Return a world with softer drives where `effect` is that they stiffen, as real ones do."""
+    if effect != "joint_stiffening":
+        return world
+    softer = _SOFTER * world.physics.joint_compliance
+    return replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+
+
 def hide(
     effect: str | OwnLaw,
     cell: Cell,
@@ -151,10 +256,7 @@ def hide(
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:
-        world = nothing_hidden(cell, rng)
-        if effect == "joint_stiffening":
-            softer = _SOFTER * world.physics.joint_compliance
-            world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+        world = softened(nothing_hidden(cell, rng), effect)
     if effect == "none" or strength_sigma == 0.0:
         return world
     hidden, reference = (

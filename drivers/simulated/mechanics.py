@@ -1,4 +1,4 @@
-"""Static equilibrium of the elastic arm under its own weight and a dead load."""
+"""The elastic arm, its laws, and its static equilibrium under its own weight and a dead load."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -6,12 +6,318 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from drivers.simulated.elastic_tree import ElasticTree
-from drivers.simulated.elasticity import Elasticity
-from drivers.simulated.misreading import Misreading
-from drivers.simulated.rigid import moved_by, skew
+from drivers.simulated.truth import Misreading, long_links
 from hilcal.errors import InputError
+from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints
+
+
+def displacement(twist: Floats) -> Floats:
+    """Return the (4, 4) rigid displacement exp([twist]) of a (6,) twist (v, omega), m and rad."""
+    return np.asarray(pin.exp6(pin.Motion(twist[:3], twist[3:])).homogeneous)
+
+
+def turned(rotation: Floats) -> Floats:
+    """Return (N, 3, 3) rotation matrices of (N, 3) rotation vectors, rad."""
+    return np.array([pin.exp3(w) for w in rotation]).reshape(-1, 3, 3)
+
+
+def rotation_vector(matrix: Floats) -> Floats:
+    """Return (N, 3) rotation vectors of (N, 3, 3) rotation matrices, rad, length at most pi."""
+    return np.array([pin.log3(r) for r in matrix]).reshape(-1, 3)
+
+
+def inverse(transform: Floats) -> Floats:
+    """Return the inverse of rigid transforms (..., 4, 4)."""
+    out = np.zeros_like(transform)
+    turn = np.swapaxes(transform[..., :3, :3], -1, -2)
+    out[..., :3, :3] = turn
+    out[..., :3, 3] = -(turn @ transform[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def skew(vector: Floats) -> Floats:
+    """Return (..., 3, 3) matrices that multiply as (..., 3) vectors do in a cross product."""
+    out = np.zeros((*vector.shape, 3))
+    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = np.moveaxis(vector, -1, 0)
+    return out - np.swapaxes(out, -1, -2)
+
+
+def moved_by(jacobian: Floats, arm: Floats) -> Floats:
+    """Return Jacobians (N, 6, k) taken at a point that lies `arm` (N, 3) further, same axes.
+
+    v' = v + omega × arm; rows are (v, omega), m and rad.
+    """
+    out = jacobian.copy()
+    out[:, :3] += np.cross(jacobian[:, 3:], arm[:, :, None], axis=1)
+    return out
+
+
+_MASSLESS = 1e-9  # kg; what carries the first moment of a body without a mass
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ElasticTree:
+    """Pinocchio model of the elastic arm and where its degrees of freedom sit.
+
+    The tree from base to flange is
+
+        RX RY RZ (base origin), then for each joint j: RX RY (bearing) RZ (drive),
+        and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam);
+        last RX RY RZ (flange).
+
+    Attributes:
+        model: the Pinocchio model, v degrees of freedom.
+        base: (3,) indices of the base's tilts about x, y, z; (0,) where nothing tilts.
+        tilt: (n, 2) indices of the bearings' tilts about the axes across each joint; or (n, 0).
+        drive: (n,) indices of the joints themselves: command, errors and elasticity add.
+        beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
+        beam_length: (b,) lengths, m.
+        beam_link: (b,) number k of each long link, the constant transform L_k.
+        tool: (3,) indices of the flange's tilts about its x, y, z; (0,) where it has none.
+        last: number of the last Pinocchio joint, which carries the flange.
+        flange: (4, 4) flange in the last joint's frame.
+    """
+
+    model: pin.Model
+    base: Ints
+    tilt: Ints
+    drive: Ints
+    beam: Ints
+    beam_length: Floats
+    beam_link: Ints
+    tool: Ints
+    last: int
+    flange: Floats
+
+
+def build(
+    arm: Arm,
+    links: Floats,
+    tool_mass: float,
+    tool_com: Floats,
+    gravity: Floats,
+    *,
+    tilts: bool = True,
+    beams: bool = False,
+    tool: bool = False,
+    moments: Floats | None = None,
+) -> ElasticTree:
+    """Build the tree from the true links (n + 1, 4, 4); lengths in m, masses in kg.
+
+    Args:
+        arm: the arm; its own links are not used, `links` are.
+        links: (n + 1, 4, 4) the constant transforms as they truly are.
+        tool_mass: what the flange carries permanently, kg.
+        tool_com: (3,) its centre of mass, flange axes, m.
+        gravity: (3,) base axes, m/s².
+        tilts: whether base and bearings can tilt.
+        beams: whether long links get elastic tips.
+        tool: whether the flange can tilt; only then no constant transform is left behind the
+            last degree of freedom.
+        moments: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
+    """
+    model = pin.Model()
+    model.gravity.linear = np.asarray(gravity, dtype=float)
+    here = pin.SE3.Identity()
+    last = 0
+
+    def add(kind: object, name: str) -> int:
+        nonlocal here, last
+        last = model.addJoint(last, kind, here, name)
+        here = pin.SE3.Identity()
+        return int(model.idx_qs[last])
+
+    base = []
+    if tilts:
+        base = [
+            add(pin.JointModelRX(), "base_x"),
+            add(pin.JointModelRY(), "base_y"),
+            add(pin.JointModelRZ(), "base_z"),
+        ]
+    here = pin.SE3(links[0])
+    tilt, drive, beam = [], [], []
+    bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
+    for j in range(arm.n):
+        kinds = ((pin.JointModelRX(), "x"), (pin.JointModelRY(), "y")) if tilts else ()
+        tilt.append([add(kind, f"tilt_{axis}{j + 1}") for kind, axis in kinds])
+        drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
+        body = _body(float(arm.masses[j]), arm.coms[j], None if moments is None else moments[j])
+        model.appendBodyToJoint(last, body, pin.SE3.Identity())
+        here = pin.SE3(links[j + 1])
+        if j + 1 in bent:
+            tip = pin.SE3(_beam_axes(links[j + 1][:3, 3]), links[j + 1][:3, 3])
+            here = tip
+            moves = (
+                pin.JointModelPY(),
+                pin.JointModelPZ(),
+                pin.JointModelRX(),
+                pin.JointModelRY(),
+                pin.JointModelRZ(),
+            )
+            beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(moves)])
+            here = tip.inverse() * pin.SE3(links[j + 1])
+    hand = []
+    if tool:
+        hand = [
+            add(pin.JointModelRX(), "tool_x"),
+            add(pin.JointModelRY(), "tool_y"),
+            add(pin.JointModelRZ(), "tool_z"),
+        ]
+    carried = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
+    model.appendBodyToJoint(last, carried, here)
+    return ElasticTree(
+        model=model,
+        base=np.array(base, dtype=np.int64),
+        tilt=np.array(tilt, dtype=np.int64),
+        drive=np.array(drive),
+        beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
+        beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),
+        beam_link=bent,
+        tool=np.array(hand, dtype=np.int64),
+        last=last,
+        flange=np.asarray(here.homogeneous),
+    )
+
+
+def _body(mass: float, com: Floats, moment: Floats | None) -> pin.Inertia:
+    """Return a body of the given mass whose first moment is mass com + moment, kg·m."""
+    if moment is not None and np.any(moment):
+        held = max(mass, _MASSLESS)
+        com, mass = (mass * com + moment) / held, held
+    return pin.Inertia(mass, np.asarray(com, dtype=float), np.zeros((3, 3)))
+
+
+def _beam_axes(along: Floats) -> Floats:
+    """Return a (3, 3) rotation whose x runs along the given vector."""
+    x = along / np.linalg.norm(along)
+    other = np.eye(3)[int(np.argmin(np.abs(x)))]
+    y = np.cross(other, x)
+    y /= np.linalg.norm(y)
+    return np.column_stack([x, y, np.cross(x, y)])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Elasticity:
+    """delta = (C + diag x) tau + s tau³ + b tanh(tau / tau_0).
+
+    Where drives turn several joints, this is the law of the drives, with their torques; the joints
+    then turn by T delta, and tau = Tᵀ (torques about the axes).
+
+    Attributes:
+        linear: (v, v) C, symmetric, rad/(N·m) and its like for the tips of beams.
+        cubic: (v,) s, rad/(N·m)³; negative where a gear stiffens under load.
+        play: (v,) b, rad: half of the play that a joint crosses with the sign of its torque.
+        crossing: (v,) tau_0, the torque that takes it most of the way, over 0, N·m.
+        extra: (N, v) x, compliance that belongs to one of N states, rad/(N·m); None: nothing.
+        turns: (v, v) T; None: 1.
+    """
+
+    linear: Floats
+    cubic: Floats
+    play: Floats
+    crossing: Floats
+    extra: Floats | None = None
+    turns: Floats | None = None
+
+    def give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
+        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states.
+
+        Raises:
+            InputError: the gear would soften to nothing.
+        """
+        if self.turns is None:
+            return self._give(tau, states)
+        delta, slack = self._give(tau @ self.turns, states)
+        return delta @ self.turns.T, self.turns @ slack @ self.turns.T
+
+    def _give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
+        delta, bend = tau @ self.linear.T, np.zeros_like(tau)
+        if self.extra is not None:
+            bend += self.extra[states]
+            delta += bend * tau
+        stiffens = self.cubic != 0.0
+        if stiffens.any():
+            delta += self.cubic * tau**3
+            bend += 3.0 * self.cubic * tau**2
+            soft = np.any((np.diag(self.linear) + bend)[:, stiffens] <= 0.0, axis=1)
+            if soft.any():
+                raise InputError(
+                    f"state {states[soft][0]}: joint_stiffening is too strong for "
+                    "joint_compliance: the joint would spring back under more torque; "
+                    "valid: c + 3 s tau^2 > 0"
+                )
+        if self.play.any():
+            part = np.tanh(tau / self.crossing)
+            delta += self.play * part
+            bend += self.play / self.crossing * (1.0 - part**2)
+        return delta, self.linear + bend[:, :, None] * np.eye(len(self.linear))
+
+
+def elasticity(
+    tree: ElasticTree,
+    joint: Floats,
+    stiffening: Floats,
+    tilt: Floats,
+    base: Floats,
+    beam: Floats,
+    *,
+    tool: Floats | None = None,
+    play: Floats | None = None,
+    crossing: Floats | None = None,
+    extra: Floats | None = None,
+    drive: Floats | None = None,
+) -> Elasticity:
+    """Assemble the elastic law from physical constants.
+
+    A beam of length L that carries (F, M) at its tip gives way there by L³/3EI F + L²/2EI M,
+    turns by L²/2EI F + L/EI M and twists by L/GJ M (Euler-Bernoulli; e.g. Gere and
+    Timoshenko, Mechanics of Materials, table of cantilever deflections).
+
+    Args:
+        tree: the degrees of freedom.
+        joint: (n,) compliances of the drives, rad/(N·m).
+        stiffening: (n,) their cubic terms, rad/(N·m)³.
+        tilt: (n,) compliances of the bearings, rad/(N·m).
+        base: (3,) compliance of the base about x, y, z, rad/(N·m).
+        beam: (b, 2) 1/EI and 1/GJ of the long links, 1/(N·m²).
+        tool: (2,) compliance of the flange along and across its z axis, rad/(N·m).
+        play: (n,) half of the play of the drives, rad.
+        crossing: (n,) torque that crosses it, over 0, N·m.
+        extra: (N, n) compliances of the drives that belong to N states, rad/(N·m).
+        drive: (n, n) how far each drive turns each joint; None: its own.
+    """
+    size = tree.model.nv
+    linear, cubic = np.zeros((size, size)), np.zeros(size)
+    linear[tree.base, tree.base] = base[: len(tree.base)]
+    linear[tree.drive, tree.drive] = joint
+    linear[tree.tilt, tree.tilt] = tilt[:, None]
+    cubic[tree.drive] = stiffening
+    for (py, pz, rx, ry, rz), length, (bend, twist) in zip(
+        tree.beam, tree.beam_length, beam, strict=True
+    ):
+        linear[[py, pz], [py, pz]] = length**3 / 3.0 * bend
+        linear[[ry, rz], [ry, rz]] = length * bend
+        linear[rx, rx] = length * twist
+        half = length**2 / 2.0 * bend
+        linear[[py, rz], [rz, py]] = half  # a force along +y turns the tip about +z
+        linear[[pz, ry], [ry, pz]] = -half  # a force along +z turns it about -y
+    if tool is not None and len(tree.tool):
+        linear[tree.tool, tree.tool] = tool[[1, 1, 0]]
+    free, torque = np.zeros(size), np.ones(size)
+    if play is not None and crossing is not None:
+        free[tree.drive], torque[tree.drive] = play, crossing
+    own = None
+    if extra is not None:
+        own = np.zeros((len(extra), size))
+        own[:, tree.drive] = extra
+    turns = None
+    if drive is not None:
+        turns = np.eye(size)
+        turns[np.ix_(tree.drive, tree.drive)] = drive
+    return Elasticity(linear, cubic, free, torque, own, turns)
+
 
 _ITERATIONS = 40
 _STEP = 1e-9  # rad or m; Newton's next step, about its square, is below rounding

@@ -7,8 +7,7 @@ from drivers.simulated import admin
 from drivers.terminal_operator import TerminalOperator
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import Report
+from hilcal.measuring.devices import Clock, Report
 
 HAND_S = 20.0
 """Time that a person takes to change a load, s."""

@@ -13,6 +13,7 @@ import threading
 import time
 import tty
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,15 @@ _SPEEDS = {rate: speed for speed, rate in _RATES.items()}
 _OUTPUT_SPEED = 5  # index in what tcgetattr returns
 _PULSE = 0.02  # longest wait in one call, s, so that an unplugged line closes soon
 
-FAULTS = ("flip", "cut", "mute", "half_frame", "garbage", "unplug", "replug", "baud", "die")
+
+def crc16(data: bytes, start: int) -> int:
+    """Return the CRC-16 with x¹⁶ + x¹⁵ + x² + 1, reflected: ARC from 0, MODBUS from FFFF."""
+    crc = start
+    for byte in data:
+        crc ^= byte
+        for _ in range(8):
+            crc = crc >> 1 ^ (0xA001 if crc & 1 else 0)
+    return crc
 
 
 class PtyPort:
@@ -176,38 +185,30 @@ class PtyPort:
             self._inbox.clear()
             return data
 
-    def admin(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out one of `FAULTS` and return the state.
+    def faults(self) -> dict[str, Callable[..., None]]:
+        """Return what can go wrong on the line, by name."""
+        return {
+            "flip": lambda probability: setattr(self, "flip", float(probability)),
+            "cut": lambda probability: setattr(self, "cut", float(probability)),
+            "mute": lambda on: setattr(self, "mute", bool(on)),
+            "half_frame": lambda: setattr(self, "_halve", True),
+            "garbage": self.garbage,
+            "unplug": self.unplug,
+            "replug": self.plug,
+            "baud": self.set_baud,
+        }
 
-        `flip` and `cut` take `probability`, `mute` takes `on`, `garbage` takes `count`, `baud`
-        takes `baud`; `half_frame` cuts the next frame in half.
-        """
+    def garbage(self, count: int) -> None:
+        """Put random bytes on the wire."""
         with self._lock:
-            match op:
-                case "flip":
-                    self.flip = float(arguments["probability"])
-                case "cut":
-                    self.cut = float(arguments["probability"])
-                case "mute":
-                    self.mute = bool(arguments["on"])
-                case "half_frame":
-                    self._halve = True
-                case "garbage":
-                    if self.plugged:
-                        self._queue_up(self._rng.bytes(int(arguments["count"])), time.monotonic())
-                case "unplug":
-                    self.unplug()
-                case "replug":
-                    self.plug()
-                case "baud":
-                    if arguments["baud"] not in _SPEEDS:
-                        raise ValueError(f"baud = {arguments['baud']}; valid: {sorted(_SPEEDS)}")
-                    self.baud = int(arguments["baud"])
-                case "die":
-                    threading.Timer(0.02, os._exit, (1,)).start()
-                case _:
-                    raise ValueError(f'no such operation: "{op}"')
-            return self.state()
+            if self.plugged:
+                self._queue_up(self._rng.bytes(int(count)), time.monotonic())
+
+    def set_baud(self, baud: int) -> None:
+        """Let the instrument send and hear at another rate, Bd."""
+        if baud not in _SPEEDS:
+            raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
+        self.baud = int(baud)
 
     def state(self) -> dict[str, Any]:
         """Return the counters and faults."""

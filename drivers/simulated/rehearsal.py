@@ -1,21 +1,32 @@
-"""A simulated cell with a hidden effect, and the readings of a campaign in it."""
+"""A simulated cell with a hidden effect, and a campaign in it: behind real wires or behind none."""
 
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
+from drivers.simulated.cell_processes import SimulatedCell
+from drivers.simulated.injected_effects import (
+    DEFLECTION_EFFECTS,
+    EFFECTS,
+    hide,
+    nothing_hidden,
+    softened,
+)
 from drivers.simulated.own_law import own_law, own_names
-from drivers.simulated.tracker import SimulatedNoise
-from drivers.simulated.world import World
+from drivers.simulated.truth import warm_up
+from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
+from hilcal.measuring.route import approach_sides, route
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
+from hilcal.store.plan import UNLOADED, Plan
 from hilcal.toml import suggest
 from hilcal.types import Ints
 
@@ -25,7 +36,6 @@ INVENTED = "invented"
 """A law that the catalogue lacks; see `invented_law`."""
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
-_SOFTER = 1.5  # a gear that stiffens starts softer than its mean
 
 
 def choices() -> tuple[str, ...]:
@@ -168,9 +178,7 @@ def simulation_case(
     strength = 0.0
     if hidden != NOTHING:
         strength = config.simulation.strength_sigma
-        if hidden == "joint_stiffening":
-            softer = _SOFTER * world.physics.joint_compliance
-            world = replace(world, physics=world.physics.with_effect("joint_compliance", softer))
+        world = softened(world, hidden)
         what = own or hidden
         world = hide(
             what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
@@ -229,3 +237,130 @@ def simulate(
         made = replace(made, common=sight.jacobian[:, :m] * world.joint_std)
     value = world.observe(states, rng, m, arrival)
     return replace(made, value=value, covariance=world.covariance(sight, m))
+
+
+_LOADING = 60.0  # s, to change a load
+_MEASURING = 5.0  # s, to settle and to measure
+
+
+def planned_states(
+    cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
+) -> CampaignStates:
+    """Return the N states of a plan's steps in order, with times as they will about be.
+
+    Of several targets, each is read at every step.
+
+    The arm takes the route of a session, which tells from which sides the joints arrive. They warm
+    up as those of the cell behind the wires do.
+
+    Args:
+        cell: the cell.
+        config: its loads and motion.
+        plan: what is visited.
+        begun: when, in the time of the campaign, s.
+    """
+    names = [UNLOADED, *(load.name for load in config.loads)]
+    pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
+    q = np.array([plan.joints(step.pose) for step in plan.steps])
+    wrench = np.array([pulls.get(step.load, np.zeros(6)) for step in plan.steps])
+    load = np.array([names.index(step.load) for step in plan.steps])
+    moved = np.diff(q, axis=0, prepend=q[:1] - 1.0)
+    stops = route(plan, cell.arm, config.limits.joint_margin_rad)
+    speed, acceleration = config.motion.speed_rad_s, config.motion.acceleration_rad_s2
+    changed = np.diff(load, prepend=0) != 0
+    resting = _MEASURING * len(cell.all_targets)
+    lasts = np.abs(moved).max(axis=1) / speed + speed / acceleration + resting
+    time = begun + np.cumsum(lasts + _LOADING * changed)
+    hung = np.maximum.accumulate(np.where(changed, time - resting, begun))
+    states = States(
+        q=q,
+        wrench=wrench,
+        time=time,
+        load_time=np.maximum(time - hung, 1.0),
+        joint_temperature=warm_up(time, cell.arm.n),
+        approach=approach_sides(stops),
+    )
+    pose = np.array([plan.pose_names.index(step.pose) for step in plan.steps])
+    cycle = np.array([step.cycle for step in plan.steps])
+    if cell.targets is None:
+        return CampaignStates(states, pose, load, cycle)
+    each = np.repeat(np.arange(len(pose)), len(cell.targets))
+    target = np.tile(np.arange(len(cell.targets)), len(pose))
+    states = states[each]
+    passed = _MEASURING * target
+    loaded = np.maximum(time - hung, 1.0)[each] + passed
+    states = replace(states, target=target, time=time[each] + passed, load_time=loaded)
+    return CampaignStates(states, pose[each], load[each], cycle[each])
+
+
+def case_of_plan(
+    config: CellConfig, plan: Plan, choice: str, seed: int, catalogue: Catalogue | None = None
+) -> SimulationCase:
+    """Hide an effect in the simulated cell of a configuration.
+
+    Its strength holds for the readings of the plan, each the mean of several measurements; the
+    world's tracker has the noise of a single one.
+
+    Args:
+        config: the cell; `[simulation]` gives the strength.
+        plan: what will be measured.
+        choice: an effect, "random" or "nothing".
+        seed: of everything random.
+        catalogue: has the effects of a user's own, which can be hidden, too.
+
+    Raises:
+        InputError: an unknown choice, or a cell without loads.
+    """
+    rng = np.random.default_rng(seed)
+    mean = measurement_noise(config, config.acquire.samples)
+    secret = simulation_case(
+        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean, catalogue
+    )
+    return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
+
+
+def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
+    """Draw the readings of a plan in a simulated cell that is there already.
+
+    Args:
+        s: configuration and truth of the cell.
+        plan: what is measured, each reading the mean of several measurements.
+        seed: of the noise.
+        begun: when, in the time of the campaign, s.
+    """
+    config = s.config
+    world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
+    v = planned_states(s.cell, config, plan, begun)
+    names = (UNLOADED, *(load.name for load in config.loads))
+    rng = np.random.default_rng(seed)
+    readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
+    readings = replace(readings, pose_names=plan.pose_names)
+    return Rehearsal(s.config, s.cell, s.mode, world, s.hidden, s.strength_sigma, readings)
+
+
+@contextmanager
+def simulated_cell(
+    secret: SimulationCase,
+    seed: int,
+    base_dir: Path,
+    directory: Path | None = None,
+    begun: float = 0.0,
+) -> Iterator[SimulatedCell]:
+    """Run the simulated devices of a cell; they end with the block.
+
+    Args:
+        secret: configuration and truth of the cell.
+        seed: of the devices' noise.
+        base_dir: directory that a robot's file path is relative to.
+        directory: where the devices meet; a temporary one if None.
+        begun: world time at the start, s.
+
+    Raises:
+        DeviceError: a device did not start.
+    """
+    with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
+        where = directory or Path(made)
+        with SimulatedCell.start(
+            secret.world, secret.config, where, seed, base_dir=base_dir, begun=begun
+        ) as cell:
+            yield cell

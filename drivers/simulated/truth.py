@@ -1,13 +1,19 @@
-"""The hidden parameters of a simulated world, named like the effects that they cause."""
+"""The hidden parameters of a simulated world, named like the effects that they cause; their laws.
 
-from collections.abc import Iterator
+What a state brings about beside its load (sides, temperatures, time, the joint angles), and how a
+force sensor misreads what acts.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
+import pinocchio as pin
 
-from drivers.simulated.elastic_tree import long_links
+from hilcal.errors import InputError
+from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
-from hilcal.types import Floats
+from hilcal.types import Floats, Ints
 
 _AXES = ("x", "y", "z")
 _TURNS = ("rx", "ry", "rz")
@@ -27,6 +33,16 @@ _LABELS: dict[str, tuple[str, ...]] = {
     "sensor_misalignment": _TURNS,
     "tracker_scale": ("scale",),
 }
+
+
+def long_links(arm: Arm) -> Ints:
+    """Return the numbers k of the (at most two) links that are longer than a third of the longest.
+
+    Only links between two joints count: upper arm and forearm of a usual arm.
+    """
+    lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
+    longest = np.argsort(-lengths, kind="stable")[:2]
+    return np.sort(longest[lengths[longest] > lengths.max() / 3.0]) + 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,33 +110,15 @@ class Truth:
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
         """Return the truth of an arm that is perfect and rigid."""
         n = arm.n
-        return Truth(
-            joint_compliance=np.zeros(n),
-            joint_stiffening=np.zeros(n),
-            joint_tilt_compliance=np.zeros(n),
-            base_compliance=np.zeros(3),
-            link_compliance=np.zeros((len(long_links(arm)), 2)),
-            hysteresis=np.zeros(n),
-            encoder_offset=np.zeros(n),
-            joint_coupling=np.zeros((n, n)),
-            transmission_error=np.zeros((n, harmonics, 2)),
-            link_geometry=np.zeros((n + 1, 6)),
-            load_point=np.zeros(3),
-            target_offset=np.zeros(3),
-            base_frame=np.zeros(6),
-            tracker_drift=np.zeros(6),
-            tool_compliance=np.zeros(2),
-            periodic_joint_compliance=np.zeros((n, 2)),
-            backlash=np.zeros(n),
-            creep=np.zeros(1),
-            thermal_growth=np.zeros(1),
-            thermal_joint_drift=np.zeros(n),
-            link_mass=np.zeros((n, 3)),
-            wrench_bias=np.zeros(6),
-            wrench_gain=np.zeros(6),
-            sensor_misalignment=np.zeros(3),
-            tracker_scale=np.zeros(1),
-        )
+        shapes = {name: (len(labels),) for name, labels in _LABELS.items()} | {
+            "link_compliance": (len(long_links(arm)), 2),
+            "joint_coupling": (n, n),
+            "transmission_error": (n, harmonics, 2),
+            "link_geometry": (n + 1, 6),
+            "periodic_joint_compliance": (n, 2),
+            "link_mass": (n, 3),
+        }  # all others have one parameter per joint
+        return Truth(**{f.name: np.zeros(shapes.get(f.name, (n,))) for f in fields(Truth)})
 
     def with_effect(self, effect: str, value: Floats) -> "Truth":
         """Return the same truth with one effect's parameters replaced."""
@@ -138,28 +136,195 @@ class Truth:
         return out
 
 
-def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> Iterator[str]:
-    """Yield the labels of one effect's parameters in the order of their array."""
-    if effect == "transmission_error":
-        for j in range(shape[0]):
-            for k in range(shape[1]):
-                yield from (f"j{j + 1}.cos{k + 1}", f"j{j + 1}.sin{k + 1}")
-    elif effect == "joint_coupling":
-        for j in range(shape[0]):
-            yield from (f"j{j + 1}.q{i + 1}" for i in range(shape[1]))
-    elif effect == "link_geometry":
-        for k in range(shape[0]):
-            yield from (f"link{k}.{part}" for part in _TWIST)
-    elif effect == "link_compliance":
-        for k in long_links(arm):
-            yield from (f"link{k}.bend", f"link{k}.twist")
-    elif effect == "link_mass":
-        for k in range(shape[0]):
-            yield from (f"link{k + 1}.{axis}" for axis in _AXES)
-    elif effect == "periodic_joint_compliance":
-        for j in range(shape[0]):
-            yield from (f"j{j + 1}.cos2", f"j{j + 1}.sin2")
-    elif effect in _LABELS:
-        yield from _LABELS[effect]
-    else:
-        yield from (f"j{j + 1}" for j in range(shape[0]))
+def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
+    """Return the labels of one effect's parameters in the order of their array."""
+    if effect in _LABELS:
+        return list(_LABELS[effect])
+    joints, slots = [f"j{j + 1}" for j in range(arm.n)], [f"link{k}" for k in range(arm.n + 1)]
+    harmonics = range(1, shape[1] + 1 if effect == "transmission_error" else 1)
+    parts: dict[str, tuple[list[str], Sequence[str]]] = {
+        "transmission_error": (joints, [f"{x}{k}" for k in harmonics for x in ("cos", "sin")]),
+        "joint_coupling": (joints, [f"q{i + 1}" for i in range(arm.n)]),
+        "link_geometry": (slots, _TWIST),
+        "link_compliance": ([slots[k] for k in long_links(arm)], ("bend", "twist")),
+        "link_mass": (slots[1:], _AXES),
+        "periodic_joint_compliance": (joints, ("cos2", "sin2")),
+    }
+    if effect not in parts:
+        return joints
+    return [f"{name}.{part}" for name in parts[effect][0] for part in parts[effect][1]]
+
+
+LINK_REFERENCE = 20.0
+"""Temperature at which links have their nominal length, °C (ISO 1)."""
+
+_UNKNOWN_TORQUE = 150.0  # N·m, rated torque of a drive whose limit is not known
+_CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
+
+
+AIR = 22.0
+"""Air temperature of the cell behind the wires, and of a rehearsal's start, °C."""
+
+_WARM_START = 4.0  # °C above the air at the world's start
+_WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end
+_WARM_TIME = 2400.0  # s, time constant of the warm-up
+
+
+def warm_up(time: Floats, n: int = 6) -> Floats:
+    """Return the (N, n) temperatures of the joints in the cell behind the wires, °C.
+
+    T = air + rise + (start - rise) exp(-t / 2400 s), with `time` (N,) since its start, s.
+    """
+    left = np.exp(-np.asarray(time) / _WARM_TIME)[:, None]
+    rise = np.resize(_WARM_RISE, n)
+    return np.asarray(AIR + rise + (_WARM_START - rise) * left)
+
+
+def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> Floats:
+    """Return the displacements (N, n) of the drives that do not depend on the load, rad.
+
+    dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
+           + sum_k a_jk cos k q_j + b_jk sin k q_j
+
+    Args:
+        hidden: the parameters.
+        arm: the arm.
+        states: N states.
+        reference: temperature at which joints do not drift, °C.
+
+    Raises:
+        InputError: hysteresis without approach sides, or drifting joints without their
+            temperatures.
+    """
+    error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
+    if np.any(hidden.hysteresis):
+        if states.approach is None:
+            raise InputError(
+                "approach: hysteresis is hidden but the states name no side from which "
+                "the joints arrived; valid: -1 or +1 per state and joint"
+            )
+        error += hidden.hysteresis * states.approach
+    if np.any(hidden.thermal_joint_drift):
+        error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
+    order = np.arange(1, hidden.transmission_error.shape[1] + 1)
+    phase = arm.drive_angles(states.q)[:, :, None] * order
+    error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
+    error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
+    return error
+
+
+def joint_temperature(states: States) -> Floats:
+    """Return the (N, n) temperatures of the joints, °C.
+
+    Raises:
+        InputError: the states do not carry them.
+    """
+    if states.joint_temperature is None:
+        raise InputError(
+            "joint_temperature: thermal_joint_drift is hidden but the states carry no "
+            "temperatures of the joints; valid: °C per state and joint"
+        )
+    return states.joint_temperature
+
+
+def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None:
+    """Return the (N, n) compliances of the drives beyond c_j, rad/(N·m); None: none anywhere.
+
+    a_j cos 2 q_j + b_j sin 2 q_j + k c_j log10(1 + t / 1 s), q the commanded angle
+
+    Raises:
+        InputError: creep without the time under load.
+    """
+    extra: Floats | None = None
+    if np.any(hidden.periodic_joint_compliance):
+        cos, sin = hidden.periodic_joint_compliance.T
+        angle = arm.drive_angles(states.q)
+        extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
+    if np.any(hidden.creep):
+        if states.load_time is None:
+            raise InputError(
+                "load_time: creep is hidden but the states do not tell how long the load "
+                "has hung; valid: seconds since its last change"
+            )
+        crept = hidden.creep * np.log10(1.0 + states.load_time)
+        more = crept[:, None] * hidden.joint_compliance
+        extra = more if extra is None else extra + more
+    return extra
+
+
+def crossing_torque(arm: Arm) -> Floats:
+    """Return the (n,) torques tau_0 in b tanh(tau / tau_0), N·m: 1 % of the rated torque."""
+    limit = np.asarray(arm.torque_max, dtype=float)
+    rated = np.where(np.isfinite(limit) & (limit > 0.0), limit, _UNKNOWN_TORQUE)
+    return np.asarray(_CROSSING * rated)
+
+
+def link_growth(hidden: Truth, states: States) -> Floats | None:
+    """Return the (N,) factor on all lengths of the links, 1 + alpha (T - 20 °C); None: 1.
+
+    T is that of the air, or the mean of the joints' where the states do not carry it.
+
+    Raises:
+        InputError: growing links without any temperature.
+    """
+    if not np.any(hidden.thermal_growth):
+        return None
+    temperature = states.air_temperature
+    if temperature is None and states.joint_temperature is not None:
+        temperature = states.joint_temperature.mean(axis=1)
+    if temperature is None:
+        raise InputError(
+            "air_temperature: thermal_growth is hidden but the states carry no temperature; "
+            "valid: °C of the air, or of the joints"
+        )
+    return np.asarray(1.0 + hidden.thermal_growth * (temperature - LINK_REFERENCE))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Misreading:
+    """acting = G (said - b), both at the load point and in the axes of the body that carries it.
+
+    The sensor reads b + diag(1 + g) exp([delta])ᵀ acting, so G = exp([delta]) diag(1 / (1 + g)),
+    the same rotation for force and moment.
+
+    Attributes:
+        gain: (6, 6) G.
+        bias: (6,) b, N and N·m.
+    """
+
+    gain: Floats
+    bias: Floats
+
+    @classmethod
+    def of(cls, truth: Truth) -> "Misreading | None":
+        """Return that of a truth, flange axes; None where the sensor is perfect.
+
+        Raises:
+            InputError: a gain of nothing or less.
+        """
+        parts = (truth.wrench_bias, truth.wrench_gain, truth.sensor_misalignment)
+        if not any(np.any(part) for part in parts):
+            return None
+        if np.any(truth.wrench_gain <= -1.0):
+            raise InputError(
+                f"wrench_gain {truth.wrench_gain.tolist()}: a channel would read nothing, or "
+                "backwards; valid: errors over -1"
+            )
+        turn = np.asarray(pin.exp3(truth.sensor_misalignment))
+        return cls(_both(turn) / (1.0 + truth.wrench_gain), truth.wrench_bias)
+
+    def in_axes(self, axes: Floats) -> "Misreading":
+        """Return the same in other axes; `axes` (3, 3) maps present components into them."""
+        turn = _both(axes)
+        return Misreading(turn @ self.gain @ turn.T, turn @ self.bias)
+
+    def acting(self, said: Floats) -> Floats:
+        """Return the (N, 6) wrenches that act where the sensor reads `said`, N and N·m."""
+        return np.asarray((said - self.bias) @ self.gain.T)
+
+
+def _both(turn: Floats) -> Floats:
+    """Return the (6, 6) rotation of force and moment."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = turn
+    return out

@@ -4,23 +4,281 @@
         [--version 5.11.6.1010327] [--seed N]
 
 Ports as on a real one: RTDE 30004, dashboard 29999 (none from PolyScope X, version 10, on),
-script 30003. Admin operations: see `ur.operations`.
+script 30003.
+
+Admin operations: `state`, `protective_stop`, `emergency_stop`, `release_emergency_stop`,
+`local_mode`, `remote_mode`, `kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`,
+`rtde_half_frame`, `dashboard_mute {on}`, `dashboard_drop`, `refuse {on}` new RTDE clients,
+`refuse_motion {on}`, `freeze {on}` the joint angles that are told while all else goes on, `jog {q}`
+as somebody who moves the arm by hand; `set {version, slider, speed_scaling, unlock_s}`, `die`,
+`log`
 """
 
 import argparse
 import asyncio
+import inspect
+import math
+import os
 import sys
-from pathlib import Path
+import time
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard, N
-from drivers.simulated.parent import end_with_parent
-from drivers.simulated.ur.operations import AdminOperations
-from drivers.simulated.ur.server import Server, read_version, switched_on
+from drivers.simulated.ur.controller import Controller, Dashboard
+from drivers.simulated.ur.programs import ScriptStream
+from drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
+from drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
+from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
+from hilcal.types import Floats
+
+DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004
+HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
+"""Where a controller that is switched on for the first time finds its arm, rad."""
+
+_MOVING, _STILL = 0.004, 0.01  # s of real time between steps
+_POLYSCOPE_X = 10  # from this version on there is no dashboard
+_LINE = 1 << 16  # bytes of the longest line
+Version = tuple[int, int, int, int]
+
+
+def switched_on(
+    arm: Arm, board: Blackboard, version: Version, rng: np.random.Generator
+) -> ArmState:
+    """Return the state of a controller right after power-up; the arm stands where it stood."""
+    kept = board.read("arm")
+    clock = WorldClock(board)
+    known = bool(kept["alive"])
+    arrivals = int(kept["arrivals"]) + bool(kept["moving"])
+    q, side = (kept["q"], kept["side"]) if known else (HOME, rng.choice([-1.0, 1.0], arm.n))
+    trajectory = Trajectory(q, side, arrivals, clock.now)
+    state = ArmState(clock, Kinematics(arm), trajectory, version)
+    if known:
+        state.payload, state.payload_com = float(kept["payload"]), kept["payload_com"].copy()
+    state.note("switched on")
+    return state
+
+
+class Server:
+    """Everything that answers on one address."""
+
+    def __init__(
+        self, state: ArmState, board: Blackboard, host: str, rng: np.random.Generator
+    ) -> None:
+        """Put the parts together; nothing is opened."""
+        self.arm = state
+        self.faults = Faults()
+        self.controller = Controller(state, board)
+        sensors = Sensors(state, board, rng)
+        self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
+        self.controller.hears = self.rtde.hears
+        model = state.kinematics.arm.name
+        self.dashboard = Dashboard(self.controller, self.faults, model)
+        self._host = host
+        self._listening: asyncio.Server | None = None
+        self._others: list[asyncio.Server] = []
+
+    async def open(self) -> None:
+        """Listen.
+
+        Raises:
+            DeviceError: an address is in use, or is none of this computer's.
+        """
+        self._others = [await self._listen(self._run_script, SCRIPT)]
+        if self.arm.version[0] < _POLYSCOPE_X:
+            self._others.append(await self._listen(self.dashboard.run, DASHBOARD))
+        await self.accept(True)
+
+    async def accept(self, on: bool) -> None:
+        """Take new RTDE clients, or refuse them; those that are connected stay."""
+        if on and self._listening is None:
+            self._listening = await self._listen(self._run_rtde, RTDE)
+        elif not on and self._listening is not None:
+            closing, self._listening = self._listening, None
+            loop = asyncio.get_running_loop()
+            for door in closing.sockets:
+                loop.remove_reader(door)
+            # Who has just been let in gets a link first: asyncio forgets him with the server.
+            await asyncio.sleep(0)
+            closing.close()
+
+    async def run(self) -> None:
+        """Keep the controller going, for ever."""
+        motion = self.arm.trajectory
+        while True:
+            self.controller.step()
+            now = time.monotonic()
+            self.rtde.send(now)
+            wait = _STILL
+            if motion.moving:
+                wait = min(_MOVING, self.arm.clock.real(motion.left))
+            wait = min(wait, self.rtde.due(now) - time.monotonic())
+            await asyncio.sleep(max(0.0, wait))
+
+    async def _listen(self, client: Any, port: int) -> asyncio.Server:
+        try:
+            return await asyncio.start_server(client, self._host, port, limit=_LINE)
+        except OSError as error:
+            raise DeviceError(
+                f"simulated arm: {self._host}:{port} is in use or cannot be had "
+                f"({error.strerror}); each simulated arm needs an address 127.x.y.z of its own"
+            ) from None
+
+    async def _run_rtde(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await RtdeLink(self.rtde, reader, writer).run()
+
+    async def _run_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        stream = ScriptStream()
+        try:
+            while data := await reader.read(_LINE):
+                for text in stream.feed(data):
+                    self.controller.run(text)
+                self.controller.step()
+        except OSError:
+            pass
+        finally:
+            writer.close()
+
+
+def read_version(text: str) -> Version:
+    """Return the four numbers of a PolyScope version such as 5.11.6.1010327.
+
+    Raises:
+        InputError: it is something else.
+    """
+    parts = text.split(".")
+    if len(parts) == 4 and all(part.isascii() and part.isdigit() for part in parts):
+        a, b, c, d = map(int, parts)
+        return a, b, c, d
+    raise InputError(f"version {text!r}; valid: four numbers, e.g. 5.11.6.1010327")
+
+
+class AdminOperations:
+    """What may be asked and switched; answers with the state, or the log."""
+
+    def __init__(self, server: Server, loop: asyncio.AbstractEventLoop) -> None:
+        """Serve from other threads than that of the loop."""
+        self._server, self._loop = server, loop
+        arm, controller, links = server.arm, server.controller, server.rtde.links
+
+        def switch(name: str) -> Callable[..., object]:
+            return lambda on=True: setattr(server.faults, name, bool(on))
+
+        def drop() -> None:
+            for link in list(links):
+                link.writer.transport.abort()
+
+        def half_frame() -> None:
+            for link in list(links):
+                link.half()
+
+        def freeze(on: bool = True) -> None:
+            arm.frozen_q = arm.trajectory.q.copy() if on else None
+
+        self._functions: dict[str, Callable[..., object]] = {
+            "state": lambda: None,
+            "protective_stop": lambda: controller.protective_stop("admin"),
+            "emergency_stop": controller.emergency_stop,
+            "release_emergency_stop": controller.release_emergency_stop,
+            "local_mode": lambda: controller.set_remote(False),
+            "remote_mode": lambda: controller.set_remote(True),
+            "kill_script": lambda: controller.stop_program("killed"),
+            "rtde_drop": drop,
+            "rtde_stall": switch("rtde_stall"),
+            "rtde_mute": switch("rtde_mute"),
+            "rtde_half_frame": half_frame,
+            "dashboard_mute": switch("dashboard_mute"),
+            "dashboard_drop": server.dashboard.drop,
+            "refuse": lambda on=True: server.accept(not on),
+            "refuse_motion": lambda on=True: setattr(arm, "refuses_motion", bool(on)),
+            "freeze": freeze,
+            "jog": lambda q: arm.trajectory.place(_joints(q)),
+            "set": self._set,
+            "log": lambda: None,
+        }
+
+    def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
+        """Carry out an operation in the controller's own thread."""
+        if op == "die":
+            os._exit(1)
+        work = asyncio.run_coroutine_threadsafe(self._do(op, arguments), self._loop)
+        return work.result(5.0)
+
+    async def _do(self, op: str, arguments: dict[str, Any]) -> Any:
+        server, arm = self._server, self._server.arm
+        if op not in self._functions:
+            raise InputError(f"unknown op {op!r}; valid: {', '.join((*self._functions, 'die'))}")
+        if op not in ("state", "log", "set", "release_emergency_stop", "remote_mode"):
+            if arguments.get("on", True):
+                arm.fault_ns = time.monotonic_ns()
+            arm.note(f"admin: {op} {arguments or ''}".strip())
+        done = self._functions[op](**arguments)
+        if inspect.isawaitable(done):
+            await done
+        server.controller.step()
+        return list(arm.log) if op == "log" else self._state()
+
+    def _set(self, **settings: Any) -> None:
+        arm = self._server.arm
+        for key, value in settings.items():
+            match key:
+                case "version":
+                    arm.version = read_version(str(value))
+                case "slider":
+                    arm.slider = _share(key, value)
+                case "speed_scaling":
+                    arm.scaling = _share(key, value)
+                case "unlock_s":
+                    self._server.controller.unlock_after = float(value)
+                case _:
+                    raise InputError(
+                        f"no setting {key!r}; valid: version, slider, speed_scaling, unlock_s"
+                    )
+
+    def _state(self) -> dict[str, Any]:
+        server, arm = self._server, self._server.arm
+        motion = arm.trajectory
+        return {
+            "q": motion.q.tolist(),
+            "qd": motion.qd.tolist(),
+            "side": motion.side.tolist(),
+            "moving": motion.moving,
+            "arrivals": motion.arrivals,
+            "runtime": int(arm.runtime),
+            "safety": int(arm.safety_bits),
+            "robot_mode": int(arm.robot_mode),
+            "remote": arm.remote,
+            "payload": arm.payload,
+            "payload_com": arm.payload_com.tolist(),
+            "tcp": arm.tcp.tolist(),
+            "scripts": server.controller.scripts,
+            "script_running": server.controller.program_runs,
+            "watchdog_hz": server.controller.watchdog,
+            "rtde_clients": len(server.rtde.links),
+            "dashboard_clients": server.dashboard.clients,
+            "rest_ns": arm.clock.real_ns(motion.rest_time),
+            "fault_ns": arm.fault_ns,
+            "input_ns": arm.input_ns,
+            "now_ns": time.monotonic_ns(),
+        }
+
+
+def _joints(q: Any) -> Floats:
+    place = np.asarray(q, dtype=np.float64)
+    if place.shape != (6,) or not np.all(np.abs(place) <= 2.0 * np.pi):
+        raise InputError(f"q = {q!r}; valid: 6 numbers within a turn, rad")
+    return place
+
+
+def _share(key: str, value: Any) -> float:
+    if not isinstance(value, int | float) or not (math.isfinite(value) and 0 <= value <= 1):
+        raise InputError(f"{key} = {value!r}; valid: 0 to 1")
+    return float(value)
 
 
 async def serve(options: argparse.Namespace) -> None:
@@ -49,14 +307,12 @@ async def serve(options: argparse.Namespace) -> None:
 
 def main() -> None:
     """Read the command line and serve; exit code 3 and one line where that is impossible."""
-    parser = argparse.ArgumentParser(prog="ur_server", description=__doc__)
-    parser.add_argument("--directory", type=Path, required=True)
+    parser = admin.device_parser(__doc__)
     parser.add_argument("--host", required=True)
     parser.add_argument("--robot", required=True)
     parser.add_argument("--version", default="5.11.6.1010327")
-    parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    end_with_parent()
+    admin.end_with_parent()
     try:
         asyncio.run(serve(options))
     except HilcalError as error:

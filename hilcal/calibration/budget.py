@@ -17,9 +17,9 @@ import numpy as np
 
 from hilcal.calibration.scatter import ScatterSource, scatter_of
 from hilcal.errors import InputError
-from hilcal.identification.errors import noise_floor
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
+from hilcal.identification.residual import noise_floor
 from hilcal.robot.chain import evaluate
 
 COVERAGE = 2.0

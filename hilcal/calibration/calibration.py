@@ -37,8 +37,12 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
-from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames
-from hilcal.identification.whole_turns import whole_turns
+from hilcal.identification.robot_frames import (
+    RobotFrames,
+    one_of_each,
+    robot_frames,
+    whole_turns,
+)
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode

@@ -25,9 +25,8 @@ import numpy as np
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.poses import BAND, band
 from hilcal.calibration.tool import tool_of, tool_poses
-from hilcal.identification.errors import noise_floor
 from hilcal.identification.predictive import Predictive
-from hilcal.identification.residual import residual
+from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Bools, Floats

@@ -11,14 +11,15 @@ from typing import Annotated
 import numpy as np
 
 from drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.rehearsal import (
     INVENTED,
     NOTHING,
     RANDOM,
     Rehearsal,
+    case_of_plan,
     check_choice,
     invented_law,
+    read_plan,
 )
 from hilcal import numbers
 from hilcal.calibration.improvement import Improvement

@@ -50,7 +50,7 @@ from hilcal.identification.bootstrap import bootstrap as draw_again
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.other_arm import other_arm_of
+from hilcal.identification.misdescription import other_arm_of
 from hilcal.present.bootstrap import bootstrap_remarks, bootstrap_report
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
 from hilcal.present.progress import counting, working

@@ -51,9 +51,8 @@ from hilcal.errors import InputError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit
-from hilcal.identification.fit_document import prior_to_json
-from hilcal.identification.frames_document import fit_to_json
-from hilcal.identification.other_arm import other_arm_of
+from hilcal.identification.fit_document import frames_to_json, prior_to_json
+from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.weight import weight_note
 from hilcal.present.diagnosis import (
     addition_lines,
@@ -335,7 +334,7 @@ def refine(
             "rejected": list(found.rejected),
             "background": background_of(found.fit).to_json(),
             **({} if laws is None else laws_json(laws)),
-            "frames": fit_to_json(found.fit),
+            "frames": frames_to_json(found.fit),
             **prior_to_json(found.fit),
             "other_arm": None if other is None else other.to_json(),
             "diagnosis": to_json(last),

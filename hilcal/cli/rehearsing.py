@@ -12,8 +12,16 @@ from typing import Annotated
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import case_of_plan, read_plan, simulated_cell
-from drivers.simulated.rehearsal import NOTHING, RANDOM, Rehearsal, SimulationCase, as_told
+from drivers.simulated.rehearsal import (
+    NOTHING,
+    RANDOM,
+    Rehearsal,
+    SimulationCase,
+    as_told,
+    case_of_plan,
+    read_plan,
+    simulated_cell,
+)
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import (
     POSES,
@@ -32,7 +40,7 @@ from hilcal.config.write import to_toml
 from hilcal.design.checked_plan import refuse
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
-from hilcal.identification.full_covariance import campaign_readings
+from hilcal.identification.full_covariance import full_readings
 from hilcal.measuring.dry_run import dry_run
 from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.progress import Say, counting, working
@@ -140,7 +148,8 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
 
         def measured() -> Rehearsal:
             missing(campaign)
-            readings = campaign_readings(campaign, secret.cell, there.config)
+            stored = campaign.readings(), campaign.about(COVERS)
+            readings = full_readings(*stored, secret.cell, there.config)
             return _rehearsal(secret, there.config, readings)
 
         def further(more: Plan) -> Rehearsal:

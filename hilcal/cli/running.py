@@ -37,10 +37,9 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.connect import ConnectionResult, connect
+from hilcal.measuring.connect import ConnectionResult, Rig, connect
+from hilcal.measuring.devices import Clock
 from hilcal.measuring.progress import Watcher
-from hilcal.measuring.rig import Rig
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
@@ -115,7 +114,7 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
-                from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+                from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 
                 choice = config.simulation.hide or NOTHING
                 secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)

@@ -10,9 +10,7 @@ from hilcal.cell import Cell
 from hilcal.cli.options import Json, argument, check_new, option
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification import description_words, frames_document
-from hilcal.identification.gate import examine
-from hilcal.identification.other_arm import other_arm
+from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import Registration, register
 from hilcal.identification.table_preview import preview_table
 from hilcal.import_campaign import import_campaign
@@ -88,7 +86,7 @@ def import_(
     if other is not None:
         t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
     if wrong is not None:
-        said = description_words.words(wrong, cell, readings)
+        said = wrong.words(cell, readings)
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
         t.show(Words(f"{begin}: {said}.", indent=2))
     t.document(
@@ -103,11 +101,9 @@ def import_(
             "covariance": found.parts,
             "noise": None if noise is None else asdict(noise),
             "notes": list(notes),
-            "description": None
-            if wrong is None
-            else description_words.document(wrong, cell, readings),
+            "description": None if wrong is None else wrong.to_json(cell, readings),
             "other_arm": None if other is None else other.to_json(),
-            "frames": None if registered is None else frames_document.document(registered),
+            "frames": None if registered is None else registered.to_json(),
         }
     )
 

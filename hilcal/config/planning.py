@@ -91,11 +91,6 @@ class Planning(Section):
                 raise ValueError(f"work_min_m = {list(low)} is not below work_max_m = {list(high)}")
         if len({len(q) for q in self.work_q_rad}) > 1:
             raise ValueError("work_q_rad has joint vectors of different lengths")
-        if self.criterion == "I" and low is None and not self.work_q_rad:
-            raise ValueError(
-                'criterion = "I" needs work_q_rad, or work_min_m and work_max_m: where the '
-                "robot will work"
-            )
         return self
 
 

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.criteria import A, D, MeanVariance
@@ -11,6 +12,7 @@ from hilcal.design.criterion import Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.information import Problem
+from hilcal.design.mixed_design import mixed_design
 from hilcal.design.optimum import Design, best
 from hilcal.design.prediction_poses import PredictionPoses
 from hilcal.design.t_optimality import Separate, condensed
@@ -31,9 +33,10 @@ SAMPLE = 150
 class Objective:
     """A design problem with its criterion.
 
-    D, A and I are of all parameters, the potential terms with their priors among them; in A and I
-    these are nuisance parameters. E and K are of the model's parameters alone, as the
-    observability indices of the literature are, without those that have a prior.
+    D and A are of all parameters, the potential terms with their priors among them; in A these are
+    nuisance parameters. I is of predictions with all effects; see `mixed_design`. E and K are of
+    the model's parameters alone, as the observability indices of the literature are, without those
+    that have a prior.
 
     Attributes:
         criterion: φ.
@@ -55,11 +58,14 @@ def canonical(name: str) -> str:
     return "I" if name == "test" else name
 
 
-def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> Objective:
+def objective_of(
+    problem: Problem, config: CellConfig, name: str, work: PredictionPoses | None
+) -> Objective:
     """Return a design problem with a criterion.
 
     Args:
         problem: the design problem.
+        config: its loads and noise.
         name: one of `CRITERIA`, or "test", the former name of "I".
         work: the prediction poses, for "I".
 
@@ -77,7 +83,8 @@ def objective_of(problem: Problem, name: str, work: PredictionPoses | None) -> O
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
-        return replace(whole, criterion=MeanVariance(work.matrix(len(names))))
+        mixed = mixed_design(problem, config, work)
+        return Objective(MeanVariance(mixed.c), mixed.units, mixed.prior, mixed.names)
     if name == "separate":
         apart = discriminated_pairs(problem)
         units, pairs, prior = condensed(problem.units, apart.pairs, apart.prior)

@@ -2,7 +2,7 @@
 
 Potential terms make a plan good at more than its model, and so less good at the model alone. A
 compound criterion is the mean of both: of the logarithms of the two D-efficiencies, so that
-neither optimum is needed, or of the two inefficiencies in mean variance,
+neither optimum is needed, or of the two inefficiencies in the parameters' mean variance,
 
     φ = det(M)^(1/2P) · det(M_ss)^(1/2s)          1/φ = ½ q(M)/q* + ½ q(M_ss)/q_s*
 
@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.config import CellConfig
 from hilcal.design.approximate_design import relax
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.choice import LOOSE, SAMPLE, Objective, canonical, objective_of, only
@@ -22,9 +23,6 @@ from hilcal.design.criteria import Determinant, InverseVariance, MeanVariance
 from hilcal.design.information import Problem
 from hilcal.design.prediction_poses import PredictionPoses
 from hilcal.types import Floats, Ints
-
-BOTH = ("A", "I")
-"""Criteria of the model's parameters whose two optima have to be known; D's need not."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +57,7 @@ class CompoundVariance(InverseVariance):
     size: int
     a: float
     b: float
-    name: str = "I"
+    name: str = "A"
 
     def parts(self, size: int) -> tuple[Floats, ...]:
         """Return a C and b C_ss."""
@@ -68,18 +66,20 @@ class CompoundVariance(InverseVariance):
 
 def compound_objective(
     problem: Problem,
+    config: CellConfig,
     name: str,
     work: PredictionPoses | None,
     budget: float,
     rng: np.random.Generator,
 ) -> Objective:
-    """Return a design problem with a criterion; D, A and I are compound with potential terms.
+    """Return a design problem with a criterion; D and A are compound with potential terms.
 
     Args:
         problem: the design problem.
+        config: its loads and noise.
         name: as for `objective_of`.
         work: the prediction poses, for "I".
-        budget: readings, for which the two optima are found.
+        budget: readings, for which the two optima of A are found.
         rng: generator; they are found among some of the poses.
 
     Raises:
@@ -87,16 +87,12 @@ def compound_objective(
         InputError: from `objective_of`.
     """
     name = canonical(name)
-    asked, size = objective_of(problem, name, work), problem.model_size
-    if size == len(problem.terms):
+    asked, size = objective_of(problem, config, name, work), problem.model_size
+    if size == len(problem.terms) or name not in ("A", "D"):
         return asked
     if name == "D":
         return replace(asked, criterion=CompoundDeterminant(size))
-    if name not in BOTH:
-        return asked
     c = np.diag(np.where(np.arange(len(problem.terms)) < size, 1.0 / size, 0.0))
-    if isinstance(asked.criterion, MeanVariance):
-        c = asked.criterion.c
     whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))

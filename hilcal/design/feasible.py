@@ -6,9 +6,9 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import STATE, Feasibility, Margins
 from hilcal.measuring.route import beside
-from hilcal.measuring.sight import UNKNOWN
 from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
@@ -68,7 +68,7 @@ class Space(Feasibility):
     @property
     def remarks(self) -> tuple[str, ...]:
         """What is not checked, or is guessed, since it is not configured."""
-        return (*(() if self.sight is not None else (UNKNOWN,)), *super().remarks)
+        return (*(() if self.sight is not None else (TRACKER_UNKNOWN,)), *super().remarks)
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
         """Return by reason (N,) which states keep it; in the order of `REASONS`.

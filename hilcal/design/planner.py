@@ -155,7 +155,7 @@ def make(
     of, undetermined = without_undetermined(problem(model, config, drawn.q, drawn.allowed))
     work = prediction_poses(of.nominal, config, drawn.q, space.clear)
     budget = _budget(request, of)
-    asked = compound_objective(of, criterion, work, budget, rng)
+    asked = compound_objective(of, config, criterion, work, budget, rng)
     whole = request.readings is None
     costly: tuple[tuple[str, float], ...] = ()
     if whole:

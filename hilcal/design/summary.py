@@ -217,7 +217,7 @@ def summarise(
         parameters=_parameters(planned),
         position_std_m=_finite(knows.position),
         position=planned.work.what,
-        criteria=tuple(_criteria(planned, rng)) if compare else (),
+        criteria=tuple(_criteria(planned, config, rng)) if compare else (),
         curve=tuple(_curve(planned)) if curve else (),
         detectable=tuple(detectable_effects(planned, config)),
         longer=planned.ordered.longer,
@@ -267,6 +267,12 @@ def remarks(planned: Planned) -> tuple[str, ...]:
             f"as many readings, spread over as many poses and loads as tell most (--readings "
             f"{readings}), are up to {100 / planned.design.efficiency - 100:.0f} % more efficient",
         )
+    if planned.criterion == "I":
+        std = 1e6 / np.sqrt(planned.design.value)
+        omitted += (
+            f"with every effect of the catalogue as large as arms have it, the "
+            f"{planned.work.what.split(' ')[0]} is predicted to {std:.3g} um (rms)",
+        )
     without = tuple(u.remark for u in planned.undetermined)
     notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
     return tuple(dict.fromkeys(notes))
@@ -293,7 +299,9 @@ def _finite(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionResult]:
+def _criteria(
+    planned: Planned, config: CellConfig, rng: np.random.Generator
+) -> Iterator[CriterionResult]:
     """Yield the design of each criterion with as many readings."""
     of = planned.problem
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
@@ -301,7 +309,7 @@ def _criteria(planned: Planned, rng: np.random.Generator) -> Iterator[CriterionR
             yield _result(planned, name, planned.counts, planned.design.efficiency)
             continue
         try:
-            asked = compound_objective(of, name, planned.work, planned.budget, rng)
+            asked = compound_objective(of, config, name, planned.work, planned.budget, rng)
             if planned.asked_poses is not None:
                 design = choose_poses(asked, of, planned.usable, planned.asked_poses, rng, 1)
             else:

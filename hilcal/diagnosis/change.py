@@ -1,7 +1,7 @@
 """What has changed on an arm since an earlier campaign, and whether it is more than uncertainty.
 
 At later readings the earlier fit, with its posterior as prior and the tracker's place flat where it
-was set up anew, leaves r with rᵀ M r (see `identification.remeasured`). Every candidate (see
+was set up anew, leaves r with rᵀ M r (see `identification.later_readings`). Every candidate (see
 `change_candidates`) is scored by the evidence of its columns beside that, the formula of the
 diagnosis (`regression.evidence`). The scatter σ² is estimated from both: what the earlier fit
 states of it counts as ν_0 degrees of freedom beside those of r,
@@ -26,7 +26,7 @@ from hilcal.diagnosis.change_found import Change, Changes, Limit, Size
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.earlier import Earlier
-from hilcal.identification.remeasured import Remeasured, Setting, remeasure
+from hilcal.identification.later_readings import Remeasured, Setting, remeasure
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family
 from hilcal.regression.power import noncentrality_of_power
 from hilcal.regression.spectrum import visible

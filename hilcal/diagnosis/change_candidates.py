@@ -15,7 +15,7 @@ from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.changed import Changeable, Directions, Kind
 from hilcal.effects.protocol import Effect
-from hilcal.identification.remeasured import Moving
+from hilcal.identification.later_readings import Moving
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from hilcal.diagnosis.change_candidates import Candidate
 from hilcal.effects.changed import Changeable
 from hilcal.identification.earlier import Earlier
-from hilcal.identification.remeasured import Remeasured
+from hilcal.identification.later_readings import Remeasured
 
 UNEXPLAINED = 1e-3
 """Level at which what is left after all changes is called unexplained; a choice."""

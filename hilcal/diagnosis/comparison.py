@@ -7,11 +7,11 @@ from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.change_found import Changes
-from hilcal.identification.errors import error_block
 from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit
+from hilcal.identification.later_readings import Setting, beside_frames, frames_alone, remeasure
 from hilcal.identification.parameter_differences import Differences
-from hilcal.identification.remeasured import Setting, beside_frames, frames_alone, remeasure
+from hilcal.identification.residual import error_block
 from hilcal.identification.validation import Validation
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown

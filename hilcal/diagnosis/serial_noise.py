@@ -41,6 +41,7 @@ from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.wide_suspects import WideColumns
 from hilcal.model.observe import motion
+from hilcal.readings.covariance import instrument_root
 from hilcal.readings.reading_groups import Group, arrival_groups, deflection_groups, runs
 from hilcal.readings.serial_noise import Clock, SerialNoise
 from hilcal.regression.schur import inverse_root
@@ -435,7 +436,7 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     columns = whitened @ (jacobian.reshape(-1, len(live)) @ s.transform[live])
     y = inverse @ found.raw[place[loaded], :m].reshape(-1) + columns @ s.coordinates()
     each = whitened.reshape(len(y), len(rows), m)
-    factor = np.einsum("rni,nij->rnj", each, some.instrument_root(m))
+    factor = np.einsum("rni,nij->rnj", each, instrument_root(some, m))
     flat = factor.reshape(len(y), -1)
     ridge = s.equations.basis.prior_precision
     if len(y) < 2 * np.sum(ridge == 0):

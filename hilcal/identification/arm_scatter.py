@@ -24,6 +24,7 @@ from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.wide_effects import measured_columns
 from hilcal.model.model import Model
 from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
+from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
 from hilcal.regression.factored import Factored, Tall
@@ -65,13 +66,7 @@ def with_arm_scatter(cell: Cell, readings: Readings, scatter: ArmScatter) -> Rea
     """
     parts = zip(factors(cell, readings, scatter.kind), scatter.std, strict=True)
     f = np.concatenate([std * factor for factor, std in parts], axis=2)
-    return replace(
-        readings,
-        covariance=readings.covariance + f @ np.swapaxes(f, 1, 2),
-        common=None if readings.states.target is None else f,
-        stated=readings.covariance,
-        arm_scatter=scatter,
-    )
+    return replace(with_scatter(readings, f), stated=readings.covariance, arm_scatter=scatter)
 
 
 def with_prior_scatter(model: Model, readings: Readings) -> Readings:
@@ -111,9 +106,7 @@ class _Whitened:
 
     def component(self, factor: Floats) -> list[Floats]:
         """Whitened covariance of each bucket (G, S, S) by a factor F (N, m, k)."""
-        common = None if self.readings.common is None else factor
-        covariance = factor @ np.swapaxes(factor, 1, 2)
-        of = replace(self.readings, covariance=covariance, common=common, serial=None)
+        of = scatter_alone(self.readings, factor)
         parts = zip(self.w.buckets, covariance_blocks(of, self.w), strict=True)
         return [b.factor @ c @ np.swapaxes(b.factor, 1, 2) for b, c in parts]
 

@@ -10,7 +10,7 @@ from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.effects.spec import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
-from hilcal.identification.description_words import refuse_misdescribed
+from hilcal.identification.misdescription import refuse_misdescribed
 from hilcal.identification.registration import register
 from hilcal.identification.rigid_frames import TARGET_M, TELL
 from hilcal.identification.weight import loads_differ, weight_missing

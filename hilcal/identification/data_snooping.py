@@ -1,8 +1,8 @@
 """Which readings are gross errors: data snooping (Baarda) from a robust start.
 
-Least trimmed squares (`robust_start`) finds the readings, more than half, that agree best on the
-model. What a model without some effect leaves of them sizes smooth nuisance functions that stand in
-for it, as random effects. Then readings join or leave by their distance t² from the fit to the
+Least trimmed squares finds the readings, more than half, that agree best on the model. What a model
+without some effect leaves of them sizes smooth nuisance functions that stand in for it, as random
+effects. Then readings join or leave by their distance t² from the fit to the
 others, which is χ²_m of a good reading (`reading_model`), until none does.
 
 Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
@@ -15,13 +15,19 @@ from typing import Literal
 import numpy as np
 from scipy.stats import binom, chi2
 
+from hilcal.identification.common_cause import along_one_site, off_alike, site_columns
 from hilcal.identification.gauss_newton import Solution
-from hilcal.identification.off_alike import off_alike
-from hilcal.identification.outliers import MISFIT, bulk, limit
+from hilcal.identification.least_trimmed_squares import (
+    MISFIT,
+    MOST,
+    bulk,
+    limit,
+    nearest,
+    robust_start,
+    variance,
+)
 from hilcal.identification.priors import scales_of
 from hilcal.identification.reading_model import ReadingModel
-from hilcal.identification.robust_start import MOST, nearest, robust_start, variance
-from hilcal.identification.single_site import along_one_site, site_columns
 from hilcal.identification.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.reading_groups import deflection_groups
@@ -108,14 +114,14 @@ class Snooping:
         every = np.ones(len(self.readings), dtype=np.bool_)
         if self._all_noise():
             return Screened(every, every, 1.0, None)
-        at, used = robust_start(_linearised(self, self.y), rng)
+        at, used = robust_start(linearised(self, self.y), rng)
         of = at.linear
         d2, centre = of.near(of.fitted(used)[0])
         misfit = variance(of, d2, centre)
         of = at.with_nuisance(misfit)
         for _ in range(ROUNDS):
             t2, centre = _tested(of, used)
-            now = nearest(of, t2, centre)
+            now, _ = nearest(of, t2, centre)
             if np.array_equal(now, used):
                 break
             used = now
@@ -124,14 +130,14 @@ class Snooping:
 
     def _all_noise(self) -> bool:
         """Whether smooth functions beside the model leave noise of each reading: none is off."""
-        at = _linearised(self, self.solution.y)
+        at = linearised(self, self.solution.y)
         of = at.with_nuisance(float(np.mean(at.linear.residuals(at.linear.tested) ** 2)))
         t2 = of.distances(of.tested)[of.tested]
         return bool(t2.max() <= limit(of.m, len(t2)))
 
     def again(self, before: Screened) -> Screened:
         """Test them from the readings that agreed before, whose solution this is."""
-        return self._screened(_linearised(self, self.y), before.agree, before.misfit)
+        return self._screened(linearised(self, self.y), before.agree, before.misfit)
 
     def _screened(self, at: "_Linearised", used: Bools, misfit: float) -> Screened:
         every, kept = np.ones_like(used), np.zeros_like(used)
@@ -232,7 +238,7 @@ class _Linearised:
         """Return it after a step δ (K,)."""
         y = self.y.copy()
         y[self.live] += self.scale * delta
-        return _linearised(self.of, y)
+        return linearised(self.of, y)
 
     @cached_property
     def sites(self) -> Floats:
@@ -256,7 +262,8 @@ class _Linearised:
         return self.linear.with_columns(columns if kept.all() else columns[:, :, kept])
 
 
-def _linearised(of: Snooping, y: Floats) -> _Linearised:
+def linearised(of: Snooping, y: Floats) -> _Linearised:
+    """Return the linear model of all readings at the coordinates y (P,)."""
     model, readings, s = of.model, of.readings, of.solution
     theta = s.space.theta(y)
     prediction = model.predict(readings.states, theta)

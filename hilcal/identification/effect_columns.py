@@ -118,7 +118,7 @@ def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[Effe
         jacobian = fit.model.jacobian_of(
             narrow, solution.prediction, solution.theta, w.m, scale=scale, drives=drives
         )
-        white_drives = w.whitened(drives) if len(narrow) < len(group) else drives
+        white_drives = w.whiten_readings(drives) if len(narrow) < len(group) else drives
         parts, start = tuple(_groups(group, numbers, WHITENED)), 0
         for part in parts:
             sizes = [len(e.magnitudes) if e.name not in wide else 0 for e in part]
@@ -127,7 +127,7 @@ def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[Effe
             start += ends[-1]
             if len(parts) > 1:  # what is kept of a part does not keep the others
                 own = own.copy()
-            white = w.whitened(own)
+            white = w.whiten_readings(own)
             out = []
             for e, within in zip(part, map(slice, ends[:-1], ends[1:]), strict=True):
                 if e.name in wide:

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.predictive import Predictive
+from hilcal.identification.residual import ErrorBlock
+from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import Validation
-from hilcal.identification.whole_turns import whole_turns
 from hilcal.readings.ranges import ranges_of, turning_variables, variables
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, inverse_root
@@ -146,11 +146,5 @@ def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:
     """Errors of some measurements, each whitened by itself."""
     if not mine.any():
         return None
-    distance = np.linalg.norm(raw[mine, :3], axis=1)
     white = np.einsum("dij,dj->di", inverse_root(w.covariance[mine]), raw[mine])
-    return ErrorBlock(
-        rms_m=float(np.sqrt(np.mean(distance**2))),
-        mean_m=float(distance.mean()),
-        max_m=float(distance.max()),
-        rms_sigma=float(np.sqrt(np.mean(white**2))),
-    )
+    return ErrorBlock.of(raw[mine], white, white.size)

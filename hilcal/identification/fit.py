@@ -10,15 +10,13 @@ from hilcal import limits
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.data_snooping import Disagreement, Snooping
 from hilcal.identification.drift import Conflict, chosen_drift, conflicts
-from hilcal.identification.errors import ErrorBlock, error_block
-from hilcal.identification.estimates import Estimates
+from hilcal.identification.estimates import Estimates, summary
 from hilcal.identification.folds import distinct_poses, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
 from hilcal.identification.holdout import leave_out
-from hilcal.identification.outliers import limit
-from hilcal.identification.residual import residual
+from hilcal.identification.least_trimmed_squares import limit
+from hilcal.identification.residual import ErrorBlock, error_block, residual
 from hilcal.identification.robot_frames import RobotFrames, robot_frames
-from hilcal.identification.summary import summary
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
 from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model

@@ -6,12 +6,10 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identification.background import background_of
-from hilcal.identification.before import error_before
-from hilcal.identification.disagreement_words import disagreement_words
 from hilcal.identification.fit import Fit
-from hilcal.identification.frames_document import fit_to_json
-from hilcal.identification.full_prediction import full_prediction
-from hilcal.identification.gross_errors import gross_errors
+from hilcal.identification.full_prediction import error_before, full_prediction
+from hilcal.identification.gross_errors import disagreement_words, gross_errors
+from hilcal.identification.registration import register
 from hilcal.identification.weight import weight_note
 
 
@@ -53,10 +51,16 @@ def to_json(fit: Fit) -> dict[str, object]:
         "arm_scatter": None if scatter is None else scatter.to_json(),
         "serial_noise": None if serial is None else serial.to_json(),
         "registration": fit.frames.base.tolist(),
-        "frames": fit_to_json(fit),
+        "frames": frames_to_json(fit),
         "notes": list(notes(fit)),
         **prior_to_json(fit),
     }
+
+
+def frames_to_json(fit: Fit) -> dict[str, object]:
+    """Frames as fitted; residual and undetermined directions of the nominal arm's registration."""
+    found, registered = fit.frames, register(fit.model.cell, fit.readings)
+    return {**registered.to_json(found.base, found.targets), "base_is": found.base_is}
 
 
 def prior_to_json(fit: Fit) -> dict[str, object]:

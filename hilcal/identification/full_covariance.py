@@ -10,17 +10,15 @@ from hilcal.config import CellConfig, Tracker
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.registration import register
 from hilcal.readings.covariance import (
-    COVERS,
     INSTRUMENT,
     WHOLE,
-    scatter_factor,
+    arrival_factors,
     tracker_covariance,
     tracker_noise,
+    with_scatter,
 )
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import inverse_root
-from hilcal.robot.chain import drive_jacobian, evaluate
-from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.uncertainty import rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -36,21 +34,12 @@ CovarianceParts = Literal[
 """
 
 
-def campaign_readings(campaign: CampaignFile, cell: Cell, config: CellConfig) -> Readings:
-    """Return all readings of a campaign with their full covariance, see `readings.covariance`.
-
-    The arm's repeatability is added where the stored covariances cover the instrument alone.
-
-    Raises:
-        InputError: there are no readings yet, or they are damaged.
-    """
-    return full_readings(campaign.readings(), campaign.about(COVERS), cell, config)
-
-
 def full_readings(
     readings: Readings, covers: str | None, cell: Cell, config: CellConfig
 ) -> Readings:
-    """Return readings with their full covariance.
+    """Return readings with their full covariance, see `readings.covariance`.
+
+    The arm's repeatability is added where the covariances cover the instrument alone.
 
     Args:
         readings: with the covariance of a file or a table.
@@ -111,13 +100,7 @@ def with_joint_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Rea
         joint_std: (n,) standard deviations from one arrival to the next, rad.
     """
     factor = _scatter(cell, readings, joint_std)
-    if factor is None:
-        return readings
-    return replace(
-        readings,
-        covariance=readings.covariance + factor @ np.swapaxes(factor, 1, 2),
-        common=None if readings.states.target is None else factor,
-    )
+    return readings if factor is None else with_scatter(readings, factor)
 
 
 def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Readings:
@@ -159,7 +142,5 @@ def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
         readings: N readings.
         joint_std: (n,) standard deviations, rad.
     """
-    chain = evaluate(cell.arm, readings.states.q)
-    at = cell.target_of(readings.states.target)
-    jac = drive_jacobian(cell.arm, chain, chain.point(at[..., :3, 3]))
-    return scatter_factor(jac, joint_std, cell.registration[:3, :3], readings.m)
+    offset = cell.target_of(readings.states.target)[..., :3, 3]
+    return arrival_factors(cell.arm, readings, offset, cell.registration[:3, :3], joint_std)

@@ -1,10 +1,14 @@
-"""Prediction of all readings of a fit, those set aside as gross errors included."""
+"""Prediction of all readings of a fit, those set aside included; and the error before any fit."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
-from hilcal.identification.errors import noise_floor
+import numpy as np
+
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.identification.fit import Fit, mahalanobis2
-from hilcal.identification.residual import residual
+from hilcal.identification.gauss_newton import solve
+from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
@@ -68,3 +72,21 @@ def full_prediction(fit: Fit) -> FullPrediction:
     prediction = fit.model.predict(fit.readings.states, fit.theta)
     raw = residual(fit.readings, prediction, w)
     return FullPrediction(fit.readings, w, prediction, raw, fit.model, fit.theta)
+
+
+@lru_cache(maxsize=1)
+def error_before(fit: Fit) -> ErrorBlock:
+    """Return the error of the rigid nominal arm at the readings of a fit, m.
+
+    Of deflections it is the deflection itself, which a rigid arm does not have. Of absolute
+    readings it is what remains where the unknown frames (registration, target) are fitted to the
+    nominal arm alone: those of a fitted model make up for its other parameters, and are wrong for
+    the nominal arm by as much.
+    """
+    used, w = fit.readings[~fit.outlier], fit.whitening
+    frames = tuple(x for x in fit.model.effects if x.role in FRAME_ROLES)
+    rigid = Model(fit.model.cell, frames if fit.mode == "absolute" else (), fit.model.catalogue)
+    theta = np.zeros(0)
+    if rigid.effects:
+        theta = solve(rigid, used, whitening(used, fit.mode, fit.scaling), None, None).theta
+    return error_block(residual(used, rigid.predict(used.states, theta), w), w)

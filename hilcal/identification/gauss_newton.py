@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.identification.coordinates import Coordinates, coordinates_of
-from hilcal.identification.minimise import Point, Problem, linear_problem, minimise
+from hilcal.identification.gauss_newton_steps import Point, Problem, linear_problem, minimum
 from hilcal.identification.priors import prior_of
 from hilcal.identification.regularisation import LinearProblem, spent_parameters
 from hilcal.identification.residual import residual
@@ -153,7 +153,7 @@ def solve(
         coordinates = coordinates.felt(a)
     problem = _Problem(model, coordinates, w.scaling != "none", readings, w)
     y = None if start is None else coordinates.of_theta(start)
-    found = minimise(problem, y, prior)
+    found = minimum(problem, y, prior)
     point, by = found.point, found.by
     live = np.flatnonzero(by.prior > 0)
     columns = problem.columns(point, live) if found.rows is None else found.rows

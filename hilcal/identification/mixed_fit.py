@@ -21,6 +21,7 @@ from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import Variances, estimate_variances
 from hilcal.model.model import Model
+from hilcal.readings.covariance import scatter_alone
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Whitening, covariance_blocks, whitening
 from hilcal.types import Floats
@@ -91,7 +92,7 @@ class MixedFit:
 
     def std(self, name: str) -> float:
         """Return the estimated standard deviation of a family or of a component of the noise."""
-        return float(np.exp(self.variances.log_std[self.problem.names.index(name)]))
+        return self.variances.std(name)
 
     def prior_std(self) -> Floats:
         """(P,) standard deviations of the parameters; infinite for frames."""
@@ -304,9 +305,7 @@ def _noise(
     if readings.scatter_stated:
         whole = np.concatenate([s.reshape(-1) for s in seen]).astype(np.float64)
         return rows, [Noise(INSTRUMENT, whole, prior)]
-    f = _scatter_factors(model, readings)
-    common = None if readings.states.target is None else f
-    of = replace(readings, covariance=f @ np.swapaxes(f, 1, 2), common=common, serial=None)
+    of = scatter_alone(readings, _scatter_factors(model, readings))
     turned, instrument, scatter, start = np.empty_like(rows), [], [], 0
     for b, c, s in zip(w.buckets, covariance_blocks(of, w), seen, strict=True):
         u, variance = independent_rows(b.factor @ c @ np.swapaxes(b.factor, 1, 2), s)
@@ -356,9 +355,8 @@ def _noise_of(
 
 def scatter_part(model: Model, readings: Readings) -> Part:
     """Return the arm's scatter, of `SCATTER_RAD` in each joint, as a part of the noise."""
-    f = _scatter_factors(model, readings)
-    common = None if readings.states.target is None else f
-    return Part(SCATTER, f @ np.swapaxes(f, 1, 2), LogStdPrior(0.0, NOISE_SPREAD), common)
+    of = scatter_alone(readings, _scatter_factors(model, readings))
+    return Part(SCATTER, of.covariance, LogStdPrior(0.0, NOISE_SPREAD), of.common)
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

@@ -18,8 +18,9 @@ W is the stated covariance V, with more for positions or attitudes where their r
 (`excess`): a misfit has not the shape of an instrument's noise. W, C and the residual that
 parameters with this W and Λ leave belong together; they are found by turns.
 Where the model has a background its standard deviations are in units of the instrument's noise,
-σ is the factor of that as the mixed model estimates it, and κ at least what the uncertainty of the
-variances makes of it (see `variance_spread`). Else σ² is from the residual, at least 1.
+σ is the factor of that as the mixed model estimates it, also where the arm's scatter is stated, and
+κ at least what the uncertainty of the variances makes of it (see `variance_spread`). Else σ² is
+from the residual, at least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
 that was found there: what repeats itself in new poses. The variance is that of the folds as they
@@ -38,6 +39,7 @@ from hilcal.identification.excess import Excess, excess
 from hilcal.identification.folds import distinct_poses, random_folds
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.holdout import ordinary
+from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.residual import residual
 from hilcal.identification.variance_spread import variance_spread
 from hilcal.model.model import Model, Prediction
@@ -125,10 +127,14 @@ def predictive(
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
     known, least = None, 1.0
-    if model.background and fitted.arm_scatter is not None:
-        known = fitted.arm_scatter.instrument_factor**2
+    if model.background:
+        variances = mixed_fit_at(model, fitted.as_stated(), mode, theta)
+        arm = fitted.arm_scatter  # whose factor the standard deviations are in units of
+        known = (variances.std(INSTRUMENT) if arm is None else arm.instrument_factor) ** 2
         prior = prior * np.sqrt(known)
-        least = variance_spread(model, theta, fitted, mode)
+        least = variance_spread(
+            variances, stated.rows_of(random_folds(distinct_poses(fitted)[stated.reading]))
+        )
     of = coordinates_of(model)
     chosen = of.prior(prior)
     std = of.prior(open_prior(model, theta, prior))

@@ -1,32 +1,31 @@
 """The tracker's registration and the target's offset, before anything else is fitted.
 
 Positions and attitudes register together, by whitened least squares over the frames of the nominal
-arm from several starts (`rigid_frames`, `registration_starts`). What the poses cannot tell stays
-near the cell's target and is listed.
+arm from several starts (`rigid_frames`); readings that are centimetres off are found from a robust
+start, and left out. What the poses cannot tell stays near the cell's target and is listed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.registration_starts import closed_forms, rotated
+from hilcal.identification.common_cause import off_alike
+from hilcal.identification.least_trimmed_squares import MOST, limit, robust_start, variance
 from hilcal.identification.rigid_frames import (
     Frames,
-    Free,
-    Minimum,
+    Placement,
     Seen,
-    inverse_roots,
-    minimise,
-    misfit,
+    angles,
+    best_placement,
+    given_and_free,
     settled,
     sizes,
 )
-from hilcal.identification.robust_frames import far_readings
+from hilcal.identification.solver import minimise
 from hilcal.readings.readings import Readings
-from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 
@@ -36,13 +35,17 @@ NARROW = 1e-3
 FEW = 100
 """Readings that the starts are tried on, spread over all; a choice: 17 times the unknowns."""
 GOOD = 10.0
-"""Rms misfit, in units of noise with roughness, that a closed form must reach for no other start to
-be tried: about 1 mm and 1 mrad. A choice: arms are so accurate before calibration."""
-TRIED = 5
-"""Starts, the best of all by their misfit, that least squares goes on from; a choice."""
+"""Rms misfit, in units of noise with roughness, at which no other start is tried: about 1 mm and
+1 mrad. A choice: arms are so accurate before calibration."""
+STEPS, TRIED = 15, 5
+"""Steps from each start, and rotations of a cube that are tried; choices."""
 DISTURBED = 3e-3
 """Rms misfit, m, from which on readings that are far off are looked for: nominal arms are off by
-less. A choice, a third of the gate's least (`gate.GATE_M`)."""
+less. A choice, a third of what is fitted at least (`misdescription.GATE_M`)."""
+SEED = 0
+"""Of the random subsets, so that equal readings give equal frames."""
+ROUNDS = 5
+"""Most rounds in which readings join and leave; a choice."""
 TURNED = 1e-3
 """Range of a joint's angle, rad, below which it counts as never turned; a choice."""
 TOLD = 0.05
@@ -67,6 +70,16 @@ class Undetermined:
     target_turn: Floats
     base_shift: Floats
     base_turn: Floats
+
+    def to_json(self) -> dict[str, object]:
+        """Return its JSON."""
+        return {
+            "target": self.target,
+            "target_shift_m": self.target_shift.tolist(),
+            "target_turn_rad": self.target_turn.tolist(),
+            "base_shift_m": self.base_shift.tolist(),
+            "base_turn_rad": self.base_turn.tolist(),
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,6 +106,34 @@ class Registration:
     still: Bools
     estimated: bool
 
+    def to_json(
+        self, base: Floats | None = None, targets: Floats | None = None
+    ) -> dict[str, object]:
+        """Return its JSON.
+
+        Args:
+            base: (4, 4) as a fit has it.
+            targets: (T, 4, 4) the same.
+        """
+        cell = self.cell
+        own = cell.all_targets if targets is None else targets
+        several = cell.target_names if cell.targets is not None else ()
+        each = {name: _pose(t) for name, t in zip(several, own, strict=False)}
+        return {
+            "base": _pose(cell.registration if base is None else base),
+            "target": _pose(own[0]),
+            **({"targets": each} if each else {}),
+            "estimated": self.estimated,
+            "rms_m": self.rms,
+            "rms_rad": self.turn_rms,
+            "undetermined": [u.to_json() for u in self.undetermined],
+            "joints_never_turned": (np.flatnonzero(self.still) + 1).tolist(),
+        }
+
+
+def _pose(t: Floats) -> dict[str, Sequence[float]]:
+    return {"xyz_m": t[:3, 3].tolist(), "rotvec_rad": se3.rotation_vector(t[:3, :3]).tolist()}
+
 
 def register(cell: Cell, readings: Readings) -> Registration:
     """Estimate the registration and the target's offset where they are unknown.
@@ -101,80 +142,85 @@ def register(cell: Cell, readings: Readings) -> Registration:
         CannotAnswerError: where the poses do not determine it (fewer than four distinct positions,
             or all on one line).
     """
-    angle = angles(readings)
-    chain = chains.evaluate(cell.arm, angle)
-    seen = seen_of(readings, chain.rotation[-1], chain.position[-1])
-    known = np.array(cell.known_targets)
-    given = Frames(cell.registration, cell.all_targets)
-    if cell.registration_known and cell.target_known:
-        none = Free.of(False, ~known, False)
-        far = far_readings(readings, seen, given, none, DISTURBED)
-        return _result(cell, misfit(seen, given), angle, (), far, estimated=False)
-    distinct = len(np.unique(np.round(angle, 9), axis=0))
-    if distinct < MIN_POSES:
-        raise CannotAnswerError(
-            f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better 10, "
-            "that turn the flange and do not lie on a line"
-        )
-    free = Free.of(not cell.registration_known, ~known, seen.m == 6)
-    found = fit_frames(seen, given, free)
-    far = far_readings(readings, seen, found.frames, free, DISTURBED)
-    if far.any():
-        good = fit_frames(seen[~far], given, free)
-        found = replace(good, off=misfit(seen, good.frames))
-    if seen.m == 3 and not cell.registration_known:
-        _refuse_lines(seen, found.frames)
-    placed = replace(cell.with_targets(found.frames.targets), registration=found.frames.base)
-    return _result(placed, found.off, angle, undetermined(found), far, estimated=True)
-
-
-def angles(readings: Readings) -> Floats:
-    """(N, n) joint values of the readings: as the encoders reported them, else as commanded."""
-    states = readings.states
-    return states.q if states.q_actual is None else states.q_actual
-
-
-def seen_of(readings: Readings, rotation: Floats, position: Floats) -> Seen:
-    """Return what the frames are found from.
-
-    Args:
-        readings: N readings.
-        rotation: (N, 3, 3) nominal orientation of the flange.
-        position: (N, 3) nominal position of the flange, m.
-    """
-    return Seen(
-        np.ascontiguousarray(rotation),
-        np.ascontiguousarray(position),
-        readings.value[:, :3],
-        se3.rotation(readings.value[:, 3:]) if readings.m == 6 else None,
-        inverse_roots(readings.covariance),
-        readings.target,
+    angle, seen = angles(readings), Seen.of(cell.arm, readings)
+    given, free = given_and_free(cell, seen.m == 6)
+    known = cell.registration_known and cell.target_known
+    if known:
+        at, null = Placement(seen, given, np.zeros_like(free)), np.zeros((len(free), 0))
+        far = _far(readings, at)
+    else:
+        distinct = len(np.unique(np.round(angle, 9), axis=0))
+        if distinct < MIN_POSES:
+            raise CannotAnswerError(
+                f"registration: {distinct} distinct poses; measure at least {MIN_POSES}, better "
+                "10, that turn the flange and do not lie on a line"
+            )
+        at, null = _fitted(seen, given, free)
+        far = _far(readings, at)
+        if far.any():
+            at, null = _fitted(seen[~far], given, free)
+        if seen.m == 3 and not cell.registration_known:
+            _refuse_lines(seen, at.frames)
+        cell = replace(cell.with_targets(at.frames.targets), registration=at.frames.base)
+    off = seen.misfit(at.frames)
+    near = off[~far]
+    turn_rms = float(np.sqrt(np.mean(np.sum(near[:, 3:] ** 2, axis=1))))
+    return Registration(
+        cell=cell,
+        off=off,
+        rms=float(np.sqrt(np.mean(np.sum(near[:, :3] ** 2, axis=1)))),
+        turn_rms=turn_rms if seen.m == 6 else None,
+        far=far,
+        undetermined=_undetermined(null),
+        still=np.ptp(angle, axis=0) < TURNED,
+        estimated=not known,
     )
 
 
-def fit_frames(seen: Seen, given: Frames, free: Free) -> Minimum:
-    """Return the best frames from several starts, on a part of the readings, then on all.
+def _fitted(seen: Seen, given: Frames, free: Bools) -> tuple[Placement, Floats]:
+    """Return the best frames by a part of the readings, then all, and what they do not determine.
 
-    The rotations of a cube are tried only where no closed form leads to a good fit.
+    The undetermined directions (6 + 6 T, U) are of unit length, in ordinary sizes.
     """
     part = seen[np.unique(np.linspace(0, len(seen) - 1, FEW).astype(int))]
-
-    def reached(begun: Iterable[Frames]) -> list[Minimum]:
-        return [minimise(part, begin, free, steps=15) for begin in begun]
-
-    def square(frames: Frames) -> float:
-        return float(np.sum(np.einsum("nij,nj->ni", part.root, misfit(part, frames)) ** 2))
-
-    found = reached(closed_forms(part, given, free))
-    if min(m.square for m in found) > GOOD**2 * part.m * len(part):
-        found += reached(sorted(rotated(part, given, free), key=square)[:TRIED])
-    best = min(found, key=lambda m: m.square)
-    return settled(seen, minimise(seen, best.frames, free), free, given)
+    best = best_placement(part, given, free, GOOD * np.sqrt(part.m), STEPS, TRIED)
+    return settled(minimise(Placement(seen, best.frames, free)), given)
 
 
-def undetermined(found: Minimum) -> tuple[Undetermined, ...]:
+def _far(readings: Readings, at: Placement) -> Bools:
+    """(N,) readings far off while the others fit to within `DISTURBED`; none in other cases.
+
+    Args:
+        readings: N readings.
+        at: the frames of all of them.
+    """
+    seen, none = at.seen, np.zeros(len(readings), dtype=np.bool_)
+
+    def fits(off: Floats) -> bool:
+        return bool(np.mean(np.sum(off[:, :3] ** 2, axis=1)) <= DISTURBED**2)
+
+    if fits(at.off):
+        return none
+    at, used = robust_start(at, np.random.default_rng(SEED))
+    for _ in range(ROUNDS):
+        of = at.linear
+        d2, _ = of.near(np.zeros(of.columns.shape[2]))
+        far = d2 > limit(seen.m, len(seen), variance(of, d2, none))
+        if far.mean() > MOST:
+            return none
+        frames = minimise(Placement(seen[~far], at.frames, at.free)).frames
+        at = Placement(seen, frames, at.free)
+        if np.array_equal(far, ~used):
+            break
+        used = ~far
+    rows, base = np.flatnonzero(far), at.frames.base[:3, :3]
+    axes = base @ seen.rotation[rows] @ at.frames.targets[seen.target[rows], :3, :3]
+    alike = off_alike(readings, ~none, rows, at.off[rows, :3], axes)
+    return far if fits(at.off[~far]) and not len(alike) else none
+
+
+def _undetermined(null: Floats) -> tuple[Undetermined, ...]:
     """Return the undetermined directions, each with as few of a target's parameters as can be."""
-    null = found.null.copy()
     if not null.size:
         return ()
     # Reduced echelon form: targets' shifts first, then turns of base and targets.
@@ -208,33 +254,9 @@ def _direction(row: Floats) -> Undetermined:
     return Undetermined(target, mine[:3], mine[3:], moved[:3], moved[3:6])
 
 
-def _result(
-    cell: Cell,
-    off: Floats,
-    angle: Floats,
-    unknown: tuple[Undetermined, ...],
-    far: Bools,
-    *,
-    estimated: bool,
-) -> Registration:
-    return Registration(
-        cell=cell,
-        off=off,
-        rms=float(np.sqrt(np.mean(np.sum(off[~far, :3] ** 2, axis=1)))),
-        turn_rms=float(np.sqrt(np.mean(np.sum(off[~far, 3:] ** 2, axis=1))))
-        if off.shape[1] == 6
-        else None,
-        far=far,
-        undetermined=unknown,
-        still=np.ptp(angle, axis=0) < TURNED,
-        estimated=estimated,
-    )
-
-
 def _refuse_lines(seen: Seen, frames: Frames) -> None:
     """Refuse positions that do not tell how the base is turned."""
-    offset = frames.targets[seen.target, :3, 3]
-    x = seen.position + np.einsum("nij,nj->ni", seen.rotation, offset)
+    x = seen.points(frames)
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
     if spread[1] < NARROW * np.sqrt(len(x)):
         raise CannotAnswerError(

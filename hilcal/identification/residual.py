@@ -1,4 +1,6 @@
-"""Residuals, measured − predicted, of readings or deflections."""
+"""Residuals, measured − predicted, of readings or deflections, and the errors that they make."""
+
+from dataclasses import asdict, dataclass
 
 import numpy as np
 
@@ -25,3 +27,45 @@ def residual(readings: Readings, prediction: Prediction, w: Whitening) -> Floats
         read = se3.rotation(readings.value[:, 3:])
         turn = w.raw(se3.rotation_vector(read @ np.swapaxes(o.rotation, 1, 2)))
     return np.concatenate([position, turn], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorBlock:
+    """Position error per measurement, and the whitened residual.
+
+    Attributes:
+        rms_m: root mean square of the 3-D position error, m.
+        mean_m: its mean, m.
+        max_m: its maximum, m.
+        rms_sigma: root mean square of the whitened elements, pure number.
+    """
+
+    rms_m: float
+    mean_m: float
+    max_m: float
+    rms_sigma: float
+
+    @classmethod
+    def of(cls, raw: Floats, white: Floats, rank: int) -> "ErrorBlock":
+        """Summarise residuals (D, m), by their whitened elements, of which `rank` tell anything."""
+        distance = np.linalg.norm(raw[:, :3], axis=1)
+        return cls(
+            rms_m=float(np.sqrt(np.mean(distance**2))),
+            mean_m=float(distance.mean()),
+            max_m=float(distance.max()),
+            rms_sigma=float(np.linalg.norm(white) / np.sqrt(max(rank, 1))),
+        )
+
+    def to_json(self) -> dict[str, float]:
+        """Keys and values of the contract."""
+        return asdict(self)
+
+
+def error_block(raw: Floats, w: Whitening) -> ErrorBlock:
+    """Summarise residuals (D, m) and their whitened elements."""
+    return ErrorBlock.of(raw, w.whiten(raw), w.rank)
+
+
+def noise_floor(covariance: Floats) -> float:
+    """Root mean square of the 3-D position error under covariances (D, m, m) alone, m."""
+    return float(np.sqrt(np.mean(np.trace(covariance[:, :3, :3], axis1=1, axis2=2))))

@@ -4,18 +4,27 @@ With the nominal flange poses (R_i, p_i), readings y_i obey
 
     y_i = R (p_i + R_i τ) + t,      M_i = R R_i R_τ  (attitude, where read)
 
-R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange.
+R, t: the base in the sensor's frame; τ, R_τ: the target k(i) on the flange. The 6 + 6 T parameters
+are a shift of the base at the centroid of the flange's positions and a turn, base axes; per target
+a shift and a turn, flange axes; all in ordinary sizes.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 
 import numpy as np
 
+from hilcal.cell import Cell
+from hilcal.identification.reading_model import ReadingModel
+from hilcal.identification.solver import minimise
+from hilcal.readings.readings import Readings
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats, Ints
 
-ROUGH_M = 1e-4
-ROUGH_RAD = 1e-4
+ROUGH = (1e-4, 1e-4)
 """Roughness that is added to the stated covariance, m and rad: nominal arms are 0.1 to 3 mm off, so
 that no reading tells their frames better. A choice at the lower end."""
 TARGET_M = 0.3
@@ -26,10 +35,24 @@ TELL = 0.1
 """A direction of the frames counts as determined when the readings tell it to this share of an
 ordinary size (3 cm of the target's offset, 0.1 rad); a choice: a point 0.1 of the tool's length off
 moves a reading at most by as much, and only where poses turn as the measured ones did not."""
-STEPS = 40
-"""Most damped Gauss-Newton steps; a choice."""
-SMALL = 1e-12
-"""A step below this in units of the ordinary sizes ends the search; rounding."""
+ALTERNATIONS = 10
+"""Steps between rotation and translations; the least squares that follow do the rest. A choice."""
+HOLD = 1e-6
+"""Weight of an ordinary size against a position error of 1 m in the linear starts; a choice, small
+enough to shift no start, and enough to keep what the poses do not tell near what is given."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """Base and targets.
+
+    Attributes:
+        base: (4, 4) T_sensor_base.
+        targets: (T, 4, 4) T_flange_target.
+    """
+
+    base: Floats
+    targets: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,6 +75,28 @@ class Seen:
     root: Floats
     target: Ints
 
+    @classmethod
+    def of(cls, arm: Arm, readings: Readings) -> "Seen":
+        """Return the readings beside the flange poses of a nominal arm."""
+        value, root = readings.value, inverse_roots(readings.covariance)
+        turn = value[:, 3:] if readings.m == 6 else None
+        return cls.at(arm, angles(readings), value[:, :3], turn, root, readings.target)
+
+    @classmethod
+    def at(
+        cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
+    ) -> "Seen":
+        """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
+        chain = evaluate(arm, q)
+        return cls(
+            np.ascontiguousarray(chain.rotation[-1]),
+            np.ascontiguousarray(chain.position[-1]),
+            value,
+            None if turn is None else se3.rotation(turn),
+            root,
+            target,
+        )
+
     @property
     def m(self) -> int:
         """Elements per reading: 3 or 6."""
@@ -63,15 +108,29 @@ class Seen:
 
     def __getitem__(self, rows: Ints | Bools | slice) -> "Seen":
         """Return the chosen readings."""
-        attitude = None if self.attitude is None else self.attitude[rows]
-        return Seen(
-            self.rotation[rows],
-            self.position[rows],
-            self.value[rows],
-            attitude,
-            self.root[rows],
-            self.target[rows],
-        )
+        given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
+        return replace(self, **{name: a[rows] for name, a in given.items()})
+
+    def points(self, frames: Frames) -> Floats:
+        """(N, 3) predicted positions of the targets, base axes, m."""
+        offset = frames.targets[self.target, :3, 3]
+        return np.asarray(self.position + np.einsum("nij,nj->ni", self.rotation, offset))
+
+    def misfit(self, frames: Frames) -> Floats:
+        """(N, m) measured minus predicted, sensor axes, m and rad."""
+        r, t = frames.base[:3, :3], frames.base[:3, 3]
+        off = self.value - self.points(frames) @ r.T - t
+        if self.attitude is None:
+            return np.asarray(off)
+        predicted = r @ self.rotation @ frames.targets[self.target, :3, :3]
+        turn = se3.rotation_vector(self.attitude @ np.swapaxes(predicted, 1, 2))
+        return np.concatenate([off, turn], axis=1)
+
+
+def angles(readings: Readings) -> Floats:
+    """(N, n) joint values of the readings: as the encoders reported them, else as commanded."""
+    states = readings.states
+    return states.q if states.q_actual is None else states.q_actual
 
 
 def inverse_roots(covariance: Floats) -> Floats:
@@ -81,7 +140,7 @@ def inverse_roots(covariance: Floats) -> Floats:
     larger than the roughness; it counts as zero.
     """
     m = covariance.shape[-1]
-    rough = np.diag(np.repeat([ROUGH_M**2, ROUGH_RAD**2], 3)[:m])
+    rough = np.diag(np.repeat(np.square(ROUGH), 3)[:m])
     try:
         root = np.linalg.cholesky(covariance + rough)
     except np.linalg.LinAlgError:
@@ -91,171 +150,26 @@ def inverse_roots(covariance: Floats) -> Floats:
     return np.asarray(np.linalg.inv(root))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frames:
-    """Base and targets.
-
-    Attributes:
-        base: (4, 4) T_sensor_base.
-        targets: (T, 4, 4) T_flange_target.
-    """
-
-    base: Floats
-    targets: Floats
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Free:
-    """Which of the 6 + 6 T frame parameters are estimated.
-
-    Parameters: shift of the base at the centroid of the readings and turn, base axes; per target
-    shift and turn, flange axes.
-
-    Attributes:
-        mask: (6 + 6 T,) the estimated ones.
-    """
-
-    mask: Bools
-
-    @classmethod
-    def of(cls, base: bool, targets: Bools, attitudes: bool) -> "Free":
-        """Return what is free where base and targets (T,) are or are not unknown.
-
-        A target's axes show in attitudes alone, and are estimated from them also where its offset
-        is known.
-        """
-        mask = [np.full(6, base)]
-        mask += [np.repeat([bool(t), attitudes], 3) for t in targets]
-        return cls(np.concatenate(mask))
-
-
-def misfit(seen: Seen, frames: Frames) -> Floats:
-    """(N, m) measured minus predicted, sensor axes, m and rad."""
-    r, t = frames.base[:3, :3], frames.base[:3, 3]
-    target = frames.targets[seen.target]
-    x = seen.position + np.einsum("nij,nj->ni", seen.rotation, target[:, :3, 3])
-    off = seen.value - x @ r.T - t
-    if seen.attitude is None:
-        return np.asarray(off)
-    predicted = r @ seen.rotation @ target[:, :3, :3]
-    turn = se3.rotation_vector(seen.attitude @ np.swapaxes(predicted, 1, 2))
-    return np.concatenate([off, turn], axis=1)
-
-
-def derivative(seen: Seen, frames: Frames, centre: Floats) -> Floats:
-    """(N, m, 6 + 6 T) derivative of the predicted readings by the parameters."""
-    r = frames.base[:3, :3]
-    target = frames.targets[seen.target]
-    x = seen.position + np.einsum("nij,nj->ni", seen.rotation, target[:, :3, 3]) - centre
-    turned = r @ seen.rotation
-    count, size = len(seen), len(frames.targets)
-    out = np.zeros((count, seen.m, 6 + 6 * size))
-    out[:, :3, :3] = r
-    out[:, :3, 3:6] = -r @ se3.skew(x)
-    if seen.m == 6:
-        out[:, 3:, 3:6] = r
-    for k in range(size):
-        mine = seen.target == k
-        at = 6 + 6 * k
-        out[mine, :3, at : at + 3] = turned[mine]
-        if seen.m == 6:
-            out[mine, 3:, at + 3 : at + 6] = turned[mine]
-    return out
-
-
-def moved(frames: Frames, step: Floats, centre: Floats) -> Frames:
-    """Return the frames after a step of the parameters (6 + 6 T,)."""
-    about, back = np.eye(4), np.eye(4)
-    about[:3, 3], back[:3, 3] = centre, -centre
-    turn = se3.matrix(se3.rotation(step[3:6]), step[:3])
-    targets = frames.targets.copy()
-    own = step[6:].reshape(-1, 6)
-    targets[:, :3, 3] += own[:, :3]
-    targets[:, :3, :3] = se3.rotation(own[:, 3:]) @ targets[:, :3, :3]
-    return Frames(frames.base @ about @ turn @ back, targets)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Minimum:
-    """The frames of least squares.
-
-    Attributes:
-        frames: base and targets.
-        off: (N, m) misfit.
-        square: whitened sum of squares.
-        null: (6 + 6 T, U) unit directions of the parameters, in ordinary sizes, that the readings
-            do not determine.
-        centre: (3,) the point of the base axes that the base turns about in the parameters, m.
-    """
-
-    frames: Frames
-    off: Floats
-    square: float
-    null: Floats
-    centre: Floats
-
-
 def sizes(targets: int) -> Floats:
     """(6 + 6 T,) ordinary sizes of the parameters, m and rad."""
     own = [TARGET_M] * 3 + [1.0] * 3
     return np.array([BASE_M] * 3 + [1.0] * 3 + own * targets)
 
 
-def minimise(
-    seen: Seen,
-    start: Frames,
-    free: Free,
-    weights: Floats | None = None,
-    steps: int = STEPS,
-    hold: "Hold | None" = None,
-) -> Minimum:
-    """Damped Gauss-Newton (Levenberg, Marquardt) from a start.
+def free_parameters(base: bool, targets: Bools, attitudes: bool) -> Bools:
+    """(6 + 6 T,) which parameters are estimated where base and targets (T,) are or are not unknown.
 
-    Args:
-        seen: flange poses and readings.
-        start: base and targets to start from.
-        free: what is estimated.
-        weights: (N,) of the readings, all 1 unless given.
-        steps: most steps.
-        hold: prior of the targets; none unless given.
+    A target's axes show in attitudes alone, and are estimated from them also where its offset is
+    known.
     """
-    centre = np.asarray(seen.position.mean(axis=0))
-    root = seen.root if weights is None else seen.root * np.sqrt(weights)[:, None, None]
-    scale = sizes(len(start.targets)) * free.mask
-    frames, damping = start, 1e-3
-    off = misfit(seen, frames)
-    white = np.einsum("nij,nj->ni", root, off)
-    away = _away(frames, hold, scale)
-    square = float(np.sum(white**2) + np.sum(away**2))
-    h, g = np.eye(len(scale)), np.zeros(len(scale))
-    fresh = True
-    for _ in range(steps):
-        if fresh:
-            a = (root @ derivative(seen, frames, centre)).reshape(-1, len(scale)) * scale
-            h, g = a.T @ a, a.T @ white.reshape(-1)
-            if hold is not None:
-                slope = hold.slopes(free)
-                h, g = h + np.diag(slope**2), g - slope * away
-        # Damped in ordinary sizes and in units of each column, so that nothing runs away.
-        guard = damping * (np.diag(h) + 1e-6 * h.max()) + 1e-12 * h.max()
-        step = np.linalg.solve(h + np.diag(guard + ~free.mask), g)
-        trial = moved(frames, scale * step, centre)
-        trial_off = misfit(seen, trial)
-        trial_white = np.einsum("nij,nj->ni", root, trial_off)
-        trial_away = _away(trial, hold, scale)
-        now = float(np.sum(trial_white**2) + np.sum(trial_away**2))
-        fresh = now <= square
-        if fresh:
-            done = square - now <= 1e-9 * square + 1e-12 * len(seen) and damping <= 1e-3
-            frames, off, white, away, square = trial, trial_off, trial_white, trial_away, now
-            damping = max(0.1 * damping, 1e-9)
-            if done or np.abs(step).max() < SMALL:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e8:
-                break
-    return Minimum(frames, off, float(np.sum(white**2)), np.zeros((len(scale), 0)), centre)
+    own = [np.repeat([bool(t), attitudes], 3) for t in targets]
+    return np.concatenate([np.full(6, base), *own])
+
+
+def given_and_free(cell: Cell, attitudes: bool) -> tuple[Frames, Bools]:
+    """Return the frames of a cell, as given or as placed, and what is estimated of them."""
+    free = free_parameters(not cell.registration_known, ~np.array(cell.known_targets), attitudes)
+    return Frames(cell.registration, cell.all_targets), free
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -263,66 +177,257 @@ class Hold:
     """Prior of the targets: as given, to within the ordinary sizes.
 
     Attributes:
-        given: base and targets as configured, or the nominal ones.
+        given: (T, 4, 4) targets as configured, or the nominal ones.
         weight: of a target that is an ordinary size off, in units of whitened misfit.
     """
 
-    given: Frames
+    given: Floats
     weight: float
 
-    def slopes(self, free: Free) -> Floats:
-        """(6 + 6 T,) derivative of the weighted distance by the parameters, in ordinary sizes."""
-        each = np.repeat([1.0, 1 / np.pi], 3)
-        own = np.tile(each, len(self.given.targets)) * free.mask[6:]
+    def away(self, targets: Floats) -> Floats:
+        """(6 + 6 T,) weighted distance of the targets from the given ones."""
+        shift = targets[:, :3, 3] - self.given[:, :3, 3]
+        back = np.swapaxes(self.given[:, :3, :3], 1, 2)
+        turn = se3.rotation_vector(targets[:, :3, :3] @ back)
+        own = np.concatenate([shift / TARGET_M, turn / np.pi], axis=1)
+        return np.concatenate([np.zeros(6), self.weight * own.reshape(-1)])
+
+    def slopes(self) -> Floats:
+        """(6 + 6 T,) its derivative by the parameters."""
+        own = np.tile(np.repeat([1.0, 1.0 / np.pi], 3), len(self.given))
         return np.concatenate([np.zeros(6), self.weight * own])
 
 
-def settled(seen: Seen, at: Minimum, free: Free, given: Frames) -> Minimum:
-    """Return the minimum with what the readings do not determine held near the given targets.
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """Frames beside what was read: a point of `solver.minimise`.
+
+    Attributes:
+        seen: flange poses and readings.
+        frames: base and targets.
+        free: (6 + 6 T,) the parameters that are estimated, K of them.
+        hold: prior of the targets.
+    """
+
+    seen: Seen
+    frames: Frames
+    free: Bools
+    hold: Hold | None = None
+
+    @cached_property
+    def off(self) -> Floats:
+        """(N, m) misfit, m and rad."""
+        return self.seen.misfit(self.frames)
+
+    @cached_property
+    def white(self) -> Floats:
+        """(N, m) whitened misfit."""
+        return np.asarray(np.einsum("nij,nj->ni", self.seen.root, self.off))
+
+    @property
+    def square(self) -> float:
+        """Whitened sum of squares."""
+        return float(np.sum(self.white**2))
+
+    @property
+    def residual(self) -> Floats:
+        """(R,) whitened misfit, and that of the prior."""
+        if self.hold is None:
+            return self.white.reshape(-1)
+        away = self.hold.away(self.frames.targets)[self.free]
+        return np.concatenate([self.white.reshape(-1), -away])
+
+    def jacobian(self) -> Floats:
+        """(R, K) derivative of what is predicted."""
+        rows = self.columns().reshape(self.white.size, int(np.count_nonzero(self.free)))
+        if self.hold is None:
+            return rows
+        return np.concatenate([rows, np.diag(self.hold.slopes()[self.free])])
+
+    def columns(self) -> Floats:
+        """(N, m, K) whitened derivative of the predicted readings."""
+        seen, r = self.seen, self.frames.base[:3, :3]
+        x = seen.points(self.frames) - self._centre
+        turned = r @ seen.rotation
+        out = np.zeros((len(seen), seen.m, len(self.free)))
+        out[:, :3, :3] = r
+        out[:, :3, 3:6] = -r @ se3.skew(x)
+        out[:, 3:, 3:6] = r[: seen.m - 3]
+        for k in range(len(self.frames.targets)):
+            mine, at = seen.target == k, 6 + 6 * k
+            out[mine, :3, at : at + 3] = turned[mine]
+            out[mine, 3:, at + 3 : at + 6] = turned[mine, : seen.m - 3]
+        return np.asarray(seen.root @ out[:, :, self.free] * self._sizes)
+
+    @property
+    def linear(self) -> ReadingModel:
+        """The linear model of the readings."""
+        none = np.zeros(np.count_nonzero(self.free))
+        members = np.zeros((0, 0), dtype=np.int64)
+        return ReadingModel(self.white, self.columns(), none, none, self.seen.root, members)
+
+    def moved(self, step: Floats) -> "Placement":
+        """Return the placement after a step (K,)."""
+        whole = np.zeros(len(self.free))
+        whole[self.free] = self._sizes * step
+        about, back = np.eye(4), np.eye(4)
+        about[:3, 3], back[:3, 3] = self._centre, -self._centre
+        turn = se3.matrix(se3.rotation(whole[3:6]), whole[:3])
+        targets, own = self.frames.targets.copy(), whole[6:].reshape(-1, 6)
+        targets[:, :3, 3] += own[:, :3]
+        targets[:, :3, :3] = se3.rotation(own[:, 3:]) @ targets[:, :3, :3]
+        return replace(self, frames=Frames(self.frames.base @ about @ turn @ back, targets))
+
+    def determined(self, spread: float) -> tuple[Floats, Floats]:
+        """Undetermined directions (6 + 6 T, U), and the Gauss-Newton step (K,) along the others.
+
+        Args:
+            spread: rms of the whitened misfit, at least 1.
+        """
+        a = self.jacobian()
+        # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
+        squares, vectors = np.linalg.eigh(a.T @ a)
+        told = squares > (spread / TELL) ** 2
+        null = np.zeros((len(self.free), np.count_nonzero(~told)))
+        null[self.free] = vectors[:, ~told]
+        part = vectors[:, told]
+        return null, part @ ((part.T @ (a.T @ self.residual)) / squares[told])
+
+    @cached_property
+    def _centre(self) -> Floats:
+        """(3,) the point of the base axes that the base turns about, m."""
+        return np.asarray(self.seen.position.mean(axis=0))
+
+    @cached_property
+    def _sizes(self) -> Floats:
+        """(K,) units of the columns."""
+        return sizes(len(self.frames.targets))[self.free]
+
+
+def best_placement(
+    seen: Seen, given: Frames, free: Bools, good: float, steps: int, rotated: int
+) -> Placement:
+    """Return the best placement from several starts: closed forms, then rotations of a cube.
+
+    Args:
+        seen: flange poses and readings.
+        given: base and targets as configured, or the nominal ones.
+        free: (6 + 6 T,) what is estimated.
+        good: whitened rms misfit per reading at which no other start is tried.
+        steps: most steps from each start.
+        rotated: of the rotations of a cube, the number of those that fit best and are tried.
+    """
+    found: list[Placement] = []
+
+    def reached(start: Frames) -> bool:
+        found.append(minimise(Placement(seen, start, free), steps))
+        return found[-1].square <= good**2 * len(seen)
+
+    if not any(map(reached, _closed_forms(seen, given, free))) and rotated and free[:6].any():
+        turns = (_with_translations(seen, given, turn, free) for turn in _cube())
+        begun = sorted((Placement(seen, f, free) for f in turns), key=lambda p: p.square)
+        for placement in begun[:rotated]:
+            reached(placement.frames)
+    return min(found, key=lambda p: p.square)
+
+
+def settled(at: Placement, given: Frames) -> tuple[Placement, Floats]:
+    """Return a minimum whose undetermined part is held near the given targets, and that part.
 
     The prior has the ordinary sizes as standard deviations. It acts along the undetermined
-    directions alone: along the others, the last steps go to the minimum without it.
+    directions (6 + 6 T, U) alone: along the others, the last steps go to the minimum without it.
     """
-    count = max(seen.m * len(seen) - int(np.count_nonzero(free.mask)), 1)
-    spread = max(float(np.sqrt(at.square / count)), 1.0)
-    begin, scale = at, sizes(len(given.targets)) * free.mask
-    null, _ = _determined(seen, at, scale, spread)
+    dof = max(at.seen.m * len(at.seen) - int(np.count_nonzero(at.free)), 1)
+    spread = max(float(np.sqrt(at.square / dof)), 1.0)
+    null, _ = at.determined(spread)
     if null.size:
-        held = minimise(seen, at.frames, free, hold=Hold(given, spread))
-        begin = replace(held, centre=at.centre)
+        at = replace(minimise(replace(at, hold=Hold(given.targets, spread))), hold=None)
     for _ in range(3):
-        null, step = _determined(seen, begin, scale, spread)
-        frames = moved(begin.frames, scale * step, at.centre)
-        off = misfit(seen, frames)
-        square = float(np.sum(np.einsum("nij,nj->ni", seen.root, off) ** 2))
-        begin = Minimum(frames, off, square, null, at.centre)
-    return begin
+        null, step = at.determined(spread)
+        at = at.moved(step)
+    return at, null
 
 
-def _determined(seen: Seen, at: Minimum, scale: Floats, spread: float) -> tuple[Floats, Floats]:
-    """Undetermined directions (P, U), and the Gauss-Newton step (P,) along the others."""
-    live = np.flatnonzero(scale)
-    a = (seen.root @ derivative(seen, at.frames, at.centre)).reshape(-1, len(scale))[:, live]
-    white = np.einsum("nij,nj->ni", seen.root, at.off).reshape(-1)
-    a *= scale[live]
-    # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, of about 10.
-    squares, vectors = np.linalg.eigh(a.T @ a)
-    told = squares > (spread / TELL) ** 2
-    null, step = np.zeros((len(scale), int((~told).sum()))), np.zeros(len(scale))
-    null[live] = vectors[:, ~told]
-    part = vectors[:, told]
-    step[live] = part @ ((part.T @ (a.T @ white)) / squares[told])
-    return null, step
+def nearest_rotation(m: Floats) -> Floats:
+    """Return the rotation (..., 3, 3) nearest to a matrix (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(m)
+    flip = np.ones(m.shape[:-1])
+    flip[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return np.asarray((u * flip[..., None, :]) @ vt)
 
 
-def _away(frames: Frames, hold: Hold | None, scale: Floats) -> Floats:
-    """(6 + 6 T,) weighted distance of the targets from the given ones; zero without a prior."""
-    out = np.zeros(len(scale))
-    if hold is not None:
-        shift = frames.targets[:, :3, 3] - hold.given.targets[:, :3, 3]
-        back = np.swapaxes(hold.given.targets[:, :3, :3], 1, 2)
-        turn = se3.rotation_vector(frames.targets[:, :3, :3] @ back)
-        whole = np.concatenate([shift / TARGET_M, turn / np.pi], axis=1).reshape(-1)
-        there = np.flatnonzero(scale[6:])
-        out[6 + there] = hold.weight * whole[there]
+def rotation_of_attitudes(attitude: Floats, flange: Floats) -> Floats:
+    """(3, 3) A of M_i Bᵀ = A R_i, from the null vector of a linear system.
+
+    Args:
+        attitude: (N, 3, 3) M_i.
+        flange: (N, 3, 3) R_i.
+    """
+    # vec by rows: (M_i ⊗ I) vec(Bᵀ) = (I ⊗ R_iᵀ) vec(A)
+    eye = np.eye(3)
+    left = np.einsum("nij,kl->nikjl", attitude, eye).reshape(-1, 9)
+    right = np.einsum("ij,nlk->nikjl", eye, flange).reshape(-1, 9)
+    gram = np.concatenate([left, -right], axis=1)
+    a = np.linalg.eigh(gram.T @ gram)[1][9:, 0].reshape(3, 3)
+    return nearest_rotation(a * (np.sign(np.linalg.det(a)) or 1.0))
+
+
+def _closed_forms(seen: Seen, given: Frames, free: Bools) -> Iterator[Frames]:
+    """Yield base and targets from attitudes and from positions."""
+    if not free[:6].any():
+        yield _with_translations(seen, given, given.base[:3, :3], free)
+        return
+    if seen.attitude is not None:
+        mine = seen.target == seen.target[0]
+        base = rotation_of_attitudes(seen.attitude[mine], seen.rotation[mine])
+        yield _with_translations(seen, given, base, free)
+    yield _alternated(seen, given, free)
+
+
+def _cube() -> Floats:
+    """(24, 3, 3) the rotations that take a cube to itself."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
+
+
+def _with_translations(seen: Seen, given: Frames, rotation: Floats, free: Bools) -> Frames:
+    """Complete a rotation of the base by the best translations and the targets' axes."""
+    count, size = len(seen), len(given.targets)
+    turned = rotation @ seen.rotation
+    a = np.zeros((count, 3, 3 + 3 * size))
+    a[:, :, :3] = np.eye(3)
+    for k in range(size):
+        mine = seen.target == k
+        a[mine, :, 3 + 3 * k : 6 + 3 * k] = turned[mine]
+    live = np.repeat(free[::6], 3)
+    x = np.concatenate([given.base[:3, 3], *given.targets[:, :3, 3]])
+    hold = np.repeat([HOLD / BASE_M] + [HOLD / TARGET_M] * size, 3)
+    flat = a.reshape(-1, len(x))
+    rest = (seen.value - seen.position @ rotation.T).reshape(-1) - flat @ x
+    rows = np.concatenate([flat, np.diag(hold * np.sqrt(count))])[:, live]
+    if live.any():
+        x[live] += np.linalg.lstsq(rows, np.concatenate([rest, np.zeros(len(x))]), rcond=None)[0]
+    base, targets = np.eye(4), given.targets.copy()
+    base[:3, :3], base[:3, 3] = rotation, x[:3]
+    targets[:, :3, 3] = x[3:].reshape(size, 3)
+    if seen.attitude is not None:
+        for k in range(size):
+            mine = seen.target == k
+            mean = np.einsum("nji,njk->ik", turned[mine], seen.attitude[mine])
+            targets[k, :3, :3] = nearest_rotation(mean)
+    return Frames(base, targets)
+
+
+def _alternated(seen: Seen, given: Frames, free: Bools) -> Frames:
+    """Positions alone: Procrustes for R, then linear for τ and t, a few times."""
+    out, y = given, seen.value - seen.value.mean(axis=0)
+    for _ in range(ALTERNATIONS):
+        x = seen.points(out)
+        before, out = (
+            out.targets,
+            _with_translations(seen, given, nearest_rotation(y.T @ (x - x.mean(axis=0))), free),
+        )
+        if np.abs(out.targets - before).max() < 1e-6:
+            break
     return out

@@ -25,14 +25,18 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.model.model import Model
+from hilcal.readings.ranges import FULL_TURN
 from hilcal.readings.readings import States
 from hilcal.robot import se3
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 TRIALS = 8
 """Random states at which a deviation is asked whether it is constant; a choice."""
 SAME = 1e-15
 """By how much a constant deviation may differ between states, m and rad: rounding."""
+SAME_ON = 1e-5
+"""m, and of a rotation's elements: by how much a prediction may differ; a choice, what a tracker
+hardly sees: a background has a coupling of joints that is smaller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,6 +114,28 @@ def robot_frames(model: Model, theta: Floats) -> RobotFrames:
         within=within,
         beyond=beyond,
     )
+
+
+def whole_turns(model: Model, theta: Floats) -> Bools:
+    """Return whether predictions stay the same a whole turn on, for each of the n joints.
+
+    An arm is the same a whole turn of a joint on, and so are waves of whole turns. A law in the
+    angle itself, as a coupling of joints, is not; nor are cables, which no effect of the catalogue
+    has.
+
+    Args:
+        model: the model.
+        theta: (P,) its parameters.
+    """
+    states, n = random_states(model.cell), model.cell.arm.n
+    before = model.predict(states, theta).observation
+    out = np.zeros(n, dtype=np.bool_)
+    for j in range(n):
+        on = states.q + FULL_TURN * np.eye(n)[j]
+        after = model.predict(replace(states, q=on), theta).observation
+        moved = np.abs(after.position - before.position).max()
+        out[j] = max(moved, np.abs(after.rotation - before.rotation).max()) <= SAME_ON
+    return out
 
 
 def one_of_each(cell: Cell) -> States:

@@ -1,5 +1,16 @@
-"""A proposed mapping, and what the nominal arm of a cell tells about it."""
+"""A proposed mapping, and what the nominal arm of a cell tells about it.
 
+Which convention orientations are written in, the arm decides. With its nominal flange orientations
+R_i, the orientations M_i of the right convention obey
+
+    M_i = A R_i B,      y_i = A (p_i + R_i τ) + t
+
+with one rotation A (base to sensor) and one B (target on the flange) for all readings, up to the
+arm's own errors; those of a wrong convention do not. The positions are needed: a cyclic exchange of
+the axes' names turns one convention into another, and A and B take it up.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,17 +21,17 @@ from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification import description_words
-from hilcal.identification.conventions import CLEARER, Fit, choose_convention
-from hilcal.identification.gate import examine
+from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
+from hilcal.identification.rigid_frames import nearest_rotation, rotation_of_attitudes
 from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
 from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
 from hilcal.tables.guessing.proposal import FAR, GUESSED, SIDE_BY_SIDE, TURN, Proposal, Understood
 from hilcal.tables.guessing.propose import Proposed, propose
 from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
-from hilcal.tables.orientation import rotations
+from hilcal.tables.orientation import CONVENTIONS, NUMBERS, rotations
 from hilcal.tables.units import ANGLES, LENGTHS
 from hilcal.toml import check_section
 from hilcal.types import Floats
@@ -29,6 +40,31 @@ CLOSE = 0.02
 """Part of the reach that a nominal arm may be off; arms are better by ten times; a choice."""
 MOST_TRIED = 8
 """Choices of columns that are tried; each takes a registration."""
+AGREES = 0.05
+"""rad; nominal arms are better by far (1 mrad), other conventions worse (1 rad); a choice."""
+CLEARER = 5.0
+"""How much worse the next choice must fit for the first to be certain; a choice."""
+FEWEST, MOST = 6, 300
+"""Readings below which two free rotations fit too easily, and readings that are tried; choices."""
+ROUNDS = 20
+"""Steps between A and B; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class Agreement:
+    """How well a convention agrees with the arm.
+
+    Attributes:
+        convention: its name.
+        angle: rms angle left, rad.
+        position: rms distance left, m.
+        rms: both together, distances as parts of the arm's reach.
+    """
+
+    convention: str
+    angle: float
+    position: float
+    rms: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,23 +138,24 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     whole = np.isfinite(np.hstack(blocks)).all(axis=1)
     q, y, numbers = (block[whole] for block in blocks)
     unit = ANGLES[section.get("unit", "rad")]
-    choice = choose_convention(
+    ranked = rank_conventions(
         arm, ANGLES[joints["unit"]] * q, LENGTHS[position["unit"]] * y, numbers, unit
     )
-    if choice is None:
+    if not ranked:
         return []
     guess = ("orientation", GUESSED)
     proposal.unsure[:] = [doubt for doubt in proposal.unsure if doubt != guess]
-    best, second = choice.ranked[:2]
-    if choice.decided is None:
+    best, second = ranked[:2]
+    decided = clearly_best(ranked)
+    if decided is None:
         words = (
             f"the nominal {arm.name} does not decide the convention: "
             f"{best.convention} leaves {_left(best)}, {second.convention} {_left(second)}"
         )
         proposal.unsure.append(("orientation", words))
         return []
-    if not _same(section["convention"], choice.decided, numbers, unit):
-        section["convention"] = choice.decided
+    if not _same(section["convention"], decided, numbers, unit):
+        section["convention"] = decided
     proposal.open_convention = False
     for k, u in enumerate(proposal.understood):
         if u.what == "orientation":
@@ -130,7 +167,7 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     ]
 
 
-def _left(fit: Fit) -> str:
+def _left(fit: Agreement) -> str:
     angle, distance = float(np.rad2deg(fit.angle)), 1e3 * fit.position
     return f"{angle:.{0 if angle >= 10 else 2}f}° and {distance:.{0 if distance >= 10 else 2}f} mm"
 
@@ -203,7 +240,7 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
         registered = register(cell, readings)
         told.append(f"the nominal {cell.arm.name} leaves {numbers.length(registered.rms)} rms")
         if (wrong := examine(registered, readings)) is not None:
-            told.append(description_words.words(wrong, cell, readings))
+            told.append(wrong.words(cell, readings))
     except CannotAnswerError as error:
         told.append(str(error))
     return [
@@ -211,3 +248,62 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
         f"{'positions' if readings.m == 3 else 'positions and orientations'}",
         *told,
     ]
+
+
+def rank_conventions(
+    arm: Arm, q: Floats, position: Floats, numbers: Floats, unit: float
+) -> tuple[Agreement, ...]:
+    """Rank the conventions of orientations (N, k) by their agreement with the nominal arm.
+
+    Args:
+        arm: the arm.
+        q: (N, n) joint angles, rad.
+        position: (N, 3) m, sensor axes.
+        numbers: (N, 3) angles or rotation vectors, or (N, 4) quaternions.
+        unit: radians in the unit of angles.
+
+    Returns:
+        Every convention of as many numbers, best first; none where the readings are too few.
+    """
+    step = max(1, len(q) // MOST)
+    q, position, numbers = q[::step], position[::step], numbers[::step]
+    if len(q) < FEWEST:
+        return ()
+    chain = evaluate(arm, q)
+    flange, p = chain.rotation[-1], chain.position[-1]
+    found = []
+    for name, kind in CONVENTIONS.items():
+        own = name.startswith(("intrinsic-", "fixed-", "rotation-", "quaternion-"))  # no maker's
+        if own and NUMBERS.get(kind, 3) == numbers.shape[1]:
+            base, angle = _turned(rotations(name, numbers, unit), flange)
+            distance = _distance(base, flange, p, position)
+            rms = float(np.hypot(angle, distance / arm.reach))
+            found.append(Agreement(name, angle, distance, rms))
+    return tuple(sorted(found, key=lambda a: a.rms))
+
+
+def clearly_best(ranked: Sequence[Agreement]) -> str | None:
+    """Return the best convention, where the data leave no doubt; None otherwise."""
+    best, second = ranked[:2]
+    clear = best.rms < AGREES and second.rms > CLEARER * best.rms
+    return best.convention if clear else None
+
+
+def _turned(measured: Floats, flange: Floats) -> tuple[Floats, float]:
+    """A and the rms angle, rad, of the best M_i = A R_i B."""
+    a = rotation_of_attitudes(measured, flange)
+    for _ in range(ROUNDS):
+        b = nearest_rotation(np.einsum("nji,kj,nkl->il", flange, a, measured))
+        a = nearest_rotation(np.einsum("nij,kj,nlk->il", measured, b, flange))
+    trace = np.einsum("nij,nij->n", measured, a @ flange @ b)
+    angle = np.arccos(np.clip((trace - 1) / 2, -1, 1))
+    return a, float(np.sqrt(np.mean(angle**2)))
+
+
+def _distance(base: Floats, flange: Floats, p: Floats, y: Floats) -> float:
+    """Rms distance, m, of y_i − A p_i = A R_i τ + t with the best τ and t."""
+    rest = (y - p @ base.T).reshape(-1)
+    eye = np.broadcast_to(np.eye(3), (len(p), 3, 3))
+    design = np.concatenate([base @ flange, eye], axis=2).reshape(-1, 6)
+    left = rest - design @ np.linalg.lstsq(design, rest, rcond=1e-9)[0]
+    return float(np.sqrt(3 * np.mean(left**2)))

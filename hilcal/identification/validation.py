@@ -7,9 +7,8 @@ import numpy as np
 from hilcal.effects.protocol import Effect
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.errors import ErrorBlock, error_block, noise_floor
 from hilcal.identification.registration import register
-from hilcal.identification.residual import residual
+from hilcal.identification.residual import ErrorBlock, error_block, noise_floor, residual
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Whitening, whitening

@@ -9,15 +9,10 @@ fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
 
 import numpy as np
 
-from hilcal.identification.folds import distinct_poses, random_folds
-from hilcal.identification.mixed_fit import mixed_fit_at
 from hilcal.mixed.equations import equations
 from hilcal.mixed.prediction import left_out
-from hilcal.mixed.variances import log_posterior
-from hilcal.model.model import Model
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, whitening
-from hilcal.types import Floats
+from hilcal.mixed.variances import Variances, log_posterior
+from hilcal.types import Ints
 
 MOST_ROWS = 600
 """Elements of readings beyond which the variances are taken for known: of 200 poses of a real UR10
@@ -31,21 +26,15 @@ SEED = 0
 """Of the draws, so that equal fits give equal factors."""
 
 
-def variance_spread(model: Model, theta: Floats, fitted: Readings, mode: Mode) -> float:
+def variance_spread(found: Variances, fold: Ints) -> float:
     """Return the factor, at least 1, of the variance of predictions.
 
     Args:
-        model: with a background.
-        theta: (P,) its parameters.
-        fitted: the readings that it was fitted to, without gross errors.
-        mode: "deflection" or "absolute".
+        found: the variances, at the fit.
+        fold: (R,) fold of each row.
     """
-    readings = fitted.as_stated()
-    w = whitening(readings, mode, "gc")
-    if w.m * len(w) > MOST_ROWS:
+    if len(fold) > MOST_ROWS:
         return 1.0
-    found = mixed_fit_at(model, readings, mode, theta)
-    fold = w.rows_of(random_folds(distinct_poses(readings)[w.reading]))
     _, at = left_out(found.equations, fold)
     rng, root = np.random.default_rng(SEED), np.linalg.cholesky(found.covariance)
     variance, off, weight = [], [], []

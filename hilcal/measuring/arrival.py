@@ -1,4 +1,4 @@
-"""What is read in one arrival of the arm: its target, or several one after the other."""
+"""What is read in one arrival of the arm, and where the tracker roughly stands, to be aimed."""
 
 from dataclasses import dataclass
 
@@ -6,12 +6,233 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import PointingTracker, TargetLostError, TrackerDevice, WrenchSample
+from hilcal.measuring.devices import (
+    Clock,
+    PointingTracker,
+    TargetLostError,
+    TrackerDevice,
+    WrenchSample,
+)
 from hilcal.measuring.measure import Measured, Measurer
 from hilcal.measuring.progress import Remark, Watcher
-from hilcal.measuring.rough_registration import RoughRegistration
+from hilcal.readings.covariance import joint_scatter
+from hilcal.robot import chain as chains
+from hilcal.robot.chain import drive_jacobian
+from hilcal.store.plan import Step
 from hilcal.types import Floats
+
+ENOUGH = 4
+"""Readings from which a registration is computed: three fix it, one more checks it."""
+WITNESSES = 2
+"""Readings by whose distances another one is judged, at least."""
+SPREAD_M = 0.05
+"""Second extent of a cloud of positions that fixes a rotation, m."""
+PLAUSIBLE_M = 0.1
+"""A reading so far from where the nominal arm holds the target is not believed, m."""
+FITS_M = 0.02
+"""Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
+STRAYS = 3
+"""Readings that a registration leaves out at most; beyond that the nominal arm is wrong."""
+APART_M = 0.05
+"""Largest error of a distance between two readings, m."""
+STUCK_M = 1e-5
+"""Two readings so close to each other at poses that are not are one old reading, m."""
+STUCK_SHARE = 0.2
+"""A target that moves by less than this share of what the arm moves it by is not on the arm."""
+MOVES_M = 0.005
+"""The arm has to move a target by so much before that is asked, m; geometric errors are less."""
+
+
+class RoughRegistration:
+    """The registration T_sensor_base as far as it is known while a campaign is measured.
+
+    Good enough to notice that the tracker follows something else, and to judge a drift by the
+    arm's repeatability; identification does not use it.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        """Start with what is configured."""
+        self._cell = cell
+        self._held: list[Floats] = []
+        self._seen: list[Floats] = []
+        self._target: list[int] = []
+        self._step: list[Step | None] = []
+        self._doubted: list[int] = []
+        self._repeated: list[tuple[Step, str]] = []
+
+    def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
+        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
+
+        One that repeats an earlier one is left out; older versions stored such. `step` is the one
+        that it was stored for, None at the positions of the start.
+        """
+        held = self._positions(q)[target]
+        if self._stuck(held, position, target) is not None:
+            return
+        self._held.append(held)
+        self._seen.append(np.asarray(position))
+        self._target.append(target)
+        self._step.append(step)
+
+    def late_doubts(self) -> list[tuple[Step, str]]:
+        """Return the stored readings that may not be of their target, each once, and why.
+
+        They were stored while nothing told where the tracker stands: those that do not fit as soon
+        as that is known, and until then the one that the next reading repeated, which may be of
+        something at rest itself.
+        """
+        pose = self.pose()
+        if pose is None:
+            told, self._repeated = self._repeated, []
+            return told
+        far = _far(pose, np.array(self._held), np.array(self._seen))
+        out = []
+        for k, step in enumerate(self._step):
+            known = self._cell.known_targets[self._target[k]]
+            if far[k] > PLAUSIBLE_M and known and k not in self._doubted:
+                self._doubted.append(k)
+                why = (
+                    f"its target was {far[k]:.3g} m from where the arm held it; another reflector?"
+                )
+                out += [] if step is None else [(step, why)]
+        return out
+
+    def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
+        """Doubt the reading that a refused one repeats, unless the tracker's place vouches for it.
+
+        The arguments are those of `add`.
+        """
+        if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
+            return
+        last = max(k for k, t in enumerate(self._target) if t == target)
+        step = self._step[last]
+        if step is not None and last not in self._doubted:
+            self._doubted.append(last)
+            why = "the next reading saw the same place from another pose; a reflector at rest?"
+            self._repeated.append((step, why))
+
+    def pose(self) -> tuple[Floats, Floats] | None:
+        """Return rotation (3, 3) and translation (3,) of T_sensor_base; None while unknown.
+
+        Least squares over the nominal positions p: min Σ |x − R p − t|², R from the singular
+        value decomposition of Σ (x − x̄)(p − p̄)ᵀ (Kabsch 1976).
+        """
+        known = self._cell.registration
+        if self._cell.registration_known:
+            return known[:3, :3], known[:3, 3]
+        held, seen = (
+            np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen)
+        )
+        if len(held) < ENOUGH:
+            return None
+        whole = _kabsch(held, seen)
+        if not all(self._cell.known_targets):  # a guessed place on the flange fits nowhere
+            return whole
+        for _ in range(STRAYS + 1):
+            found = _kabsch(held, seen)
+            if found is None or _far(found, held, seen).max() <= FITS_M:
+                return found
+            if len(held) == ENOUGH:
+                return None
+            rest = [(np.delete(held, k, 0), np.delete(seen, k, 0)) for k in range(len(held))]
+            worst = [np.inf if (p := _kabsch(*x)) is None else _far(p, *x).max() for x in rest]
+            held, seen = rest[int(np.argmin(worst))]
+        return whole
+
+    def expected(self, q: Floats) -> Floats | None:
+        """Return (T, 3) where the targets are expected, sensor axes, m; None while unknown."""
+        pose = self.pose()
+        return None if pose is None else self._positions(q) @ pose[0].T + pose[1]
+
+    def implausible(self, q: Floats, position: Floats, target: int = 0) -> str | None:
+        """Return in one line why a reading cannot be of the target on the arm, or None."""
+        stuck = self._stuck(self._positions(q)[target], position, target)
+        if stuck is not None:
+            return stuck
+        if not self._cell.known_targets[target]:
+            return None
+        places = self.expected(q)
+        if places is None:
+            off = self._apart(self._positions(q)[target], position)
+        else:
+            off = float(np.linalg.norm(position - places[target]))
+        if off <= (APART_M if places is None else PLAUSIBLE_M):
+            return None
+        least = " or more" if places is None else ""
+        return (
+            f"tracker: it sees its target {off:.3g} m{least} from where the arm holds it; does it "
+            "follow another reflector, or has it been moved? Have it see the target; where it has "
+            "been moved, go on in a new campaign"
+        )
+
+    def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
+        """Why a reading is the one before it or of something at rest, or None.
+
+        Distances between positions do not depend on where the tracker stands.
+        """
+        same = np.flatnonzero(np.array(self._target) == target)
+        if not len(same):
+            return None
+        last = int(same[-1])
+        moved = float(np.linalg.norm(held - self._held[last]))
+        seen = float(np.linalg.norm(position - self._seen[last]))
+        known = self._cell.known_targets[target]
+        limit = max(STUCK_M, STUCK_SHARE * moved if known else 0.0)
+        if moved <= MOVES_M or seen > limit:
+            return None
+        return (
+            f"tracker: its target has moved by {1e3 * seen:.3g} mm where the arm has moved it by "
+            f"{1e3 * moved:.3g} mm: it repeats an old reading, or follows a reflector that is not "
+            "on the arm. Have it see the target"
+        )
+
+    def _apart(self, held: Floats, position: Floats) -> float:
+        """By how much most distances from the other readings are not those of the arm, m.
+
+        The median; zero with fewer than two, of which one may be wrong itself.
+        """
+        if len(self._held) - len(self._doubted) < WITNESSES:
+            return 0.0
+        others = (np.delete(np.array(x), self._doubted, axis=0) for x in (self._held, self._seen))
+        moved, seen = (
+            np.linalg.norm(x - y, axis=1) for x, y in zip(others, (held, position), strict=True)
+        )
+        off = np.sort(np.abs(seen - moved))
+        return float(off[(len(off) - 1) // 2])
+
+    def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
+        """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
+
+        J Σ_q Jᵀ at the target; while the tracker's axes are unknown its mean over all
+        directions, tr(J Σ_q Jᵀ)/3.
+        """
+        chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
+        point = chain.point(self._cell.target[:3, 3])
+        jac, pose = drive_jacobian(self._cell.arm, chain, point)[0], self.pose()
+        if pose is None:
+            return np.asarray(np.trace(joint_scatter(jac, joint_std, np.eye(3), 3)) / 3 * np.eye(3))
+        return joint_scatter(jac, joint_std, pose[0], 3)
+
+    def _positions(self, q: Floats) -> Floats:
+        """(T, 3) nominal positions of the targets, base axes, m."""
+        chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
+        return np.array([chain.point(t[:3, 3])[0] for t in self._cell.all_targets])
+
+
+def _kabsch(held: Floats, seen: Floats) -> tuple[Floats, Floats] | None:
+    """Rotation (3, 3) and translation (3,) that take positions to positions (K, 3) best."""
+    h, s = held - held.mean(axis=0), seen - seen.mean(axis=0)
+    if np.linalg.svd(h, compute_uv=False)[1] < SPREAD_M:
+        return None
+    u, _, vt = np.linalg.svd(s.T @ h)
+    flip = np.diag([1.0, 1.0, np.linalg.det(u @ vt)])
+    rotation = u @ flip @ vt
+    return rotation, seen.mean(axis=0) - rotation @ held.mean(axis=0)
+
+
+def _far(pose: tuple[Floats, Floats], held: Floats, seen: Floats) -> Floats:
+    """(K,) how far readings are from where a registration expects them, m."""
+    return np.asarray(np.linalg.norm(seen - held @ pose[0].T - pose[1], axis=1))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,4 +1,4 @@
-"""Opening the devices that a configuration names; all failures are reported together."""
+"""The open devices that a configuration names; all failures are reported together."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,9 +9,38 @@ from typing import Any
 from hilcal.config import CellConfig
 from hilcal.errors import HilcalError, InputError
 from hilcal.measuring import devices
-from hilcal.measuring.devices import Report
-from hilcal.measuring.rig import Rig
+from hilcal.measuring.devices import (
+    ArmDevice,
+    ForceSensorDevice,
+    OperatorDevice,
+    Report,
+    TrackerDevice,
+)
 from hilcal.toml import suggest
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rig:
+    """Every device that a campaign uses, connected.
+
+    Attributes:
+        arm: the arm.
+        tracker: the tracker.
+        force: the force sensor; None where the cell has none.
+        operator: the person who hangs the loads.
+    """
+
+    arm: ArmDevice
+    tracker: TrackerDevice
+    force: ForceSensorDevice | None
+    operator: OperatorDevice
+
+    def close(self) -> None:
+        """Close everything, the arm first. Never raises, may be called twice."""
+        for device in (self.arm, self.tracker, self.force, self.operator):
+            if device is not None:
+                device.close()
+
 
 Factory = Callable[[CellConfig], Any]
 

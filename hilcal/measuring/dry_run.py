@@ -7,9 +7,9 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.measuring.route import Stop, duration, home, route
-from hilcal.measuring.sight import UNKNOWN
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.toml import suggest
 
@@ -129,7 +129,7 @@ def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
 def _unseen(limits: Feasibility) -> tuple[str, ...]:
     """A line where incidence is configured and cannot be checked."""
     asked = limits.config.sight.target_normal is not None
-    return (UNKNOWN,) if asked and limits.sight is None else ()
+    return (TRACKER_UNKNOWN,) if asked and limits.sight is None else ()
 
 
 def _remarks(plan: Plan, mode: str) -> tuple[str, ...]:

@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.measuring.clearance import clearance_of
-from hilcal.measuring.sight import sight_of
-from hilcal.robot import chain as chains
+from hilcal.measuring.clearance import clearance_of, sight_of
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, is_known
+from hilcal.robot.chain import Chain, evaluate
 from hilcal.robot.scene import Pairs, Segment, from_axis, on_flange
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.store.plan import UNLOADED
@@ -145,8 +146,9 @@ class Feasibility:
 
     def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Finding]:
         """Yield what any of the states (N, n) does not keep under a load, each at its worst."""
+        at = _Placed(self.cell.arm, q)
         for kind in kinds:
-            for part in self._parts(kind, q, load):
+            for part in self._parts(kind, at, load):
                 yield from part.findings(kind)
 
     def unbearable(self, load: str) -> dict[str, str]:
@@ -218,7 +220,7 @@ class Feasibility:
     def _beyond(self, kind: str, q: Floats, load: str, turn: Floats | None = None) -> Bools:
         """(N,) which states break a kind, or might within turns (N, n) of the chain's joints."""
         out = ~self._always(q)
-        for part in self._parts(kind, q, load):
+        for part in self._parts(kind, _Placed(self.cell.arm, q), load):
             left = np.flatnonzero(~out)
             if len(left):
                 out[left] = part.beyond(left, None if turn is None else turn[left])
@@ -226,27 +228,27 @@ class Feasibility:
 
     # what is checked
 
-    def _parts(self, kind: str, q: Floats, load: str) -> Iterator["_Bounds | _Touch"]:
-        scene, margins = self.shapes.scene, self.margins
+    def _parts(self, kind: str, at: "_Placed", load: str) -> Iterator["_Bounds | _Touch"]:
+        scene, margins, q = self.shapes.scene, self.margins, at.q
         if not len(q):
             return
         if kind == JOINTS:
             yield self._joints(q)
         elif kind == WORKSPACE:
-            poses = body_poses(self.cell.arm, q)[:, self._body]
+            poses = body_poses(self.cell.arm, q, at.chain)[:, self._body]
             ends = poses[:, :, None, :3, :3] @ self._ends[..., None]
             places = ends[..., 0] + poses[:, :, None, :3, 3]
             yield self._inside(self._names, places, self._radius, self._held, self._rates)
         elif kind == TORQUE:
-            yield self._torque(q, load)
+            yield self._torque(at.chain, load)
         elif kind == SENSOR and self.config.force_sensor is not None:
-            yield self._moment(q, load)
+            yield self._moment(at.chain, load)
         elif kind == ITSELF:
             yield _Touch(scene.itself, q, margins.itself, scene.itself.rates, guessed=self._guessed)
         elif kind == OBSTACLE:
             yield _Touch(scene.around, q, margins.clear, scene.around.rates)
         elif kind == HANGING:
-            hung = self.shapes.segments(q, load)
+            hung = self.shapes.segments_at(at.chain.point(self.cell.load_point), load)
             if hung:
                 places = np.stack([np.stack([x.start, x.end], axis=1) for x in hung], axis=1)
                 held = np.ones((len(hung), len(_SIDES)), dtype=np.bool_)
@@ -298,12 +300,12 @@ class Feasibility:
         chosen = over.reshape(len(over), len(names), len(_SIDES))[:, body, side] + margin
         return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), told)
 
-    def _torque(self, q: Floats, load: str) -> "_Bounds":
+    def _torque(self, chain: Chain, load: str) -> "_Bounds":
         cell, arm, share = self.cell, self.cell.arm, self.config.limits.torque_share
         pull = self._pull(load)
-        wrench = np.broadcast_to(pull, (len(q), 6))
+        wrench = np.broadcast_to(pull, (chain.position.shape[1], 6))
         carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        about_axes = slot_wrenches(arm, chains.evaluate(arm, q), carried)[:, : arm.n, 5]
+        about_axes = slot_wrenches(arm, chain, carried)[:, : arm.n, 5]
         torque = np.abs(arm.drive_torques(about_axes))
         usable = share * np.asarray(arm.torque_max, dtype=float)
 
@@ -325,12 +327,12 @@ class Feasibility:
         limit = self.margins.bear * usable
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
 
-    def _moment(self, q: Floats, load: str) -> "_Bounds":
+    def _moment(self, chain: Chain, load: str) -> "_Bounds":
         """The moment that tool and load exert on the force sensor."""
         sensor, cell, pull = self.config.force_sensor, self.cell, self._pull(load)
         if sensor is None:
             raise ValueError("the cell has no force sensor")
-        chain, at = chains.evaluate(cell.arm, q), np.asarray(sensor.origin_m)
+        at = np.asarray(sensor.origin_m)
         weight, origin = cell.tool_mass * cell.gravity, chain.point(at)
         moment = pull[3:] + se3.cross(chain.point(cell.load_point) - origin, pull[:3])
         moment = moment + se3.cross(chain.point(cell.tool_com) - origin, weight)
@@ -402,6 +404,17 @@ class Feasibility:
         """(6,) wrench of a load at the load point, base axes; zero unloaded."""
         hung = self.shapes.load(load)
         return np.zeros(6) if hung is None else hung.wrench(self.cell.gravity)
+
+
+class _Placed:
+    """An arm in N states q (N, n); where it is, is evaluated once for all checks that ask."""
+
+    def __init__(self, arm: Arm, q: Floats) -> None:
+        self.arm, self.q = arm, q
+
+    @cached_property
+    def chain(self) -> Chain:
+        return evaluate(self.arm, self.q)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,9 +8,9 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Load
 from hilcal.errors import DeviceError
-from hilcal.measuring.clock import Clock
 from hilcal.measuring.devices import (
     ArmDevice,
+    Clock,
     ConfirmingOperator,
     OperatorDevice,
     TerminalPerson,

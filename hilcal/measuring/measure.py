@@ -1,16 +1,40 @@
-"""Measuring one reading: wait until everything has settled, average, check."""
+"""Measuring one reading: wait until everything has settled, average, check.
 
-from collections.abc import Callable
+**Settling.** Whether the tracker's readings are at rest, judged by their own trend and scatter.
+The window is the last half of what has been measured since the arm stopped, at least K samples:
+so a disturbance that fades is forgotten after twice the time that it took to fade, and a slow
+one is looked at for longer. In the window, a line x_k = x̄ + b (t_k - t̄) + noise is fitted:
+
+- drift: D = S b Σ̄⁻¹ bᵀ with S = Σ (t_k - t̄)² is chi² with m degrees of freedom at rest; the
+  readings drift if that is less probable than `DRIFT_P` (`AFTER_DRIFT_P` once they did), unless
+  the drift over the window is below half the standard deviation of the mean: then it does not
+  matter.
+- scatter about the line: if it cannot be the stated noise (p < `SCATTER_P`), the arm may still
+  vibrate, or the instrument be worse than stated. It is taken for the instrument's once there
+  are 2 K samples (2 K log10 of the excess where it is larger) and their second half does not
+  scatter less than the first; drift is then judged relative to the scatter (an F test).
+
+At rest and with the stated noise, the first full window is refused with a probability of
+DRIFT_P + SCATTER_P at most. A first window that moves by less than about four sigmas of a
+sample is not detected; more samples detect smaller drifts.
+
+**Averaging.** Several measurements at rest become one reading with the covariance of their mean.
+The covariance of the mean is `readings.covariance.covariance_of_mean`. Its factor τ is 1 unless the
+scatter cannot be explained by the stated noise (chi² test, p < 0.001): then it is their ratio, so
+that an instrument that is far worse than stated is not believed.
+"""
+
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
-from hilcal.measuring.average import Average, average
-from hilcal.measuring.clock import Clock
 from hilcal.measuring.devices import (
     ArmSample,
+    Clock,
     TargetLostError,
     TrackerDevice,
     TrackerSample,
@@ -19,8 +43,267 @@ from hilcal.measuring.devices import (
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import POLL_S, Mover
 from hilcal.measuring.progress import Remark, Watcher
-from hilcal.measuring.settle import SettleWindow
-from hilcal.types import Floats
+from hilcal.readings.covariance import covariance_of_mean
+from hilcal.readings.whitening import inverse_root
+from hilcal.robot import se3
+from hilcal.types import Bools, Floats
+
+UNEXPLAINED = 1e-3
+"""Scatter less probable than this disproves the stated noise; a choice, no study set it."""
+GROSS_SIGMA = 6.0
+"""A sample so far off (as improbable as so many sigmas of a single number) is left out; a guess."""
+MOST_LEFT_OUT = 0.2
+"""Share of the samples that may be left out; one always may. A guess."""
+_MEAN_STEPS = 10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Average:
+    """The mean of K samples.
+
+    Attributes:
+        value: (m,) position in m and, for m = 6, rotation vector in rad, sensor axes.
+        covariance: (m, m) of `value`; rotations as small rotations about the sensor's axes.
+        scatter: mean square of the scatter over what is stated; 1 is expected.
+        scatter_p: how probable at least as much scatter is under the stated noise.
+        left_out: numbers of the samples (from 0) that were gross outliers.
+        warnings: what a person should know, one line each.
+    """
+
+    value: Floats
+    covariance: Floats
+    scatter: float
+    scatter_p: float
+    left_out: tuple[int, ...]
+    warnings: tuple[str, ...]
+
+
+def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
+    """Average K samples of one target at rest; the law is that of the module.
+
+    A gross outlier among them is left out: its squared distance from the median, whitened by
+    Σ̄ and relative to what is usual in the window (never less than stated), is less probable
+    than `GROSS_SIGMA`.
+
+    Args:
+        samples: at least 2, of one target at rest.
+        systematic_share: s, 0 to 1.
+
+    Raises:
+        DeviceError: more than one in five samples (and more than one) are gross outliers, or
+            fewer than 2 remain.
+    """
+    values = np.array([sample.value for sample in samples])
+    stated = np.array([sample.covariance for sample in samples])
+    keep = _not_gross(values, stated.mean(axis=0))
+    left_out = tuple(int(k) for k in np.flatnonzero(~keep))
+    if len(left_out) > max(1.0, MOST_LEFT_OUT * len(samples)) or keep.sum() < 2:
+        raise DeviceError(
+            f"tracker: its readings scatter: {len(left_out)} of {len(samples)} at one pose are "
+            "gross outliers; is the beam disturbed, or does something move?"
+        )
+    prior = stated[keep].mean(axis=0)
+    mean, residuals = deviations(values[keep])
+    ratio, p = _trace_test(residuals, prior)
+    believed = 1.0 if p >= UNEXPLAINED else ratio
+    covariance = covariance_of_mean(prior, residuals, systematic_share, believed)
+    warnings = [f"reading {k + 1} of {len(samples)} is a gross outlier, left out" for k in left_out]
+    if p < UNEXPLAINED:
+        warnings.append(
+            f"the repeats scatter {np.sqrt(ratio):.1f} times as much as the instrument's noise "
+            f"(p = {p:.1g}); the reading's covariance was enlarged"
+        )
+    warnings += dict.fromkeys(
+        s.warning for s, kept in zip(samples, keep, strict=True) if kept and s.warning
+    )
+    return Average(mean, covariance, ratio, p, left_out, tuple(warnings))
+
+
+def deviations(values: Floats) -> tuple[Floats, Floats]:
+    """Mean (m,) of values (K, m), and each one's deviation from it (K, m).
+
+    Rotations average in the tangent space: R̄ is where the rotation vectors of R_k R̄ᵀ have
+    the mean zero (the Fréchet mean; Barfoot, *State Estimation for Robotics*, section 7.3).
+    """
+    mean = values.mean(axis=0)
+    residuals = values - mean
+    if values.shape[1] == 6:
+        turns = se3.rotation(values[:, 3:])
+        middle = turns[0]
+        for _ in range(_MEAN_STEPS):
+            residuals[:, 3:] = se3.rotation_vector(turns @ middle.T)
+            step = residuals[:, 3:].mean(axis=0)
+            if np.linalg.norm(step) < 1e-14:
+                break
+            middle = se3.rotation(step) @ middle
+        mean[3:] = se3.rotation_vector(middle)
+    return mean, residuals
+
+
+def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
+    """T / (m (K - 1)) and P(chi² >= T), with T = Σ_k r_kᵀ Σ̄⁻¹ r_k.
+
+    Under the stated noise T follows chi² with m (K - 1) degrees of freedom.
+    """
+    count, m = residuals.shape
+    white = residuals @ inverse_root(prior).T
+    total, dof = float(np.sum(white**2)), m * (count - 1)
+    return total / dof, float(stats.chi2.sf(total, dof))
+
+
+def _not_gross(values: Floats, stated: Floats) -> Bools:
+    """Which samples (K,) are no gross outliers."""
+    m = values.shape[1]
+    white = deviations(values)[1] @ inverse_root(stated).T
+    square = np.sum((white - np.median(white, axis=0)) ** 2, axis=1)
+    usual = max(1.0, float(np.median(square) / stats.chi2.median(m)))
+    return np.asarray(stats.chi2.logsf(square / usual, m) > _LOG_GROSS)
+
+
+_LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))
+
+
+DRIFT_P = 0.04
+"""False alarm rate of the drift test. The constants here are choices, traded by hand in
+tests/unit/measuring/test_settle.py: time lost at rest against the bias that a decay leaves."""
+AFTER_DRIFT_P = 0.3
+"""The same after readings have drifted: the test is repeated at every sample, and none of the
+repeated tests may miss a drift that is there."""
+SCATTER_P = 0.001
+SHRINKING_P = 0.05
+NEGLIGIBLE = 0.5
+"""Drift over the window that does not matter, as a share of the standard deviation of a mean."""
+FEW = 12
+"""Fewer samples than this do not estimate a scatter."""
+LONGEST = 10
+"""The window grows to at most so many times K samples."""
+
+
+class SettleWindow:
+    """Collects samples after the arm has stopped, and tests whether they are at rest."""
+
+    def __init__(self, count: int, scale: float = 1.0) -> None:
+        """Start empty.
+
+        Args:
+            count: K, the least number of samples to judge, 3 or more.
+            scale: cell seconds per real second (`Clock.scale`).
+
+        Raises:
+            ValueError: fewer than 3.
+        """
+        if count < 3:
+            raise ValueError(f"count = {count}: a trend takes at least 3 samples")
+        self._count, self._scale = count, scale
+        self._samples: list[TrackerSample] = []
+        self._settled = self._has_drifted = False
+
+    def add(self, sample: TrackerSample) -> None:
+        """Add the next sample."""
+        self._samples.append(sample)
+        del self._samples[: -2 * LONGEST * self._count]
+        self._settled = len(self._samples) >= self._count and self._judge()
+
+    def clear(self) -> None:
+        """Forget everything: the arm has moved, or the load has changed."""
+        self._samples.clear()
+        self._settled = self._has_drifted = False
+
+    def __len__(self) -> int:
+        """Number of samples since the start, as far as they are remembered."""
+        return len(self._samples)
+
+    @property
+    def latest(self) -> tuple[TrackerSample, ...]:
+        """The last K samples, fewer if there are not as many yet."""
+        return tuple(self._samples[-self._count :])
+
+    @property
+    def drift(self) -> Floats:
+        """Slope (m,) over the window, m/s and rad/s of cell time; zeros before 2 samples."""
+        window = self._window()
+        if len(window) < 2:
+            return np.zeros(window[0].value.shape[0] if window else 3)
+        return _trend(window, self._scale).slope
+
+    def settled(self) -> bool:
+        """Whether the readings are at rest; False before K samples."""
+        return self._settled
+
+    def _judge(self) -> bool:
+        """Test the window after a new sample."""
+        window = self._window()
+        trend = _trend(window, self._scale)
+        if trend.moment == 0.0:
+            return False  # all at one time: no word on a trend
+        noise = 1.0
+        if trend.scatter_p < SCATTER_P:
+            enough = max(2 * self._count, FEW) * max(1.0, np.log10(trend.scatter))
+            if len(self._samples) < enough or self._shrinking():
+                return False
+            noise = trend.scatter
+        over_window = np.linalg.norm(trend.white_slope) * trend.span
+        if over_window < NEGLIGIBLE * np.sqrt(noise / len(window)):
+            return True
+        m, drift = len(trend.slope), trend.moment * float(np.sum(trend.white_slope**2))
+        if noise == 1.0:
+            p = float(stats.chi2.sf(drift, m))
+        else:
+            p = float(stats.f.sf(drift / (m * noise), m, trend.dof))
+        self._has_drifted = self._has_drifted or p <= DRIFT_P
+        return bool(p > (AFTER_DRIFT_P if self._has_drifted else DRIFT_P))
+
+    def _window(self) -> Sequence[TrackerSample]:
+        """The last half of all, at least K."""
+        return self._samples[-max(self._count, len(self._samples) // 2) :]
+
+    def _shrinking(self) -> bool:
+        """Whether the second half of all samples scatters less than the first (F test)."""
+        half = len(self._samples) // 2
+        first = _trend(self._samples[:half], self._scale)
+        second = _trend(self._samples[-half:], self._scale)
+        ratio = first.scatter / max(second.scatter, np.finfo(float).tiny)
+        return bool(stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Trend:
+    """A line through a window.
+
+    Attributes:
+        slope: (m,) per s of cell time.
+        white_slope: (m,) the same, whitened by the mean stated covariance.
+        moment: Σ (t_k - t̄)², s².
+        span: from the first to the last sample, s.
+        scatter: mean square about the line over what is stated.
+        scatter_p: how probable at least as much is.
+        dof: m (K - 2).
+    """
+
+    slope: Floats
+    white_slope: Floats
+    moment: float
+    span: float
+    scatter: float
+    scatter_p: float
+    dof: int
+
+
+def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
+    """Least squares of a line."""
+    time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9 * scale
+    span = float(time[-1])
+    time -= time.mean()
+    moment = float(time @ time)
+    residuals = deviations(np.array([s.value for s in samples]))[1]
+    root = inverse_root(np.mean([s.covariance for s in samples], axis=0))
+    slope = time @ residuals / moment if moment > 0 else np.zeros(residuals.shape[1])
+    about = (residuals - np.outer(time, slope)) @ root.T
+    dof = residuals.shape[1] * (len(samples) - 2)
+    total = float(np.sum(about**2))
+    scatter, p = (total / dof, float(stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
+    return _Trend(slope, root @ slope, moment, span, scatter, p, dof)
+
 
 SEARCHES = 2
 """How often a lost target is searched for in one reading."""

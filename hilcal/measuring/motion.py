@@ -7,13 +7,11 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import ArmDevice, ArmSample
+from hilcal.measuring.devices import ArmDevice, ArmSample, Clock
 from hilcal.measuring.dry_run import on_route
 from hilcal.measuring.feasibility import Feasibility
 from hilcal.measuring.force import ForceMeter
-from hilcal.measuring.guard import HOW_ON, NORMAL, Guard
-from hilcal.measuring.load_watch import LoadWatch
+from hilcal.measuring.guard import HOW_ON, NORMAL, Guard, LoadWatch
 from hilcal.measuring.route import Stop, duration
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats

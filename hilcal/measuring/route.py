@@ -1,6 +1,8 @@
 """The way of the arm through a plan: every stop in order, and where loads are changed."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -74,6 +76,21 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
             stops.append(Stop(*away, hanging))
         stops.append(Stop(step.pose, plan.joints(step.pose), step.load, step=step))
     return tuple(stops)
+
+
+def approach_sides(stops: Sequence[Stop]) -> Floats:
+    """Return (S, n) from which side each joint arrives at the readings of a route, -1 or +1.
+
+    It is the direction of the joint's last motion, also of one to a stop without a reading, as
+    where a load is changed; 0 where it has not moved.
+    """
+    side, sides = np.zeros(len(stops[0].q)), []
+    for before, stop in pairwise(stops):
+        moved = np.sign(stop.q - before.q)
+        side = np.where(moved == 0.0, side, moved)
+        if stop.step is not None:
+            sides.append(side)
+    return np.array(sides)
 
 
 def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> float:

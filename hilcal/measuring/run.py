@@ -8,15 +8,14 @@ from typing import Any
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import ArmDevice
+from hilcal.measuring.connect import Rig
+from hilcal.measuring.devices import ArmDevice, Clock
 from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.rig import Rig
+from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import route
 from hilcal.measuring.session import LiveModel, Session
 from hilcal.measuring.stopping_rule import StoppingRule
-from hilcal.measuring.store import Store
 from hilcal.store.plan import Plan
 
 HOW_ON = "The campaign is safe: run again with --resume"

@@ -12,24 +12,19 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError
-from hilcal.measuring.arrival import ArrivalReader, TargetReading
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import LoadChangedError, TargetLostError, WrenchSample
-from hilcal.measuring.drift import Shift
-from hilcal.measuring.eta import Eta
+from hilcal.measuring.arrival import ArrivalReader, RoughRegistration, TargetReading
+from hilcal.measuring.connect import Rig
+from hilcal.measuring.devices import Clock, LoadChangedError, TargetLostError, WrenchSample
 from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.guard import Guard
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import Measured, Measurer
 from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
-from hilcal.measuring.rig import Rig
-from hilcal.measuring.rough_registration import RoughRegistration
+from hilcal.measuring.reading_record import Store, detail, reading_of, sample_json, stored_wrench
 from hilcal.measuring.route import Stop
-from hilcal.measuring.session_state import SessionState
+from hilcal.measuring.session_state import Eta, SessionState, Shift
 from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
-from hilcal.measuring.store import Store
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
 from hilcal.types import Floats
@@ -334,6 +329,10 @@ class Session:
         if wrong is not None:
             for told in details:
                 self._event("doubted", {"why": str(wrong), "reading": told})
+            for one in found:
+                position = one.measured.mean.value[:3]
+                self._state.registration.doubt_repeated(one.measured.q, position, one.target or 0)
+            self._look_back()
             raise wrong
 
     def _look_back(self) -> None:

@@ -9,8 +9,8 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, Watcher
+from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import Stop, home
-from hilcal.measuring.store import Store
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
 

@@ -55,6 +55,10 @@ class Variances:
         """(F + N,) estimate of log s and η."""
         return self.equations.log_std
 
+    def std(self, name: str) -> float:
+        """Return the standard deviation of a family or of a component of the noise."""
+        return float(np.exp(self.log_std[self.equations.problem.names.index(name)]))
+
 
 def estimate_variances(
     problem: MixedProblem, start: Floats | None = None, *, search: bool = False

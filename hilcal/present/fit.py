@@ -10,15 +10,14 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
-from hilcal.identification.before import error_before
 from hilcal.identification.carried import Group as CarriedGroup
 from hilcal.identification.drift import Conflict
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.full_prediction import FullPrediction, full_prediction
+from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
 from hilcal.identification.gross_errors import gross_errors
 from hilcal.identification.learnt import of_arm
+from hilcal.identification.residual import ErrorBlock
 from hilcal.numbers import names
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.registration import fitted_lines

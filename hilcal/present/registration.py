@@ -8,8 +8,8 @@ from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
+from hilcal.identification.misdescription import OtherArm
 from hilcal.identification.noise_estimate import NoiseEstimate
-from hilcal.identification.other_arm import OtherArm
 from hilcal.identification.registration import Registration, Undetermined, register
 from hilcal.identification.robot_frames import RobotFrames
 from hilcal.readings.whitening import Mode

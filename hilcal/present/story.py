@@ -19,9 +19,9 @@ from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.discovery.drawn_law import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
 from hilcal.identification.full_prediction import FullPrediction, full_prediction
+from hilcal.identification.residual import ErrorBlock
 from hilcal.model.model import Model
 from hilcal.present.diagnosis import (
     diagnosis_report,

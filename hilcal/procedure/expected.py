@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.design.timing import pace
-from hilcal.measuring.route import duration, route
+from hilcal.measuring.route import approach_sides, duration, route
 from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import Plan
@@ -32,17 +32,14 @@ def expected_states(
     """
     at = pace(config)
     stops = route(plan, arm, config.limits.joint_margin_rad)
-    side, now, since = np.zeros(arm.n), begun, begun
-    sides, times, hung = [], [], []
+    now, since = begun, begun
+    times, hung = [], []
     for before, stop in pairwise(stops):
-        moved = np.sign(stop.q - before.q)
-        side = np.where(moved == 0.0, side, moved)
         now += duration(before.q, stop.q, at.speed, at.acceleration)
         if stop.change_to is not None:
             now += at.change_s
             since = now
         if stop.step is not None:
-            sides.append(side)
             times.append(now + at.reading_s / 2)
             hung.append(times[-1] - since)
             now += at.reading_s
@@ -50,7 +47,7 @@ def expected_states(
     known = {
         "time": np.array(times),
         "load_time": np.array(hung),
-        "approach": np.array(sides),
+        "approach": approach_sides(stops),
     }
     given = {name: v for name, v in known.items() if getattr(last, name) is not None}
     q = np.array([plan.joints(step.pose) for step in plan.steps])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import compress
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.readings.readings import Readings, States
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
 
 Say = Callable[[str], None]
@@ -111,16 +112,18 @@ def fewer_returns(plan: Plan, space: Space, config: CellConfig) -> Plan:
     """Return the plan without readings at the reference pose where a load is changed.
 
     The arm goes there all the same. The first and the last one stay, which measure the drift of a
-    campaign that takes minutes.
+    campaign that takes minutes, and the unloaded ones of loaded ones that stay: a deflection needs
+    both.
     """
     steps = plan.steps
-    kept = [
-        s
-        for k, s in enumerate(steps)
-        if s.pose != REFERENCE
+    stays = [
+        s.pose != REFERENCE
         or k in (0, len(steps) - 1)
         or steps[k - 1].load == s.load == steps[k + 1].load
+        for k, s in enumerate(steps)
     ]
+    needed = {Step(s.pose, UNLOADED, s.cycle) for s in compress(steps, stays)}
+    kept = [s for s, stay in zip(steps, stays, strict=True) if stay or s in needed]
     made = replace(plan, steps=tuple(kept))
     margin = config.limits.joint_margin_rad
     lasts = timeline(made, space.cell.arm, margin, pace(config))[0]

@@ -1,4 +1,4 @@
-"""The covariance of a reading: the one place where its parts are made and added.
+"""The covariance of readings: the one place where its terms are made and added.
 
     V = s Σ̄ + R / K + R_sensor_base J Σ_q Jᵀ R_sensor_baseᵀ
 
@@ -18,16 +18,22 @@ cover, the file states (`COVERS`):
   `hilcal export` writes), or the cell does ([repeatability] in_tables = true): `WHOLE`, and nothing
   is added;
 - a campaign imported before the file stated it is read as it was: nothing is added.
+
+Two readings have in common the scatter of an arrival and noise that is correlated along their
+order, two deflections the error of their unloaded readings (`measurement_covariance`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from hilcal.config import Tracker
 from hilcal.errors import InputError
-from hilcal.types import Bools, Floats
+from hilcal.readings.readings import Readings
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import drive_jacobian, evaluate
+from hilcal.types import Bools, Floats, Ints
 
 COVERS = "covariance"
 """Key among the texts about a campaign: what the stored covariances cover."""
@@ -185,6 +191,103 @@ def scatter_factor(jacobian: Floats, joint_std: Floats, rotation: Floats, m: int
     moved = jacobian * joint_std
     turned = np.concatenate([rotation @ moved[..., :3, :], rotation @ moved[..., 3:, :]], axis=-2)
     return np.asarray(turned[..., :m, :])
+
+
+def arrival_factors(
+    arm: Arm, readings: Readings, offset: Floats, rotation: Floats, joint_std: Floats
+) -> Floats:
+    """Factors F (N, m, n) of the scatter of the joints at the nominal poses of the readings.
+
+    Args:
+        arm: the nominal arm.
+        readings: N readings.
+        offset: (3,) or (N, 3) the target in flange axes, m.
+        rotation: (3, 3) R_sensor_base.
+        joint_std: (n,) standard deviations from one arrival to the next, rad.
+    """
+    chain = evaluate(arm, readings.states.q)
+    jac = drive_jacobian(arm, chain, chain.point(offset))
+    return scatter_factor(jac, joint_std, rotation, readings.m)
+
+
+def with_scatter(readings: Readings, factor: Floats) -> Readings:
+    """Return the readings with a scatter of the arm added: V + F Fᵀ, F (N, m, k).
+
+    Targets that were read in one arrival have it in common (`Readings.common`).
+    """
+    total = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
+    return replace(readings, covariance=total, common=_of_arrival(readings, factor))
+
+
+def scatter_alone(readings: Readings, factor: Floats) -> Readings:
+    """Return the readings with the covariance of a scatter F (N, m, k) of the arm alone."""
+    own = factor @ np.swapaxes(factor, 1, 2)
+    return replace(readings, covariance=own, common=_of_arrival(readings, factor), serial=None)
+
+
+def _of_arrival(readings: Readings, factor: Floats) -> Floats | None:
+    return None if readings.states.target is None else factor
+
+
+def symmetric_root(covariance: Floats) -> Floats:
+    """S (..., m, m) of covariances, see `serial_noise`."""
+    std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    per = 1.0 / np.where(std > 0, std, 1.0)
+    values, vectors = np.linalg.eigh(covariance * per[..., :, None] * per[..., None, :])
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return np.asarray(std[..., :, None] * (root @ np.swapaxes(vectors, -1, -2)))
+
+
+def instrument_root(readings: Readings, m: int | None = None) -> Floats:
+    """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's.
+
+    Of the first m elements; of all where that is None.
+    """
+    v = readings.covariance if readings.stated is None else readings.stated
+    if readings.stated is None and readings.common is not None:
+        v = v - readings.common @ np.swapaxes(readings.common, 1, 2)
+    return symmetric_root(v[:, :m, :m])
+
+
+def measurement_covariance(
+    readings: Readings, loaded: Ints, reference: Ints, weights: Floats
+) -> Floats:
+    """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
+
+    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
+    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`.
+
+    Args:
+        readings: N readings.
+        loaded: (G, L) rows of the measured readings of each group.
+        reference: (G, U) rows of the unloaded readings that they share.
+        weights: (L, U) of these in the mean that each measurement is taken from.
+    """
+    rows = np.concatenate([loaded, reference], axis=1)
+    groups, count = rows.shape
+    m = readings.m
+    c = np.zeros((groups, count, m, count, m))
+    if readings.common is not None and count > 1:
+        f, arrival = readings.common[rows], readings.arrivals[rows]
+        together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
+        np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
+    each = np.arange(count)
+    if readings.serial is not None and readings.along is not None:
+        root = instrument_root(readings)[rows]
+        shared = readings.serial.share * readings.serial.correlation(readings.along[rows])
+        c += np.einsum("gaik,gab,gbjk->gaibj", root, shared, root, optimize=True)
+    c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
+    if reference.shape[1]:
+        d = np.concatenate([np.eye(len(weights)), -weights], axis=1)
+        c = np.einsum("pa,gaibj,qb->gpiqj", d, c, d, optimize=True)
+    size = len(weights) * m
+    return c.reshape(groups, size, size)
+
+
+def single_covariance(v: Floats, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
+    """(G, L, m, m) covariance of each measurement by itself, from V (N, m, m); see above."""
+    unloaded = np.einsum("lu,guij->glij", weights**2, v[reference])
+    return np.asarray(v[loaded] + unloaded)
 
 
 def smallest_correlation(covariance: Floats) -> Floats:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.serial_noise import SerialNoise, symmetric_root
+from hilcal.readings.serial_noise import SerialNoise
 from hilcal.types import Bools, Floats, Ints
 
 SAME_POSE = 1e-6
@@ -156,16 +156,6 @@ class Readings:
         return replace(
             self, serial=noise, along=self.states.time if noise.clock == "time" else order
         )
-
-    def instrument_root(self, m: int | None = None) -> Floats:
-        """(N, m, m) S of `serial_noise`: root of the covariance that is not known as the arm's.
-
-        Of the first m elements; of all where that is None.
-        """
-        v = self.covariance if self.stated is None else self.stated
-        if self.stated is None and self.common is not None:
-            v = v - self.common @ np.swapaxes(self.common, 1, 2)
-        return symmetric_root(v[:, :m, :m])
 
     @property
     def m(self) -> int:

@@ -38,18 +38,8 @@ def already(readings: Readings, others: Readings) -> Bools:
         readings: N readings; where one of both has positions alone, these are compared.
         others: any number of readings.
     """
-    if not len(readings) or not len(others):
-        return np.zeros(len(readings), dtype=np.bool_)
-    if readings.states.q.shape[1] != others.states.q.shape[1]:
-        return np.zeros(len(readings), dtype=np.bool_)
-    from scipy.spatial import cKDTree  # slow to import
-
     attitude = readings.m == others.m == 6
-    tree = cKDTree(_coordinates(others, attitude))
-    distance, _ = tree.query(
-        _coordinates(readings, attitude), p=np.inf, distance_upper_bound=1.0 + 1e-9
-    )
-    return np.asarray(np.isfinite(distance))
+    return _near(_coordinates(readings, attitude), _coordinates(others, attitude))
 
 
 def prints(readings: Readings) -> Floats:
@@ -62,12 +52,16 @@ def prints(readings: Readings) -> Floats:
 
 def among(readings: Readings, kept: Floats) -> Bools:
     """(N,) which readings are among those whose `prints` (M, n + 4) were kept."""
-    own = prints(readings)
-    if not len(own) or not len(kept) or own.shape[1] != kept.shape[1]:
-        return np.zeros(len(readings), dtype=np.bool_)
+    return _near(prints(readings), kept)
+
+
+def _near(own: Floats, others: Floats) -> Bools:
+    """(N,) which coordinates (N, K) are among others (M, K'); none where K' is not K."""
+    if not len(own) or not len(others) or own.shape[1] != others.shape[1]:
+        return np.zeros(len(own), dtype=np.bool_)
     from scipy.spatial import cKDTree  # slow to import
 
-    distance, _ = cKDTree(kept).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
+    distance, _ = cKDTree(others).query(own, p=np.inf, distance_upper_bound=1.0 + 1e-9)
     return np.asarray(np.isfinite(distance))
 
 

@@ -75,12 +75,3 @@ class SerialNoise:
         given: dict[str, Any] = {name: x for name, x in content.items() if name != "half"}
         lists = given.keys() & {"instead", "wider"}
         return cls(**{**given, **{name: tuple(given[name]) for name in lists}})
-
-
-def symmetric_root(covariance: Floats) -> Floats:
-    """S (..., m, m) of covariances; see the module."""
-    std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    per = 1.0 / np.where(std > 0, std, 1.0)
-    values, vectors = np.linalg.eigh(covariance * per[..., :, None] * per[..., None, :])
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    return np.asarray(std[..., :, None] * (root @ np.swapaxes(vectors, -1, -2)))

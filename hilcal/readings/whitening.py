@@ -16,7 +16,6 @@ Cholesky's factor: the whitened rows of a measurement are what earlier ones do n
 """
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -25,10 +24,10 @@ from scipy.linalg import solve_triangular
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.readings.covariance import measurement_covariance, single_covariance
 from hilcal.readings.reading_groups import arrival_groups, deflection_groups, has_unloaded, runs
 from hilcal.readings.readings import Readings
 from hilcal.robot import se3
-from hilcal.robot.batch import chunks
 from hilcal.types import Floats, Ints
 
 Scaling = Literal["none", "gu", "gc"]
@@ -36,8 +35,6 @@ Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
-CACHED = 64_000
-"""Numbers that are whitened at a time, half a megabyte; a choice by timing."""
 MANY = 1000
 """Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
 rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
@@ -91,29 +88,12 @@ def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
     det > e k `RANK_TOLERANCE` have no eigenvalue that the rule leaves out.
     """
     k = covariance.shape[-1]
-    out = np.zeros(covariance.shape)
-    for rows in chunks(len(covariance)):
-        v, d, root = covariance[rows], np.asfortranarray(per_std[rows]), out[rows]
-        low: dict[tuple[int, int], Floats] = {}
-        inverse: dict[tuple[int, int], Floats] = {}
-        det = np.ones(len(v))
-        for i in range(k):
-            for j in range(i + 1):
-                rest = 0.5 * (v[:, i, j] + v[:, j, i]) * (d[:, i] * d[:, j])
-                for n in range(j):
-                    rest -= low[i, n] * low[j, n]
-                if j < i:
-                    low[i, j] = rest * inverse[j, j]
-            det *= np.maximum(rest, 0.0)
-            inverse[i, i] = 1.0 / np.sqrt(np.maximum(rest, RANK_TOLERANCE))
-            for j in range(i):
-                total = sum(low[i, n] * inverse[n, j] for n in range(j, i))
-                inverse[i, j] = -total * inverse[i, i]
-        for (i, j), x in inverse.items():
-            np.multiply(x, d[:, j], out=root[:, i, j])
-        doubtful = ~(det > math.e * k * RANK_TOLERANCE)
-        if doubtful.any():
-            root[doubtful] = _eigenvalue_roots(v[doubtful], d[doubtful])
+    correlation = covariance * per_std[:, :, None] * per_std[:, None, :]
+    sure = np.linalg.det(correlation) > math.e * k * RANK_TOLERANCE
+    out = np.empty(covariance.shape)
+    lower = np.linalg.cholesky((correlation + np.swapaxes(correlation, 1, 2))[sure] / 2)
+    out[sure] = np.linalg.inv(lower) * per_std[sure, None, :]
+    out[~sure] = _eigenvalue_roots(covariance[~sure], per_std[~sure])
     return out
 
 
@@ -134,31 +114,19 @@ class Bucket:
     factor: Floats
     weights: Floats
 
-    @property
-    def shared(self) -> bool:
-        """Whether all deflections are taken from the same unloaded readings."""
-        return bool(np.all(self.weights == self.weights[:1]))
+    def difference(self, x: Floats) -> Floats:
+        """(G·L, ...) loaded minus the mean of the unloaded of x (N, ...)."""
+        loaded = x[self.loaded]
+        if self.reference.shape[1]:
+            loaded -= self._reference_mean(x)
+        return loaded.reshape(self.loaded.size, *x.shape[1:])
 
-    def reference_mean(self, x: Floats, groups: slice = slice(None)) -> Floats:
-        """(G, L or 1, ...) means of the unloaded of x (N, ...), of some groups."""
-        unloaded = x[self.reference[groups]]
-        if unloaded.shape[1] == 1:
-            return np.asarray(unloaded)
-        if self.shared:
+    def _reference_mean(self, x: Floats) -> Floats:
+        """(G, L or 1, ...) means of the unloaded of x (N, ...)."""
+        unloaded = x[self.reference]
+        if np.all(self.weights == self.weights[:1]):  # all from the same ones
             return np.asarray(unloaded.mean(axis=1)[:, None])
         return np.asarray(np.einsum("lu,gu...->gl...", self.weights, unloaded))
-
-    def reference_covariance(self, v: Floats) -> Floats:
-        """(G, L or 1, m, m) covariance of those means, from covariances (N, m, m)."""
-        square = (self.weights[:1] if self.shared else self.weights) ** 2
-        return np.asarray(np.einsum("lu,guij->glij", square, v[self.reference]))
-
-    def own_covariance(self, v: Floats) -> Floats:
-        """(G, L, m, m) covariance of each measurement, from covariances (N, m, m)."""
-        loaded = v[self.loaded]
-        if self.reference.shape[1]:
-            loaded += self.reference_covariance(v)
-        return np.asarray(loaded)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -198,55 +166,23 @@ class Whitening:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
             return x if _each_alone(self.buckets) else x[self.reading]
-        parts = [_difference(b, x).reshape(b.loaded.size, *x.shape[1:]) for b in self.buckets]
-        return np.concatenate(parts)
+        return np.concatenate([b.difference(x) for b in self.buckets])
 
     def whiten(self, raw: Floats) -> Floats:
-        """Whitened rows (D·m, P) of measurements (D, m) or (D, m, P)."""
-        return self._whiten(raw, np.empty((len(raw) * self.m, *raw.shape[2:])))
-
-    def whitened(self, x: Floats) -> Floats:
-        """Whitened rows (D·m, P) of values at the readings (N, m, P), which stay as they are.
-
-        A few groups at a time: their differences stay in the processor's cache.
-        """
-        width = math.prod(x.shape[2:])
-        out = np.empty((len(self) * self.m, width))
-        values = x.reshape(len(x), self.m, width)
-        alone, start = self.mode == "absolute" and _each_alone(self.buckets), 0
+        """Whitened rows (D·m, ...) of measurements (D, m, ...)."""
+        shape = (len(raw) * self.m, *raw.shape[2:])
+        flat, start = raw.reshape(len(raw) * self.m, math.prod(raw.shape[2:])), 0
+        parts = []
         for b in self.buckets:
-            size = b.factor.shape[-1]
-            for groups in _blocks(len(b.loaded), CACHED // max(size * width, 1)):
-                factor = b.factor[groups]
-                own = values[groups] if alone else _difference(b, values, groups)
-                rows = slice(start + groups.start * size, start + groups.stop * size)
-                to = out[rows].reshape(len(factor), size, width)
-                np.matmul(factor, own.reshape(len(factor), size, width), out=to)
-            start += len(b.loaded) * size
-        return out.reshape(len(out), *x.shape[2:])
+            groups, size = b.factor.shape[:2]
+            block = flat[start : start + groups * size].reshape(groups, size, flat.shape[1])
+            parts.append((b.factor @ block).reshape(groups * size, flat.shape[1]))
+            start += groups * size
+        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(shape)
 
     def whiten_readings(self, x: Floats) -> Floats:
-        """Whitened rows (D·m, P) of values at the readings (N, m, P), which are overwritten.
-
-        There is no second array of that size, which a Jacobian of many parameters can be.
-        """
-        raw = np.ascontiguousarray(self.raw(x))
-        return self._whiten(raw, raw.reshape(len(raw) * self.m, *raw.shape[2:]))
-
-    def _whiten(self, raw: Floats, out: Floats) -> Floats:
-        """Write the whitened rows of measurements (D, m, ...) to `out`, which may be the same."""
-        width = math.prod(out.shape[1:])
-        flat, to = raw.reshape(len(out), width), out.reshape(len(out), width)
-        start = 0
-        for b in self.buckets:
-            size = b.factor.shape[-1]
-            for groups in chunks(len(b.loaded), size * width):
-                factor = b.factor[groups]
-                rows = slice(start + groups.start * size, start + groups.stop * size)
-                block = flat[rows].reshape(len(factor), size, -1)
-                to[rows] = (factor @ block).reshape(len(factor) * size, -1)
-            start += len(b.loaded) * size
-        return out
+        """Whitened rows (D·m, ...) of values at the readings (N, m, ...)."""
+        return self.whiten(self.raw(x))
 
     def rows_of(self, measurements: Ints) -> Ints:
         """Repeat a number per measurement (D,) for each of its rows (D·m,)."""
@@ -269,12 +205,14 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
     serial = readings.serial is not None and scaling == "gc"
     for loaded, reference, weights in runs(readings, groups, RUN) if serial else groups:
         limits.check_shared(loaded.shape[1], m, len(loaded))
-        covariance = _group_covariance(readings, loaded, reference, weights)
+        covariance = measurement_covariance(readings, loaded, reference, weights)
         factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
         rank += int(np.count_nonzero(factor.any(axis=-1)))
         buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])
-    own = np.concatenate([b.own_covariance(v).reshape(-1, m, m) for b in buckets])
+    own = np.concatenate(
+        [single_covariance(v, b.loaded, b.reference, b.weights).reshape(-1, m, m) for b in buckets]
+    )
     return Whitening(mode, scaling, m, tuple(buckets), reading, own, readings.pose[reading], rank)
 
 
@@ -323,47 +261,6 @@ def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
     return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
 
 
-def _difference(b: Bucket, x: Floats, groups: slice = slice(None)) -> Floats:
-    """(G, L, ...) loaded minus the mean of the unloaded, of some groups."""
-    loaded = x[b.loaded[groups]]
-    if b.reference.shape[1]:
-        loaded -= b.reference_mean(x, groups)
-    return np.asarray(loaded)
-
-
-def _blocks(count: int, size: int) -> Iterator[slice]:
-    """Yield slices that cover `count` groups, of `size` each, at least 1."""
-    for start in range(0, count, max(size, 1)):
-        yield slice(start, min(start + max(size, 1), count))
-
-
-def _group_covariance(readings: Readings, loaded: Ints, reference: Ints, weights: Floats) -> Floats:
-    """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
-
-    C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
-    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`.
-    """
-    rows = np.concatenate([loaded, reference], axis=1)
-    groups, count = rows.shape
-    m = readings.m
-    c = np.zeros((groups, count, m, count, m))
-    if readings.common is not None and count > 1:
-        f, arrival = readings.common[rows], readings.arrivals[rows]
-        together = (arrival[:, :, None] == arrival[:, None, :]).astype(float)
-        np.einsum("gain,gbjn,gab->gaibj", f, f, together, out=c, optimize=True)
-    each = np.arange(count)
-    if readings.serial is not None and readings.along is not None:
-        root = readings.instrument_root()[rows]
-        shared = readings.serial.share * readings.serial.correlation(readings.along[rows])
-        c += np.einsum("gaik,gab,gbjk->gaibj", root, shared, root, optimize=True)
-    c[:, each, :, each, :] = np.moveaxis(readings.covariance[rows], 1, 0)
-    if reference.shape[1]:
-        d = np.concatenate([np.eye(len(weights)), -weights], axis=1)
-        c = np.einsum("pa,gaibj,qb->gpiqj", d, c, d, optimize=True)
-    size = len(weights) * m
-    return c.reshape(groups, size, size)
-
-
 def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
     """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
 
@@ -371,7 +268,7 @@ def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
         readings: those of the scaling, with any covariance.
         w: the scaling.
     """
-    return [_group_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
+    return [measurement_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
 
 def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:

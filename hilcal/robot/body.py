@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
+from hilcal.robot.chain import Chain, evaluate
 from hilcal.robot.conventions import as_drawn
 from hilcal.types import Floats
 
@@ -106,7 +106,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     )
 
 
-def body_poses(arm: Arm, q: Floats) -> Floats:
+def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
     """Poses T_base_body of base and bodies, and of the flange.
 
     T_base_body0 = 1, T_base_bodyi = L_0 Rz(θ_1) ... L_{i-1} Rz(θ_i).
@@ -114,11 +114,12 @@ def body_poses(arm: Arm, q: Floats) -> Floats:
     Args:
         arm: the arm.
         q: (N, n) the controller's joint values, rad.
+        chain: the chain at q where it is evaluated already.
 
     Returns:
         (N, n + 2, 4, 4): base, the n bodies, flange.
     """
-    chain = evaluate(arm, q)
+    chain = evaluate(arm, q) if chain is None else chain
     out = np.tile(np.eye(4), (len(q), arm.n + 2, 1, 1))
     out[:, 1:, :3, :3] = np.swapaxes(chain.rotation, 0, 1)
     out[:, 1:, :3, 3] = np.swapaxes(chain.position, 0, 1)

@@ -8,6 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from hilcal.config import Obstacle
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule, capsules
 from hilcal.robot.pinocchio_model import pinocchio_model
@@ -170,6 +171,7 @@ class Pairs:
         self._state = geometry.createData()
         self._names, self._pairs = names, pairs
         self._free = len(names) - 1
+        self._margins: list[float] = []
 
     def touching(
         self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
@@ -198,9 +200,11 @@ class Pairs:
 
         It is negative where they overlap.
         """
-        hit = np.flatnonzero(self.touching(q, margin, segment))
-        lies = None if segment is None else _lies(segment, len(q))
         out: dict[tuple[str, str], float] = {}
+        hit = np.flatnonzero(self.touching(q, margin, segment))
+        if not len(hit):
+            return out
+        lies = None if segment is None else _lies(segment, len(q))
         for i in hit.tolist():
             self._place(self._arm.chain_angles(q[i]), lies, i)
             for k, (a, b) in enumerate(self._pairs):
@@ -234,8 +238,10 @@ class Pairs:
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
         """Set the margins of all pairs, and which of them count."""
         each = np.broadcast_to(margin, len(self._pairs)).tolist()
-        for request, kept in zip(self._state.collisionRequests, each, strict=True):
-            request.security_margin = kept
+        if each != self._margins:
+            for request, kept in zip(self._state.collisionRequests, each, strict=True):
+                request.security_margin = kept
+            self._margins = each
         if segment is not None:
             self._geometry.geometryObjects[self._free].geometry.radius = segment.radius
             for k, (a, _) in enumerate(self._pairs):
@@ -339,6 +345,6 @@ def _turn(way: Floats) -> Floats:
     """(N, 3, 3) rotations that lead z to directions (N, 3); 1 for none."""
     length = np.linalg.norm(way, axis=1, keepdims=True)
     z = np.where(length > _SHORT, way / np.where(length > _SHORT, length, 1.0), [0.0, 0.0, 1.0])
-    x = np.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
+    x = se3.cross(np.eye(3)[np.argmin(np.abs(z), axis=1)], z)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return np.stack([x, np.cross(z, x), z], axis=2)
+    return np.stack([x, se3.cross(z, x), z], axis=2)

@@ -12,7 +12,7 @@ import stat
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 
@@ -207,14 +207,21 @@ def _refuse_log(path: Path) -> None:
 
 @contextmanager
 def transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
-    """Commit everything or nothing."""
+    """Commit everything or nothing.
+
+    An interrupt between the statement `with` and its block leaves a transaction open: the next one
+    rolls it back, or the end of the connection.
+    """
+    if connection.in_transaction:
+        connection.execute("ROLLBACK")
     connection.execute("BEGIN IMMEDIATE")
     try:
         yield connection
         connection.execute("COMMIT")
     except BaseException:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
+        with suppress(sqlite3.ProgrammingError):  # it is closed, and has rolled back
+            if connection.in_transaction:
+                connection.execute("ROLLBACK")
         raise
 
 

@@ -1,6 +1,6 @@
 """A model fitted to a stream: Gauss-Newton in which each step is one pass.
 
-The steps are those of readings in memory (`minimise`): the linear problem of a step has
+The steps are those of readings in memory (`gauss_newton_steps`): the linear problem of a step has
 the triangle of the whitened rows in place of the rows, whose products are the same. What needs all
 readings at once is replaced:
 
@@ -27,16 +27,16 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.coordinates import coordinates_of
-from hilcal.identification.errors import ErrorBlock
 from hilcal.identification.estimates import Estimates
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.gauss_newton import over_all_parameters, prior_coordinates
-from hilcal.identification.minimise import Point, Problem, linear_problem, minimise
-from hilcal.identification.outliers import bulk, limit
+from hilcal.identification.gauss_newton_steps import Point, Problem, linear_problem, minimum
+from hilcal.identification.least_trimmed_squares import bulk, limit
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.regularisation import LinearProblem, Regularisation, spent_parameters
+from hilcal.identification.residual import ErrorBlock
 from hilcal.identification.uncertainty import (
     MISFIT_CHANCE,
     identifiable_parameters,
@@ -348,7 +348,7 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
         CannotAnswerError: fewer measured elements than parameters.
     """
     space = problem.coordinates
-    found = minimise(problem, space.of_theta(theta), None)
+    found = minimum(problem, space.of_theta(theta), None)
     point, by, converged = found.point, found.by, found.converged
     if point.rank <= by.basis.structural:
         raise CannotAnswerError(

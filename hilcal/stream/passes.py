@@ -15,6 +15,7 @@ from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model, Prediction
+from hilcal.readings.covariance import with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, whitening
 from hilcal.regression.triangle import Triangle
@@ -156,9 +157,7 @@ def _chunks(group: int, work: Work, theta: Floats) -> Iterator[_Chunk]:
     cell = work.model.cell
     for readings in work.stream.chunks(group):
         if work.joint_std.any():
-            factor = joint_factors(cell, readings, work.joint_std)
-            covariance = readings.covariance + factor @ np.swapaxes(factor, 1, 2)
-            readings = replace(readings, covariance=covariance)
+            readings = with_scatter(readings, joint_factors(cell, readings, work.joint_std))
         rows = np.arange(row, row + len(readings))
         prediction = work.model.predict(readings.states, theta)
         w = whitening(readings, "absolute")

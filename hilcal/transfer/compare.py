@@ -13,13 +13,13 @@ from hilcal.diagnosis.change_candidates import changing
 from hilcal.diagnosis.comparison import Comparison, error_today
 from hilcal.diagnosis.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.description_words import refuse_misdescribed
 from hilcal.identification.earlier import earlier_fit
 from hilcal.identification.fit import Fit
+from hilcal.identification.later_readings import setting
+from hilcal.identification.misdescription import refuse_misdescribed
 from hilcal.identification.parameter_differences import Differences, parameter_differences
 from hilcal.identification.posterior import Posterior
 from hilcal.identification.registration import register
-from hilcal.identification.remeasured import setting
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted

@@ -17,9 +17,8 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
-from drivers.simulated.rehearsal import SimulationCase, measurement_noise
-from drivers.simulated.rigid import displacement
+from drivers.simulated.mechanics import displacement
+from drivers.simulated.rehearsal import SimulationCase, case_of_plan, measurement_noise, read_plan
 from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
 from hilcal.readings.readings import States

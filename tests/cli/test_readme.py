@@ -13,7 +13,7 @@ import numpy as np
 import openpyxl
 import pytest
 
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
+from drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.cli import planning
 from hilcal.cli.commands import COMMANDS

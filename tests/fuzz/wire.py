@@ -22,7 +22,7 @@ from drivers.force_stream import RING, ForceStream, SensorFormat
 from drivers.geocom import GeoComTracker, Options
 from drivers.geocom_line import Link
 from hilcal.config.cell import Tracker
-from hilcal.measuring.clock import Clock
+from hilcal.measuring.devices import Clock
 from tests.fuzz import controller
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed

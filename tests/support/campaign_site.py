@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config

@@ -7,8 +7,7 @@ import numpy as np
 
 from drivers.simulated.injected_effects import hide, nothing_hidden
 from drivers.simulated.rehearsal import simulate
-from drivers.simulated.tracker import SimulatedNoise
-from drivers.simulated.world import World
+from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.readings.readings import Readings, States

@@ -17,7 +17,7 @@ from hilcal.config import (
     Tool,
     Tracker,
 )
-from hilcal.measuring.rig import Rig
+from hilcal.measuring.connect import Rig
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_devices import FakeArm, FakeClock, FakeForce, FakeOperator, FakeTracker
 from tests.support.fake_store import MemoryStore, Notes

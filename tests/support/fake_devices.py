@@ -5,9 +5,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.config import Load
-from hilcal.measuring.clock import Clock
 from hilcal.measuring.devices import (
     ArmSample,
+    Clock,
     Losses,
     Report,
     TargetLostError,

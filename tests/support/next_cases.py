@@ -5,8 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
-from drivers.simulated.rehearsal import Rehearsal, SimulationCase
+from drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.design.next import Next, measure_next

@@ -3,8 +3,7 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
-from drivers.simulated.rehearsal import SimulationCase
+from drivers.simulated.rehearsal import SimulationCase, case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.effects.catalogue import installed

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.identification.errors import ErrorBlock
+from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import Curve, Story, StoryRevision
 from hilcal.robot.arm import Arm

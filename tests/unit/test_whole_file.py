@@ -22,7 +22,7 @@ STRAIGHT = {
     "hilcal/tables/matfile.py": "a buffer in memory",
     "hilcal/present/viewer/live.py": "a recording that grows while it is looked at",
     "hilcal/store/schema.py": "SQLite has a journal of its own",
-    "drivers/simulated/device_process.py": "a device's log, which grows",
+    "drivers/simulated/cell_processes.py": "a device's log, which grows",
     "drivers/simulated/blackboard.py": "memory shared by the devices of a simulated cell",
     "drivers/simulated/world_server.py": "memory shared by the devices of a simulated cell",
     "drivers/simulated/admin.py": "a socket",

@@ -14,15 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.on_the_wire import case_of_plan, simulated_cell
+from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.average import average
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.connect import ConnectionResult, connect
-from hilcal.measuring.devices import ForceSensorDevice
-from hilcal.measuring.rig import Rig
+from hilcal.measuring.connect import ConnectionResult, Rig, connect
+from hilcal.measuring.devices import Clock, ForceSensorDevice
+from hilcal.measuring.measure import average
 from hilcal.robot.catalogue import configs_dir
 from tests.support.spread_plan import spread_plan
 

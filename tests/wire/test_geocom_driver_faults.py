@@ -8,8 +8,7 @@ import pytest
 from drivers.geocom import GeoComTracker, Options, open_tracker
 from drivers.geocom_line import Link
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.clock import Clock
-from hilcal.measuring.devices import TargetLostError
+from hilcal.measuring.devices import Clock, TargetLostError
 from tests.support import sim_serial_cases as simulated
 from tests.support.geocom_cases import GREETING, cell, line, table_instrument
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from drivers.frames import crc_modbus, crc_x25
-from drivers.simulated.force.ft300 import Ft300
-from drivers.simulated.geocom.protocol import crc16_arc
+from drivers.simulated.force_server import Ft300
+from drivers.simulated.pty_port import crc16
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
 
 
@@ -178,4 +178,4 @@ def test_check_values_of_the_checksums() -> None:
     """Of "123456789", as the catalogue of parametrised CRC algorithms (reveng) gives them."""
     assert crc_modbus(b"123456789") == 0x4B37
     assert crc_x25(b"123456789") == 0x906E
-    assert crc16_arc(b"123456789") == 0xBB3D
+    assert crc16(b"123456789", 0) == 0xBB3D

@@ -12,7 +12,7 @@ from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ModbusIOException
 
 from drivers.ft300 import STREAM
-from drivers.simulated.force.gauge import DRIFT_STD, ROOM
+from drivers.simulated.force_server import DRIFT_STD, ROOM
 from tests.support.force_cases import ALL, WRENCH, fails, instruments, opened, simulated, steady
 from tests.support.sim_serial_cases import force_sensor
 
@@ -106,6 +106,6 @@ def test_a_clock_that_wraps_loses_nothing(kind, simulated) -> None:
 def test_it_dies_when_told_to(kind) -> None:
     with force_sensor(kind) as sensor, serial.Serial(str(sensor.port), 19200) as line:
         sensor.admin("die")
-        assert sensor.process.wait(10) == 1
+        assert sensor.process.wait(10) == 70
         with pytest.raises(serial.SerialException):
             line.read(10_000_000)

@@ -15,7 +15,8 @@ from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
-from drivers.simulated.geocom.optics import Beam, PolarPoint
+from drivers.simulated.admin import Operations
+from drivers.simulated.geocom_station import Beam, PolarPoint
 from drivers.simulated.pty_port import PtyPort
 from tests.support.sim_serial_cases import Instrument, tracker
 
@@ -112,7 +113,7 @@ def test_old_bytes_are_gone_when_a_client_opens(port: PtyPort) -> None:
 def test_flips_come_as_often_as_asked(port: PtyPort) -> None:
     frames, share = 2000, 0.1
     past = time.monotonic() - 100.0
-    port.admin("flip", {"probability": share})
+    port.faults()["flip"](probability=share)
     spoilt = 0
     with client(port) as line:
         for _ in range(frames):
@@ -124,11 +125,11 @@ def test_flips_come_as_often_as_asked(port: PtyPort) -> None:
 
 
 def test_a_cut_frame_is_a_shorter_beginning(port: PtyPort) -> None:
-    port.admin("cut", {"probability": 1.0})
+    port.faults()["cut"](probability=1.0)
     with client(port) as line:
         for _ in range(100):
             port.send(b"<123456789")
-        port.admin("cut", {"probability": 0.0})
+        port.faults()["cut"](probability=0.0)
         port.send(b"<end")
         port.drain()
         got = line.read_until(b"<end").removesuffix(b"<end")
@@ -143,7 +144,7 @@ def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
     port.unplug()
     other = os.openpty()  # takes the freed number: the name has to lead to the new one
     try:
-        port.admin("replug", {})
+        port.faults()["replug"]()
         assert os.readlink(port.link) != before
         with client(port) as line:
             port.send(b"back")
@@ -155,10 +156,10 @@ def test_plugged_in_again_it_works_under_the_same_name(port: PtyPort) -> None:
 
 
 def test_refuses_what_it_does_not_know(port: PtyPort) -> None:
-    with pytest.raises(ValueError, match="no such operation"):
-        port.admin("explode", {})
+    with pytest.raises(ValueError, match="unknown op 'explode'; valid: flip, cut"):
+        Operations(port.faults())("explode", {})
     with pytest.raises(ValueError, match="valid"):
-        port.admin("baud", {"baud": 12345})
+        Operations(port.faults())("baud", {"baud": 12345})
 
 
 TARGET = (0.5, 2.8, 0.4)

@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from drivers.simulated.ur.kinematics import GRAVITY, Kinematics
-from drivers.simulated.ur.motion import Trajectory, line
-from drivers.simulated.ur.script import ScriptStream
+from drivers.simulated.ur.programs import ScriptStream
+from drivers.simulated.ur.state import GRAVITY, Kinematics, Trajectory, line
 from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
 
 GOAL = np.array([1.0, -0.5, 0.0, 0.2, 0.0, -1.5])
 vectors = some.lists(some.floats(-3.0, 3.0), min_size=6, max_size=6).map(np.array)
@@ -87,11 +87,8 @@ def test_jacobian_and_weight_are_derivatives():
 
     def energy(q):
         """Work of gravity, J."""
-        frames = kinematics.frames(q)
-        heights = [f[:3, :3] @ c + f[:3, 3] for f, c in zip(frames[:-1], arm.coms, strict=True)]
-        return sum(m * GRAVITY @ p for m, p in zip(arm.masses, heights, strict=True)) + (
-            mass * GRAVITY @ tip(q)
-        )
+        centres = evaluate(arm, q[None]).com[:, 0]
+        return arm.masses @ centres @ GRAVITY + mass * GRAVITY @ tip(q)
 
     steps = h * np.eye(6)
     numeric = np.array([(tip(q + s) - tip(q - s)) / (2 * h) for s in steps]).T

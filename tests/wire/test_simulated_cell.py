@@ -15,8 +15,7 @@ import pytest
 
 from drivers.simulated import cell_processes
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.cell_processes import UR_PORTS, SimulatedCell, free_host
-from drivers.simulated.device_process import DeviceProcess
+from drivers.simulated.cell_processes import UR_PORTS, DeviceProcess, SimulatedCell, free_host
 from drivers.simulated.truth import Truth
 from drivers.simulated.world import World
 from hilcal.errors import DeviceError, InputError

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.simulated.ur.motion import line
+from drivers.simulated.ur.state import line
 from drivers.ur_link import states
 from drivers.ur_link.cause import program_ended
 from drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration

@@ -6,8 +6,8 @@ import pytest
 
 from drivers.simulated.admin import ask
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.device_process import DeviceProcess
-from drivers.simulated.world_file import write_world
+from drivers.simulated.cell_processes import DeviceProcess
+from drivers.simulated.world_server import write_world
 from hilcal.errors import DeviceError
 from tests.support.living_cell import config, world_of
 

@@ -7,9 +7,8 @@ from scipy.stats import chi2
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import names
+from hilcal.identification.full_prediction import error_before, names
 from hilcal.identification.variance_factor import CONFIDENCE
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent

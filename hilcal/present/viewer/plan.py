@@ -12,7 +12,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.next import PairPower
 from hilcal.design.summary import PlanSummary
-from hilcal.measuring.sight import UNKNOWN as NO_TRACKER
+from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, pairs, table
 from hilcal.present.plan import load_name

@@ -14,9 +14,8 @@ from hilcal.design.next import PairPower
 from hilcal.design.summary import PlanSummary
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import InputError
-from hilcal.measuring.clearance import Clearance, clearance_of
+from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
 from hilcal.measuring.route import route
-from hilcal.measuring.sight import LineOfSight, sight_of
 from hilcal.present.plan import load_name
 from hilcal.present.viewer import arm_shapes, style
 from hilcal.robot import body

@@ -18,7 +18,7 @@ from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import UR_JOINTS, frames, ur_kinematics, urdf
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.frames_document import fit_to_json
+from hilcal.identification.fit_document import frames_to_json
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
@@ -151,7 +151,7 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(
     for name, poses in exported.items():
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
         assert np.mean(off <= band) > 0.9, name
-    fitted_frames = fit_to_json(found)["base"]
+    fitted_frames = frames_to_json(found)["base"]
     np.testing.assert_allclose(fitted_frames["xyz_m"], base[:3, 3], atol=1e-9)
 
 

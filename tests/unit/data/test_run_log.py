@@ -1,6 +1,8 @@
 """What a run writes: readings with their details, steps exactly once, events, durable."""
 
+import gc
 import os
+import sqlite3
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +18,7 @@ from hilcal.readings.readings import Readings, States
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.store.run_log import PLAN, RunLog
+from hilcal.store.schema import transaction
 
 STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("none", "5kg"))
 MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
@@ -197,3 +200,23 @@ def test_a_wrong_edit_of_a_plan_is_named(tmp_path: Path, old: str, new: str, mes
 def test_a_missing_plan_names_the_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="hilcal plan"):
         load_plan(tmp_path / "no.json")
+
+
+def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The block is never entered: nobody ends the transaction but the next one, or the close."""
+    complaints: list[object] = []
+    monkeypatch.setattr("sys.unraisablehook", complaints.append)
+    connection = sqlite3.connect(tmp_path / "x", isolation_level=None)
+    connection.execute("CREATE TABLE t (x)")
+    interrupted = [transaction(connection) for _ in range(2)]
+    interrupted[0].__enter__().execute("INSERT INTO t VALUES (1)")
+    with transaction(connection) as found:
+        found.execute("INSERT INTO t VALUES (2)")
+    assert connection.execute("SELECT x FROM t").fetchall() == [(2,)]
+    interrupted[1].__enter__()
+    connection.close()
+    interrupted.clear()
+    gc.collect()
+    assert complaints == []

@@ -13,8 +13,8 @@ from hilcal.design.prediction_poses import prediction_poses
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
-from hilcal.measuring.average import average
 from hilcal.measuring.devices import TrackerSample
+from hilcal.measuring.measure import average
 from tests.support.arm_cases import ARMS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import (

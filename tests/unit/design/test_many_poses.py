@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.planned import planned_states
-from drivers.simulated.rehearsal import simulate
+from drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.design.many_poses import measure_poses
 from hilcal.diagnosis.more_poses import pose_powers
 from hilcal.diagnosis.verdict import diagnose

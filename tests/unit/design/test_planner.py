@@ -121,10 +121,10 @@ def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
     of, work = usual.problem, usual.work
     designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
     for name in designs:
-        asked = objective_of(of, name, work)
+        asked = objective_of(of, small(), name, work)
         values = {}
         for other, made in designs.items():
-            own = objective_of(made.problem, name, made.work)
+            own = objective_of(made.problem, small(), name, made.work)
             taken = np.flatnonzero(made.counts)
             m = own.prior + own.units.information(made.counts[taken], taken)
             values[other] = float(asked.criterion.value(m))

@@ -12,8 +12,8 @@ from hilcal.config import CellConfig
 from hilcal.design.feasible import Space
 from hilcal.measuring.clearance import Clearance
 from hilcal.measuring.dry_run import route_problems
-from hilcal.measuring.feasibility import BETWEEN_M, STATE, Margins
-from hilcal.measuring.guard import SLACK_M, Guard
+from hilcal.measuring.feasibility import BETWEEN_M, STATE, Feasibility, Margins
+from hilcal.measuring.guard import SLACK, SLACK_M, Guard
 from hilcal.measuring.route import Stop
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
@@ -150,6 +150,24 @@ def test_a_state_is_refused_by_all_or_by_none(
         assert lines or said is None
         if inside < -SLACK_M - 1e-6 or apart < -1e-9:
             assert said is not None
+
+
+@settings(max_examples=20, deadline=None)
+@given(cells(), SEED, LOAD)
+def test_all_checks_together_find_what_each_finds_alone(
+    made: tuple[Cell, CellConfig], seed: int, load: str
+) -> None:
+    """The checks share one evaluation of the states; it is another for every state."""
+    c, config = made
+    limits, q = Feasibility(c, config, SLACK), states(c, seed, 6)
+    together = list(limits.findings(q, load))
+    assert together == [x for kind in STATE for x in limits.findings(q, load, (kind,))]
+    alone = [list(limits.findings(row[None], load)) for row in q]
+    assert {x.what for x in together} == {x.what for found in alone for x in found}
+    allowed = np.array([not found for found in alone])
+    np.testing.assert_array_equal(limits.allowed(q, load, STATE), allowed)
+    fresh = Feasibility(c, config, SLACK)
+    assert list(fresh.findings(q[-1:], load)) == alone[-1]
 
 
 @settings(max_examples=20, deadline=None)

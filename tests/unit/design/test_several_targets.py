@@ -11,9 +11,8 @@ from hilcal.design.nominal_model import nominal_model
 from hilcal.design.predicted import predicted
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.measuring.clearance import clearance_of
+from hilcal.measuring.clearance import LineOfSight, clearance_of
 from hilcal.measuring.dry_run import seconds_at_rest
-from hilcal.measuring.sight import LineOfSight
 from hilcal.readings.whitening import MODES, Mode
 from tests.support.plan_cases import config_of, everything_once, poses_in
 from tests.support.reflector_cases import NAMES, OFFSETS, reflectors

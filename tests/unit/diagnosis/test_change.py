@@ -20,7 +20,7 @@ from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.earlier import earlier_fit
-from hilcal.identification.remeasured import setting
+from hilcal.identification.later_readings import setting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import StudiedArm, measured, remeasured, studied_arm
 

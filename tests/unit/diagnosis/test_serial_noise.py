@@ -17,8 +17,8 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.verdict import message
+from hilcal.readings.covariance import symmetric_root
 from hilcal.readings.readings import Readings
-from hilcal.readings.serial_noise import symmetric_root
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir

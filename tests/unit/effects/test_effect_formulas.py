@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated import elastic_tree
+from drivers.simulated import truth
 from hilcal.effects.link_compliance import long_links
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains
@@ -19,7 +19,7 @@ from tests.support.effect_cases import CELLS, SOFT, make, position, situation, s
 @pytest.mark.parametrize("name", [*robot_names(), "odd"])
 def test_long_links_are_those_of_the_simulated_world(name):
     arm = arm_of(name)
-    np.testing.assert_array_equal(long_links(arm), elastic_tree.long_links(arm))
+    np.testing.assert_array_equal(long_links(arm), truth.long_links(arm))
 
 
 def test_an_arm_without_long_links_has_one_to_the_flange():

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from drivers.simulated.tracker import SimulatedNoise
 from drivers.simulated.truth import Truth
-from drivers.simulated.world import World
+from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell
 from hilcal.effects.protocol import Situation
 from hilcal.model.model import Model

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
@@ -13,9 +14,12 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import baseline
+from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit
+from hilcal.identification.predictive import predictive
 from hilcal.library import read_table
 from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, Refinement, refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.records import content_hash
@@ -99,3 +103,43 @@ def test_what_it_moves_is_told_by_effect(found: Refinement) -> None:
     assert set(of.effects) == set(found.fit.model.background)
     listed = {p.name for p in found.fit.parameters}
     assert not any(name.split(".")[0] in found.fit.model.background for name in listed)
+
+
+def test_the_sizes_of_its_families_are_told_with_intervals(found: Refinement) -> None:
+    sizes = family_sizes(found.fit)
+    effects = {s.effect for s in sizes}
+    model = found.fit.model
+    assert effects == set(model.names) - {"base_frame", "target_offset"}
+    assert {s.effect for s in sizes if s.named} == effects & set(model.named)
+    assert all(0.0 < s.low < s.std < s.high for s in sizes)
+    assert sizes[0].moves_m == max(s.moves_m for s in sizes)
+    assert sizes[0].effect in {"link_geometry", "transmission_error"}
+    waves = {s.name: s.unit for s in sizes if s.effect == "transmission_error"}
+    assert set(waves.values()) == {"rad"}
+    # what moves nothing is known by its prior alone
+    widths = [s.high / s.low for s in sizes]
+    assert widths[0] < 0.2 * max(widths)
+    assert family_sizes(found.steps[0].fit) == ()
+
+
+def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series: Readings) -> None:
+    """Of a table that states the arm's scatter, too: its factor is estimated and in the band."""
+    cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
+    test = series[500:700]
+    sizes = []
+    for by in (1.0, 9.0):
+        some = replace(series[:40], covariance=by * series[:40].covariance, scatter_stated=True)
+        fit = refine(baseline(cell, some, "absolute"), some, "absolute").fit
+        assert fit.model.background
+        assert fit.readings.arm_scatter is None
+        known = predictive(
+            fit.model, fit.theta, fit.solution.prior, some, "absolute", fit.holdout.rms_sigma
+        )
+        prediction = fit.model.predict(test.states, fit.theta)
+        of = replace(test, covariance=by * test.covariance, scatter_stated=True)
+        total = known.of_reading(prediction, whitening(of, "absolute", "gc"))
+        off = test.value - prediction.observation.position
+        inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off) < chi2.ppf(0.95, 3)
+        assert 0.85 < inside.mean() <= 1.0
+        sizes.append(np.sqrt(np.trace(total, axis1=1, axis2=2).mean()))
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.2)

@@ -1,29 +1,31 @@
 """Readings of another arm of the catalogue are noticed; ordinary errors are not taken for one."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
-from hilcal.identification.other_arm import BEYOND_NOISE, other_arm, other_arm_of
+from hilcal.identification.misdescription import BEYOND_NOISE, other_arm, other_arm_of
 from hilcal.identification.registration import register
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.types import Floats
+from studies.random_descriptions import read, readings_of
+from tests.unit.identification.test_registration import pose_of
 
 TARGET = np.array([0.03, -0.02, 0.1])
 NOISE = 3e-5
 
 
 def rotation(rng, angle=None):
-    """Rodrigues' formula about a random axis."""
+    """About a random axis."""
     axis = rng.standard_normal(3)
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     a = rng.uniform(0, 3) if angle is None else angle
-    return np.eye(3) + np.sin(a) * k + (1 - np.cos(a)) * k @ k
+    return Rotation.from_rotvec(a * axis / np.linalg.norm(axis)).as_matrix()
 
 
 def measured(
@@ -40,20 +42,9 @@ def measured(
     for link in links:
         link[:3, :3] = link[:3, :3] @ rotation(rng, 1e-3 * off * rng.standard_normal())
         link[:3, 3] += 1e-3 * off * rng.standard_normal(3)
-    base, shift = rotation(rng), 2 * rng.standard_normal(3)
-    x = []
-    for row in q + errs(q):
-        place = links[0]
-        for angle, link in zip(row, links[1:], strict=True):
-            c, s = np.cos(angle), np.sin(angle)
-            turn = np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-            place = place @ turn @ link
-        x.append(base @ (place[:3, :3] @ TARGET + place[:3, 3]) + shift)
-    value = np.array(x) + noise * rng.standard_normal((poses, 3))
-    k = np.arange(poses)
-    cov = np.tile(noise**2 * np.eye(3), (poses, 1, 1))
-    states = States(q=q, wrench=np.zeros((poses, 6)))
-    return Readings(states, k, 0 * k, 0 * k, value, cov, ("none",), tuple(map(str, k)))
+    base = pose_of(rotation(rng), 2 * rng.standard_normal(3))
+    x = read(replace(arm, links=links), q + errs(q), base, pose_of(np.eye(3), TARGET), 3)
+    return readings_of(q, x + noise * rng.standard_normal((poses, 3)), np.full(3, noise))
 
 
 def cell(name: str, known: bool = False, **robot: object) -> Cell:
@@ -90,9 +81,7 @@ def test_an_arm_before_calibration_is_not_taken_for_another(name: str, off: floa
 def test_joints_count_as_the_cell_says() -> None:
     sign = [1, 1, 1, -1, 1, 1]
     right = measured("ur10", 0, 1.0)
-    turned = States(q=right.states.q * sign, wrench=right.states.wrench)
-    counted = Readings(turned, right.pose, right.load, right.cycle, right.value, right.covariance,
-                       right.load_names, right.pose_names)  # fmt: skip
+    counted = replace(right, states=replace(right.states, q=right.states.q * sign))
     found = other_arm_of(cell("ur10e", joint_sign=sign), counted)
     assert found is not None
     assert found.name == "ur10"

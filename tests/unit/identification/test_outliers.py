@@ -11,7 +11,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import outliers
-from hilcal.identification.outliers import FALSE_ALARMS, bulk, limit
+from hilcal.identification.least_trimmed_squares import FALSE_ALARMS, bulk, limit
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case

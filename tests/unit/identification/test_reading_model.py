@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.identification.baseline import baseline
-from hilcal.identification.data_snooping import Snooping, _linearised
+from hilcal.identification.data_snooping import Snooping, linearised
 from hilcal.identification.fit import fit
 from hilcal.identification.reading_model import ReadingModel
 from hilcal.readings.whitening import MODES, Mode, inverse_root, whitening
@@ -59,7 +59,7 @@ def test_a_step_of_the_linear_model_is_that_of_the_fit(mode: Mode, m: int) -> No
     """At the minimum of a fit the step is zero, deflections through their offset as well."""
     c = campaign("none", mode, poses=12, m=m)
     found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
-    of = _linearised(
+    of = linearised(
         Snooping(found.model, c.readings, mode, found.solution, found.solution.y),
         found.solution.y,
     ).linear

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.identification.minimise import Point, linear_problem
+from hilcal.identification.gauss_newton_steps import Point, linear_problem
 from hilcal.identification.regularisation import LinearProblem
 from hilcal.regression.normal_equations import find_basis, normal_equations
 

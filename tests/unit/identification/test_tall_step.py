@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.identification.minimise import Point, linear_problem
+from hilcal.identification.gauss_newton_steps import Point, linear_problem
 from hilcal.identification.regularisation import regularise
 from hilcal.regression.normal_equations import TALL
 from hilcal.types import Floats

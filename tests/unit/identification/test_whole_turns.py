@@ -9,8 +9,8 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.extrapolation import extrapolation
 from hilcal.identification.fit import fit
 from hilcal.identification.predictive import predictive
+from hilcal.identification.robot_frames import whole_turns
 from hilcal.identification.validation import validate
-from hilcal.identification.whole_turns import whole_turns
 from tests.support.campaigns import campaign
 
 

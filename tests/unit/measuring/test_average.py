@@ -6,8 +6,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilcal.errors import DeviceError
-from hilcal.measuring.average import average, deviations
 from hilcal.measuring.devices import TrackerSample
+from hilcal.measuring.measure import average, deviations
 
 AXES = Rotation.from_rotvec([0.4, -0.2, 0.9]).as_matrix()
 V = AXES @ np.diag([5e-6, 15e-6, 15e-6]) ** 2 @ AXES.T

@@ -10,7 +10,7 @@ import pytest
 from hilcal.cell import Cell
 from hilcal.config import Limits
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.rough_registration import RoughRegistration
+from hilcal.measuring.arrival import RoughRegistration
 from hilcal.measuring.run import HOW_ON, run
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir

@@ -1,6 +1,6 @@
 """A person beside the arm: it is moved, leaned on, a load falls; and devices that repeat."""
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase, Remark
+from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
 from tests.support.run_cases import measure, rows
@@ -491,6 +492,28 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
     assert [name for name, _ in b.operator.asked] == ["none", "3kg", "none", "pull", "none"]
 
 
+def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing() -> None:
+    """30 N from below a weight of 59 N: less than it may pull to the side while it swings."""
+    b = Bench()
+    latest, borne = b.rig.force.latest, []  # type: ignore[union-attr]
+
+    def bears() -> WrenchSample:
+        one = latest()
+        b.world.hurry = 1.0 if b.world.load == "6kg" else 20.0
+        asked = [name for name, _ in b.operator.asked].count("6kg")
+        if b.world.load == "6kg" and b.world.is_moving and asked == 1:
+            borne.append(b.world.time)
+            turned = evaluate(b.cell.arm, b.world.joints()[None]).rotation[-1][0]
+            one.wrench[:3] += turned.T @ np.array([0.0, 0.0, 30.0])
+        return one
+
+    b.rig.force.latest = bears  # type: ignore[union-attr, method-assign]
+    measure(b, plan_of(("p1", "none", 0), ("p1", "6kg", 0), ("p2", "6kg", 0)))
+    assert borne
+    assert borne[-1] - borne[0] < 1.0
+    assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
+
+
 def test_a_load_that_stays_wrong_ends_the_run() -> None:
     b = Bench()
     moving, fell = b.rig.arm.moving, []
@@ -555,6 +578,26 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named_with_its_fi
         measure(b)
     assert len(b.store.rows) == 2
     assert "why" in b.store.last("doubted")
+    doubted = [told["reading"] for kind, told in b.store.events if told.get("stored")]
+    # it may be of something at rest itself: nothing tells yet where the tracker stands
+    assert doubted == [asdict(b.store.rows[1][0])]
+
+
+def test_a_repeated_reading_is_not_doubted_where_the_tracker_s_place_vouches_for_it() -> None:
+    b = Bench()
+    place = b.world.position
+    kept: list[Any] = []
+
+    def stuck() -> Any:
+        if len(b.store.rows) < 8:
+            kept[:] = [place()]
+        return kept[0]
+
+    b.world.position = stuck  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="repeats an old reading"):
+        measure(b)
+    assert len(b.store.rows) == 8
+    assert not [told for _, told in b.store.events if told.get("stored")]
 
 
 def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.measuring.devices import TrackerSample
-from hilcal.measuring.settle import SettleWindow
+from hilcal.measuring.measure import SettleWindow
 
 STD = np.array([5.0, 12.0, 12.0]) * 1e-6
 V = np.diag(STD**2)

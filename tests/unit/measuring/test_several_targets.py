@@ -9,9 +9,9 @@ import pytest
 from hilcal.config import Tool
 from hilcal.config.cell import Target
 from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import TargetLostError, TrackerSample, WrenchSample
 from hilcal.measuring.progress import ReadingStored, Remark
-from hilcal.measuring.rig import Rig
 from hilcal.measuring.run import run
 from hilcal.present.campaign import event_words
 from hilcal.readings.readings import Readings

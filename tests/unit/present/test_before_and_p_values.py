@@ -12,10 +12,9 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
 from hilcal.identification.baseline import baseline
-from hilcal.identification.before import error_before
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
-from hilcal.identification.full_prediction import full_prediction
+from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.present.diagnosis import diagnosis_report, suspects_table
 from hilcal.present.fit import before_and_after, errors, fit_report, worst_poses
 from hilcal.present.story import Chapter, build_story

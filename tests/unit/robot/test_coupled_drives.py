@@ -4,11 +4,10 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from drivers.simulated.rigid import rotation_vector
-from drivers.simulated.tracker import SimulatedNoise
+from drivers.simulated.mechanics import rotation_vector
 from drivers.simulated.truth import Truth
-from drivers.simulated.ur.kinematics import GRAVITY, Kinematics
-from drivers.simulated.world import World
+from drivers.simulated.ur.state import GRAVITY, Kinematics
+from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.effects.protocol import Situation

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.simulated.injected_effects import EFFECTS, nothing_hidden
-from drivers.simulated.on_the_wire import case_of_plan, read_plan
 from drivers.simulated.own_law import OwnLaw, own_law, own_names
-from drivers.simulated.rehearsal import check_choice
-from drivers.simulated.world_file import read_world, write_world
+from drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
+from drivers.simulated.world_server import read_world, write_world
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed

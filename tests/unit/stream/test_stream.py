@@ -13,7 +13,7 @@ import scipy.linalg as sl
 from hilcal.calibration.calibration import Calibration
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identification import minimise
+from hilcal.identification import gauss_newton_steps
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations
@@ -44,7 +44,7 @@ def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def to_rounding() -> Iterator[None]:
     """Let fits go on until rounding stops them: else a part of σ may be left."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(minimise, "CONVERGED", 1e-9)
+        patch.setattr(gauss_newton_steps, "CONVERGED", 1e-9)
         yield
 
 

@@ -1,1 +1,0 @@
-"""Simulated wrench sensors that stream over a serial line."""

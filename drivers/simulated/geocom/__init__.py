@@ -1,1 +1,0 @@
-"""A simulated laser station that speaks GeoCOM."""

@@ -1,0 +1,221 @@
+"""I-optimality under the mixed model: the mean variance of predictions with all effects.
+
+    y = A b + Z u + e,    (b, u) known before by M = [F G; Gᵀ H],    e ~ N(0, 1)
+
+A, Z are whitened rows of a unit; b are the parameters without a prior, u those with one: of the
+model, and of every other effect of the catalogue, each family of the size that arms have
+(`Effect.log_std_prior`) or that the readings so far tell. Completing the square,
+
+    A' = A − Z H⁻¹ Gᵀ,    v = H^½ (u + H⁻¹ Gᵀ b) ~ N(0, 1),    b known before by F − G H⁻¹ Gᵀ
+
+are independent. Of v the directions Q that move the units most are kept; the others act as noise,
+in each unit by itself:
+
+    rows [A', Z H^−½ Q] whitened by 1 + T Tᵀ,    T = Z H^−½ (1 − Q Qᵀ)
+
+The criterion is 1 / tr(C M⁻¹), C the mean of VᵀV with V the derivative of the predicted positions
+by the same coordinates. Source: Chaloner and Verdinelli, *Bayesian experimental design: a review*,
+Statistical Science 10 (1995) 273-304.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from hilcal.config import CellConfig
+from hilcal.design.candidate_set import CandidateSet
+from hilcal.design.candidates import (
+    Candidates,
+    absolute_rows,
+    deflection_rows,
+    reading_derivatives,
+)
+from hilcal.design.information import Problem
+from hilcal.design.nominal_model import NominalModel, build, potential_names
+from hilcal.design.prediction_poses import PredictionPoses, position_derivative
+from hilcal.design.prior_information import information_of
+from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.protocol import Effect
+from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
+from hilcal.mixed.families import families_of
+from hilcal.types import Bools, Floats, Ints
+
+DIRECTIONS = 150
+"""Most directions Q. A choice: of a UR10 the others together move a position by half of the noise,
+half of it waves of the gears that 60 poses do not tell."""
+SAMPLE = 300
+"""Candidate poses by which they are found. A choice."""
+LEAST = 1e-3
+"""Directions that move the units by less than this in units of the noise (rms) are left out."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MixedDesign:
+    """A design problem in the coordinates (b, Qᵀ v).
+
+    Attributes:
+        units: the units of the problem.
+        prior: (P, P) what is known before.
+        c: (P, P) C, m².
+        names: of b, then of Qᵀ v by number.
+    """
+
+    units: CandidateSet
+    prior: Floats
+    c: Floats
+    names: tuple[str, ...]
+
+
+def mixed_design(of: Problem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
+    """Return the design problem of predictions with all effects.
+
+    Args:
+        of: the design problem of the model.
+        config: its noise; where it states no repeatability, an ordinary one is assumed.
+        work: where positions are predicted.
+    """
+    nominal, config = of.nominal, _with_scatter(of.nominal, config)
+    more, std = other_effects(nominal, config)
+    prior_std = nominal.prior_std[nominal.live]
+    flat = np.concatenate([np.isinf(prior_std), np.zeros(len(std), dtype=bool)])
+    own = np.where(np.isinf(prior_std), of.scale[: len(prior_std)], prior_std)
+    scale = np.concatenate([own, std])
+    known = information_of(nominal, more, scale) + np.diag(~flat)
+    every = _Every(of, config, more, scale)
+    turned = _turned(known, flat, every)
+    count = int(flat.sum()) + turned.random.shape[1]
+    rows = np.zeros((*of.units.rows.shape[:2], count))
+    for place, some in every.rows(of.candidates):
+        rows[place, : some.shape[1]] = turned.whitened(some)
+    v = turned.columns(position_derivative(nominal, work, more, scale)).reshape(-1, count)
+    prior = np.eye(count)
+    prior[: turned.flat.shape[1], : turned.flat.shape[1]] = turned.prior
+    names = [t.name for t, free in zip(of.terms, flat, strict=False) if free]
+    names += [f"direction {k}" for k in range(1, turned.random.shape[1] + 1)]
+    c = v.T @ v / len(work.q)
+    return MixedDesign(CandidateSet(rows, of.units.cost), prior, c, tuple(names))
+
+
+def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:
+    """Return the effects beside the model, and the standard deviations of their parameters, SI.
+
+    Those of `[planning] against` at the sizes that arms have; none where a fit has a background,
+    which holds them already.
+    """
+    model, known = nominal.model, nominal.model.catalogue
+    names = () if model.background else potential_names(config, model)
+    finest = {"harmonics": HARMONICS}
+    more = tuple(
+        build(known, name, nominal.cell, nominal.m, finest if _in_waves(known, name) else {})
+        for name in names
+    )
+    alone = replace(model, effects=more, random={}, background=frozenset(), prior=None)
+    std = np.zeros(alone.size)
+    for f in families_of(alone).random:
+        std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
+    return more, std
+
+
+def _in_waves(known: Catalogue, name: str) -> bool:
+    return "harmonics" in known[name].option_help
+
+
+def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
+    """Return the configuration with the arm's repeatability: stated, estimated or ordinary."""
+    stated = config.repeatability.per_joint(nominal.cell.arm.n)
+    if np.any(stated):
+        return config
+    std: tuple[float, ...] = (SCATTER_RAD,)
+    found = None if nominal.fit is None else nominal.fit.readings.arm_scatter
+    if found is not None and found.kind != "isotropic":
+        std = found.std
+    each = std if len(std) > 1 else std[0]
+    repeatability = config.repeatability.model_copy(update={"joint_std_rad": each})
+    return config.model_copy(update={"repeatability": repeatability})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Every:
+    """The units of a problem with the columns of all effects."""
+
+    of: Problem
+    config: CellConfig
+    more: tuple[Effect, ...]
+    scale: Floats
+
+    def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
+        """Yield units and their whitened rows (k, R, P), of every `step`-th candidate pose."""
+        of = self.of
+        pose = np.array([p for p, _ in of.what]) / step
+        loads = np.array([of.candidates.loads.index(names[0]) for _, names in of.what])
+        several: dict[tuple[str, ...], list[int]] = {}
+        for k, (p, names) in enumerate(of.what):
+            if p % step == 0:
+                several.setdefault(names, []).append(k)
+        some = candidates[slice(None, None, step)]
+        for part in reading_derivatives(of.nominal, self.config, some, self.more, self.scale):
+            single = absolute_rows(part) if of.mode == "absolute" else np.empty(0)
+            for names, members in several.items():
+                mine = np.array(members)
+                mine = mine[(pose[mine] >= part.rows.start) & (pose[mine] < part.rows.stop)]
+                at = pose[mine].astype(np.int64) - part.rows.start
+                if of.mode == "absolute":
+                    yield mine, single[at, loads[mine]]
+                else:
+                    which = tuple(of.candidates.loads.index(name) for name in names)
+                    yield mine, deflection_rows(part, at, which)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Turned:
+    """The change of coordinates.
+
+    Attributes:
+        flat: (P, b) columns of A' by those of all parameters.
+        random: (P, r) columns Z H^−½ Q.
+        root: (P, u) columns Z H^−½.
+        prior: (b, b) F − G H⁻¹ Gᵀ.
+    """
+
+    flat: Floats
+    random: Floats
+    root: Floats
+    prior: Floats
+
+    def columns(self, rows: Floats) -> Floats:
+        """(..., b + r) of rows (..., P)."""
+        return np.concatenate([rows @ self.flat, rows @ self.random], axis=-1)
+
+    def whitened(self, rows: Floats) -> Floats:
+        """(k, R, b + r) of units (k, R, P), with the other directions as noise."""
+        whole, kept = rows @ self.root, rows @ self.random
+        noise = whole @ np.swapaxes(whole, 1, 2) - kept @ np.swapaxes(kept, 1, 2)
+        noise += np.eye(rows.shape[1])
+        low = np.linalg.cholesky(noise)
+        return np.asarray(np.linalg.solve(low, np.concatenate([rows @ self.flat, kept], axis=-1)))
+
+
+def _turned(known: Floats, flat: Bools, every: _Every) -> _Turned:
+    """Complete the square, and find the directions that move the units most."""
+    size, free = len(known), np.flatnonzero(flat)
+    held = np.flatnonzero(~flat)
+    g = known[np.ix_(free, held)]
+    factor = cho_factor(known[np.ix_(held, held)], lower=True)
+    lifted = cho_solve(factor, g.T)
+    columns = np.zeros((size, len(free)))
+    columns[free, np.arange(len(free))] = 1.0
+    columns[held] = -lifted
+    root = np.zeros((size, len(held)))
+    root[held] = solve_triangular(factor[0], np.eye(len(held)), lower=True).T
+    gram, elements = np.zeros((len(held), len(held))), 0
+    candidates = every.of.candidates
+    for _, rows in every.rows(candidates, max(1, len(candidates) // SAMPLE)):
+        moved = (rows @ root).reshape(-1, len(held))
+        gram += moved.T @ moved
+        elements += len(moved)
+    values, vectors = np.linalg.eigh(gram / max(elements, 1))
+    kept = np.flatnonzero(values > LEAST**2)[-DIRECTIONS:]
+    prior = known[np.ix_(free, free)] - g @ lifted
+    return _Turned(columns, root @ vectors[:, kept], root, (prior + prior.T) / 2)

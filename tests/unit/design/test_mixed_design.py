@@ -1,0 +1,128 @@
+"""Plans for predictions with all effects: condensed, the problem is that of all parameters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.config import CellConfig
+from hilcal.design import mixed_design as condensing
+from hilcal.design.candidates import absolute_rows, deflection_rows, reading_derivatives
+from hilcal.design.choice import choose, objective_of
+from hilcal.design.information import Problem, problem
+from hilcal.design.mixed_design import MixedDesign, mixed_design, other_effects
+from hilcal.design.nominal_model import after, nominal_model
+from hilcal.design.prediction_poses import (
+    PredictionPoses,
+    position_derivative,
+    prediction_poses,
+)
+from hilcal.design.prior_information import information_of
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.readings.whitening import Mode
+from hilcal.types import Floats
+from tests.support.campaigns import campaign, cell_of
+from tests.support.plan_cases import config_of, poses_of
+
+AGAINST = ("joint_tilt_compliance", "link_geometry", "transmission_error")
+STD_RAD = 2e-5
+
+
+def config(mode: Mode) -> CellConfig:
+    found = config_of(mode, against=AGAINST, work_load="none" if mode == "absolute" else "10kg")
+    scatter = found.repeatability.model_copy(update={"joint_std_rad": STD_RAD})
+    return found.model_copy(update={"repeatability": scatter})
+
+
+def scene(mode: Mode, *, fitted: bool) -> tuple[Problem, PredictionPoses]:
+    known = config(mode)
+    if fitted:
+        c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
+        nominal = after(fit(baseline(c.cell, c.readings, mode), c.readings, mode), known)
+    else:
+        nominal = nominal_model(cell_of(registration_known=True), known)
+    of = problem(nominal, known, poses_of(6))
+    return of, prediction_poses(of.nominal, known, poses_of(5, 9))
+
+
+def mean_variance_of_all(of: Problem, work: PredictionPoses, mode: Mode, counts: Floats) -> float:
+    """tr(C M⁻¹) by all parameters as they are."""
+    known, nominal = config(mode), of.nominal
+    more, std = other_effects(nominal, known)
+    live = nominal.prior_std[nominal.live]
+    scale = np.concatenate([np.where(np.isinf(live), of.scale[: len(live)], live), std])
+    prior = np.concatenate([~np.isinf(live), np.ones(len(std), dtype=bool)]).astype(float)
+    m = information_of(nominal, more, scale) + np.diag(prior)
+    (part,) = reading_derivatives(nominal, known, of.candidates, more, scale)
+    for (pose, loads), count in zip(of.what, counts, strict=True):
+        index = tuple(of.candidates.loads.index(name) for name in loads)
+        if mode == "absolute":
+            rows = absolute_rows(part)[pose, index[0]]
+        else:
+            rows = deflection_rows(part, np.array([pose]), index)[0]
+        m += count * rows.T @ rows
+    v = position_derivative(nominal, work, more, scale).reshape(-1, len(scale))
+    return float(np.trace(v @ np.linalg.solve(m, v.T))) / len(work.q)
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+def test_with_all_directions_the_mean_variance_is_that_of_all_parameters(
+    monkeypatch: pytest.MonkeyPatch, mode: Mode, fitted: bool
+) -> None:
+    monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
+    monkeypatch.setattr(condensing, "LEAST", 0.0)
+    of, work = scene(mode, fitted=fitted)
+    asked = mixed_design(of, config(mode), work)
+    # what no unit moves is as uncertain by every plan, and left out
+    least = mean_variance_of_all(of, work, mode, np.full(len(of.units), 1e9))
+    least -= variance_of(asked, np.full(len(of.units), 1e9))
+    for seed in range(3):
+        counts = np.random.default_rng(seed).integers(1, 3, len(of.units)).astype(float)
+        every = mean_variance_of_all(of, work, mode, counts) - least
+        assert variance_of(asked, counts) == pytest.approx(every, rel=1e-5)
+
+
+def variance_of(asked: MixedDesign, counts: Floats) -> float:
+    m = asked.prior + asked.units.information(counts)
+    return float(np.trace(asked.c @ np.linalg.inv(m)))
+
+
+def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of one unit: what is predicted of the kept directions is as uncertain as by all of them."""
+    monkeypatch.setattr(condensing, "DIRECTIONS", 10_000)
+    monkeypatch.setattr(condensing, "LEAST", 0.0)
+    of, work = scene("absolute", fitted=True)
+    whole = mixed_design(of, config("absolute"), work)
+    monkeypatch.setattr(condensing, "DIRECTIONS", 12)
+    few = mixed_design(of, config("absolute"), work)
+    free, size = len(whole.names) - len(whole.prior), len(few.prior)
+    assert free == 0
+    flat = size - 12
+    kept = np.r_[np.arange(flat), np.arange(len(whole.prior) - 12, len(whole.prior))]
+    for k in range(0, len(of.units), 7):
+        counts = np.zeros(len(of.units))
+        counts[k] = 1.0
+        of_all = np.linalg.inv(whole.prior + whole.units.information(counts))
+        of_few = np.linalg.inv(few.prior + few.units.information(counts))
+        assert of_few == pytest.approx(of_all[np.ix_(kept, kept)], rel=1e-6, abs=1e-9)
+
+
+def test_a_plan_for_predictions_is_better_than_random_poses_and_certified() -> None:
+    known = config("absolute").model_copy(update={"loads": []})
+    nominal = nominal_model(cell_of(registration_known=False), known)
+    nominal = replace(nominal, live=nominal.live[:-6])  # no load tells the compliance
+    of = problem(nominal, known, poses_of(80))
+    asked = objective_of(of, known, "I", prediction_poses(of.nominal, known, poses_of(30, 9)))
+    design = choose(asked, 20.0, np.random.default_rng(0))
+    # the bound splits precise readings over all poses, which no plan can
+    assert 0.1 < design.efficiency <= 1.0
+    rng, others = np.random.default_rng(5), []
+    for _ in range(20):
+        some = rng.permutation(len(of.units))[:20]
+        m = asked.prior + asked.units.information(np.ones(20), some)
+        others.append(float(asked.criterion.value(m)))
+    assert design.value > 1.2 * max(others)

@@ -1,0 +1,131 @@
+"""Readings that do not fit the description of the arm are refused, and the reason is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.hypotheses import Described, Hypothesis
+from hilcal.identification.misdescription import examine
+from hilcal.identification.registration import register
+from studies.random_descriptions import draw, judge, read
+from studies.random_descriptions import readings_of as table_of
+from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
+
+
+def readings_of(change: Hypothesis | None, m: int, noise: float = 5e-5):
+    """Readings by an arm that is otherwise than the catalogue's, at the same joint values."""
+    rng = np.random.default_rng(2)
+    q = rng.uniform(-2, 2, (40, 6))
+    nothing = Described(CELL.arm, q, q[:, :3], None, True, True)
+    arm = CELL.arm if change is None else change.applied(nothing).arm
+    value = read(arm, q, BASE, pose_of(np.eye(3), OFFSET), m)
+    sigma = np.full(m, noise)
+    return table_of(q, value + noise * rng.normal(size=value.shape), sigma)
+
+
+def found_in(readings, cell=None):
+    cell = cell or told(BASE, np.eye(4), False, False)
+    return examine(register(cell, readings), readings), cell
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_a_right_description_passes(m):
+    readings = readings_of(None, m)
+    assert found_in(readings)[0] is None
+    model = baseline(told(BASE, np.eye(4), False, False), readings, "absolute")
+    assert model.names == ("base_frame", "target_offset")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            Hypothesis("joint", 4, -1),
+            "joint 4 turns the other way in these data: .* in CELL.toml: "
+            r"\[robot\] joint_sign = \[1, 1, 1, -1, 1, 1\]",
+        ),
+        (
+            Hypothesis("joint", 3, 1, np.radians(7.0)),
+            r"joint 3's zero is 7.*° elsewhere .*joint_offset_deg = \[0.0, 0.0, [67]\.\d+, 0.0",
+        ),
+        (
+            Hypothesis("coupling", 3, follows=2, factor=1.0),
+            r"joint_coupling = \[\{ joint = 3, follows = 2, factor = 1.0 \}\]",
+        ),
+    ],
+)
+def test_the_reason_is_named_with_the_line_to_write(change, said):
+    readings = readings_of(change, 3)
+    with pytest.raises(InputError, match=said) as refused:
+        baseline(told(BASE, np.eye(4), False, False), readings, "absolute")
+    assert "\n" not in str(refused.value)
+
+
+def test_millimetres_and_swapped_rows_are_named():
+    good = readings_of(None, 3)
+    scaled = replace(good, value=1e3 * good.value)
+    finding, cell = found_in(scaled)
+    assert "the positions are millimetres" in finding.words(cell, scaled)
+    value = good.value.copy()
+    value[[4, 19]] = value[[19, 4]]
+    crossed = replace(good, value=value)
+    finding, cell = found_in(crossed)
+    assert finding.swapped == ((4, 19),)
+    assert "rows are swapped (p5/none with p20/none)" in finding.words(cell, crossed)
+
+
+@pytest.mark.parametrize("shift", [1, -2])
+def test_positions_of_other_rows_are_named(shift):
+    """Also where three of four readings of a pose are the same, and look right."""
+    good = readings_of(None, 3)
+    off = replace(good, value=np.roll(good.value, shift, axis=0))
+    finding, cell = found_in(off)
+    way = "after" if shift > 0 else "before"
+    rows = "1 row" if shift == 1 else "2 rows"
+    said = finding.words(cell, off)
+    assert finding.refused
+    assert f"each position stands {rows} {way} the joint values it belongs to" in said
+    assert said.endswith("correct it in the table")
+    four = good[np.repeat(np.arange(40), 8)]
+    off = replace(four, value=np.roll(four.value, 1, axis=0))
+    finding, cell = found_in(off)
+    assert "each position stands 1 row after" in finding.words(cell, off)
+
+
+def test_exchanged_columns_of_joints_are_named():
+    good = readings_of(None, 3)
+    for order, said in (
+        ([0, 4, 2, 3, 1, 5], "the columns of joints 2 and 5 are exchanged"),
+        ([0, 1, 2, 3, 5, 4], "the columns of joints 5 and 6 are exchanged"),
+        ([1, 2, 3, 4, 5, 0], "joint 1's values are in the column of joint 6"),
+    ):
+        off = replace(good, states=replace(good.states, q=good.states.q[:, order]))
+        finding, cell = found_in(off)
+        assert finding.refused
+        assert said in finding.words(cell, off)
+
+
+def test_a_gauge_is_not_proposed():
+    """The zero of joint 1 goes into the base, that of the last joint into the target."""
+    for joint in (1, 6):
+        assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7), 3))[0] is None
+
+
+def test_nonsense_is_refused_with_what_was_tried():
+    good = readings_of(None, 3)
+    mixed = replace(good, value=good.value[np.random.default_rng(0).permutation(len(good))])
+    finding, cell = found_in(mixed)
+    assert finding.refused
+    assert not finding.explanations
+    assert "Nothing that was tried explains it" in finding.words(cell, mixed)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4, 5])
+def test_random_arms_register_or_are_refused_for_the_right_reason(seed):
+    """A small sample of `studies/random_descriptions.py`."""
+    outcome, _ = judge(draw(np.random.default_rng(seed)))
+    assert outcome.right
+    assert outcome.named is not False
