@@ -12,7 +12,9 @@ Every name is imported when it is first used, so that `import hilcal` costs noth
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
+
+from hilcal.shown import Presenter
 
 __version__ = "0.1.0"
 
@@ -100,6 +102,11 @@ def __getattr__(name: str) -> object:
     found = getattr(import_module(_PLACES[name]), name)
     globals()[name] = found
     return found
+
+
+def presenter() -> Presenter:
+    """Return who writes what values say."""
+    return cast(Presenter, import_module("hilcal.present"))
 
 
 def __dir__() -> list[str]:

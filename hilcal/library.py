@@ -29,7 +29,7 @@ from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.noise_estimate import with_estimated_noise
 from hilcal.identification.posterior import Posterior
 from hilcal.model.model import Model
-from hilcal.present.build_story import build_story
+from hilcal.present.story import build_story
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode

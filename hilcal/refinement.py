@@ -28,6 +28,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Shown
 
 __all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
 
@@ -61,7 +62,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Refinement:
+class Refinement(Shown):
     """The steps of a refinement, from the starting model to the last one."""
 
     steps: tuple[Step, ...]

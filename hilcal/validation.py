@@ -1,7 +1,6 @@
 """Prediction of another campaign's readings: what was fitted is left out, the rest is judged."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,31 +8,10 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import mode_of
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification import validation
-from hilcal.identification.acceptance import Acceptance, Judged, acceptance
-from hilcal.identification.extrapolation import Extrapolation, extrapolation
-from hilcal.identification.validation import Validation
-from hilcal.model.model import Model
+from hilcal.identification.acceptance import CampaignValidation, Judged, acceptance
+from hilcal.identification.extrapolation import extrapolation
 from hilcal.readings.same_readings import never_fitted
 from hilcal.store.revision import RevisionRecord
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CampaignValidation:
-    """Readings of another campaign against a revision.
-
-    Attributes:
-        model: of the revision.
-        judged: which of the readings are judged.
-        prediction: of these.
-        beyond: what the fit states of them, and which lie outside of what was measured.
-        shares: errors by load and by pose, and against a limit.
-    """
-
-    model: Model
-    judged: Judged
-    prediction: Validation
-    beyond: Extrapolation
-    shares: Acceptance
 
 
 def validate(

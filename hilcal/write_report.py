@@ -12,8 +12,8 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
-from hilcal.present.build_story import build_story, of_left_out
 from hilcal.present.html.content import ReportContent, Tested
+from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.readings.whitening import SCALINGS, Scaling
 from hilcal.store.overview import overview
@@ -122,7 +122,7 @@ def write_report(
         first, verdict = comparison_screen(found, run.path.name), None
     else:
         from hilcal.present.html.first_screen import first_screen
-        from hilcal.present.html.page import page
+        from hilcal.present.html.sections import page
 
         with ExitStack() as stack:
             beside = Files(run.path).validation
@@ -156,14 +156,7 @@ def content_of(
     tested = None
     if validation is not None:
         found = validate(run, validation, record, limit_m, say=say)
-        tested = Tested(
-            validation.path.name,
-            _sha256(validation.path),
-            found.judged,
-            found.prediction,
-            found.beyond,
-            found.shares,
-        )
+        tested = Tested(validation.path.name, _sha256(validation.path), found)
         commands.append(f"hilcal validate {name} {quoted(validation.path.name)}{number}")
     story = build_story(chapters)
     return ReportContent(

@@ -3,6 +3,7 @@
 What `Calibration.compensate` returns; all but the joint values is computed when asked for.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -11,9 +12,10 @@ import numpy as np
 
 from hilcal.calibration.compensation import Inverse, singular
 from hilcal.calibration.measured import Outside
-from hilcal.calibration.poses import ToolPoses
+from hilcal.calibration.poses import BAND, ToolPoses
 from hilcal.calibration.tool import Tool
 from hilcal.readings.readings import States
+from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 
@@ -99,3 +101,50 @@ class Compensation:
         if self._wanted is None:
             return self._calibration.nominal(self._tool, self._states)
         return self._wanted
+
+    def to_dict(self, names: Sequence[str]) -> dict[str, object]:
+        """Return the document of `compensate --json`, SI; `names` are those of the points.
+
+        `expected_error_m` is the rms error to be expected at the corrected joint values: what the
+        inversion leaves, and the standard deviation of the position.
+        """
+        of, after, inside = self._calibration, self.after, self.inside
+        expected = np.hypot(self.inverse.residual_m, after.std_m)
+        return {
+            "calibration": dict(of.source),
+            "readings": of.mode,
+            "base_in_tracker": se3.six(of.base_in_tracker()),
+            "base_is": of.frames.base_is,
+            "n_points": len(names),
+            "error_before": _block(self.before.error_m),
+            "error_after": {
+                "std_m": _rms(after.std_m),
+                "band_m": float(after.band_m.max()),
+                "band_share": BAND,
+            },
+            "points": [
+                {
+                    "name": name,
+                    "q_command": self.given[k].tolist(),
+                    "q_corrected": self.q[k].tolist(),
+                    "expected_error_m": float(expected[k]),
+                    "inside": bool(inside[k]),
+                    "q_rad": self.q[k].tolist(),
+                    "before_m": float(self.before.error_m[k]),
+                    "before_rad": float(self.before.error_rad[k]),
+                    "residual_m": float(self.inverse.residual_m[k]),
+                    "std_m": float(after.std_m[k]),
+                    "band_m": float(after.band_m[k]),
+                    "refused": None,
+                }
+                for k, name in enumerate(names)
+            ],
+        }
+
+
+def _block(values: Floats) -> dict[str, float]:
+    return {"mean_m": float(values.mean()), "rms_m": _rms(values), "max_m": float(values.max())}
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.mean(values**2)))

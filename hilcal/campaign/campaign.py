@@ -24,6 +24,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
 from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
@@ -41,14 +42,14 @@ from hilcal.identification.posterior import Posterior, Source
 from hilcal.identification.predictive import Predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
-from hilcal.present.build_story import Chapter
-from hilcal.present.diagnosis_json import to_json
+from hilcal.present.story import Chapter
 from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import typed_now
+from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.records import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
@@ -108,6 +109,14 @@ class Campaign:
         except BaseException:
             file.close()
             raise
+
+    def _repr_html_(self) -> str:
+        from hilcal.present.campaign import info_report  # notebooks alone need them
+        from hilcal.present.html.page import fragment
+        from hilcal.present.registration import covariance_words
+
+        covariance = covariance_words(self.covariance_parts, self.noise)
+        return fragment(info_report(overview(self.file), self.path.name, covariance))
 
     @classmethod
     def _of(cls, file: CampaignFile, catalogue: Catalogue, changes: Changes) -> Self:

@@ -10,13 +10,13 @@ from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
-from hilcal.present.campaign import info_json, info_report
+from hilcal.present.campaign import info_report
 from hilcal.present.fit import model_name
 from hilcal.present.progress import counting
 from hilcal.present.registration import covariance_words
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.overview import overview
+from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
@@ -30,7 +30,7 @@ def info(run: Run, as_json: Json = False) -> None:
         parts = covariance_parts(file.about(COVERS), found.config)
         noise = NoiseEstimate.from_json(file.about(NOISE))
     t.show(info_report(found, run.name, covariance_words(parts, noise)))
-    t.document(info_json(found, str(run), parts))
+    t.document(to_json(found, str(run), parts))
 
 
 def accept(
@@ -144,7 +144,7 @@ def fleet(
         t.show(f"{report}: the report")
         document["report"] = str(report)
     if record is not None:
-        from hilcal.present.viewer.fleet_stream import record_fleet  # loads the viewer's library
+        from hilcal.present.viewer.fleet import record_fleet  # loads the viewer's library
 
         record_fleet(found, record)
         t.notice(f"recorded {record}; open it with: {opening(record)}")

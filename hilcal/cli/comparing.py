@@ -27,9 +27,7 @@ from hilcal.present.fit import (
 )
 from hilcal.present.progress import working
 from hilcal.present.validation import (
-    extrapolation_json,
     opening,
-    shares_json,
     shares_report,
     validation_failure,
     validation_report,
@@ -179,8 +177,8 @@ def validate(
             "error": found.error.to_json(),
             "variance_factor": found.variance_factor,
             "noise_floor_m": found.noise_floor,
-            **extrapolation_json(beyond),
-            **shares_json(shares),
+            **beyond.to_dict(),
+            **shares.to_dict(),
         },
         failed,
     )

@@ -36,7 +36,6 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
 from hilcal.present.calibration import (
-    compensation_json,
     compensation_report,
     fates,
     refusals,
@@ -152,7 +151,7 @@ def compensate(
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         found = calibration.compensate(q, acting, tool=task.tool)
-    document = compensation_json(calibration, task.points.names, found)
+    document = found.to_dict(task.points.names)
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
     for path in output or ():

@@ -42,11 +42,13 @@ from hilcal.design.checked_plan import refuse
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
 from hilcal.diagnosis.diagnosis import Diagnosis, History
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.doubt import in_doubt as left_open
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
 from hilcal.discovery.agreement import agreement
+from hilcal.discovery.document import laws_json
 from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.search import SAME
 from hilcal.effects.catalogue import Catalogue
@@ -65,8 +67,7 @@ from hilcal.present.diagnosis import (
     truth_table,
     verdict_line,
 )
-from hilcal.present.diagnosis_json import to_json
-from hilcal.present.discovery import laws_json, refined_laws
+from hilcal.present.discovery import refined_laws
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report

@@ -19,6 +19,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.discovery import discover as search
 from hilcal.discovery.discovery import rival_sources
+from hilcal.discovery.document import discovery_json
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.protocol import FRAME_ROLES
@@ -26,7 +27,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.names import quoted
-from hilcal.present.discovery import discovery_json, discovery_report, silence
+from hilcal.present.discovery import discovery_report, silence
 from hilcal.present.fit import model_name
 from hilcal.present.progress import working
 from hilcal.whole_file import replace_file

@@ -17,9 +17,9 @@ from hilcal.identification.baseline import with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
-from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.fit import model_name
 from hilcal.present.progress import Say, working
+from hilcal.present.story import Chapter, build_story
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.revision import RevisionRecord

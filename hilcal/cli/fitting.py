@@ -51,7 +51,7 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.misdescription import other_arm_of
-from hilcal.present.bootstrap import bootstrap_json, bootstrap_report
+from hilcal.present.bootstrap import bootstrap_remarks, bootstrap_report
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
 from hilcal.present.progress import counting, working
 from hilcal.present.registration import covariance_words, other_arm_line
@@ -227,4 +227,11 @@ def bootstrap(
         with counting(t.progress, "draws", draws) as advance:
             found = draw_again(fit, engine, draws, seed, advance)
     t.show(bootstrap_report(found))
-    t.document({"revision": number, "seed": seed, **bootstrap_json(found)})
+    t.document(
+        {
+            "revision": number,
+            "seed": seed,
+            **found.to_dict(),
+            "remarks": [*bootstrap_remarks(found)],
+        }
+    )

@@ -2,6 +2,7 @@
 
 import keyword
 import re
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -36,7 +37,6 @@ from hilcal.present.document import Table, note, table
 from hilcal.present.preparing import (
     reference_page,
     section_report,
-    sections_json,
     sections_overview,
 )
 from hilcal.present.progress import counting
@@ -183,11 +183,11 @@ def config(
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
     if section is None:
         t.show(sections_overview(known))
-        t.document(sections_json(known))
+        t.document({"sections": [asdict(s) for s in known]})
         return
     found = reference.table(section, known)
     t.show(section_report(found))
-    t.document(sections_json((found,)))
+    t.document({"sections": [asdict(found)]})
 
 
 def write_page(path: str = "docs/reference/cell-configuration.md") -> None:

@@ -76,7 +76,7 @@ def write(
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
         replace_file(csv, plan_csv(made.plan, pulls))
     if record is not None:
-        from hilcal.present.viewer.plan_stream import record_plan
+        from hilcal.present.viewer.plan import record_plan
 
         with working(t.progress) as say:
             say(f"recording {record}")

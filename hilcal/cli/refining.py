@@ -39,8 +39,10 @@ from hilcal.cli.options import (
 )
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
+from hilcal.diagnosis.document import suspect_json, to_json
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
+from hilcal.discovery.document import laws_json
 from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
@@ -52,7 +54,6 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.weight import weight_note
-from hilcal.present.build_story import Chapter
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
@@ -63,11 +64,11 @@ from hilcal.present.diagnosis import (
     rose,
     verdict_line,
 )
-from hilcal.present.diagnosis_json import suspect_json, to_json
-from hilcal.present.discovery import laws_json, refined_laws
+from hilcal.present.discovery import refined_laws
 from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
+from hilcal.present.story import Chapter
 from hilcal.present.verdict import message
 from hilcal.refinement import Step as RefinementStep
 from hilcal.refinement import refine as refine_model

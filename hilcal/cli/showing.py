@@ -26,10 +26,10 @@ from hilcal.cli.options import (
 from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.errors import InputError
 from hilcal.names import quoted
-from hilcal.present.build_story import build_story
 from hilcal.present.live_viewer import PORT, LiveViewer
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words
+from hilcal.present.story import build_story
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.schema import is_campaign
 from hilcal.tables.units import parse_length

@@ -60,6 +60,32 @@ class Change:
         """The parts of the cell that it may be of, the likeliest first."""
         return tuple(dict.fromkeys(c.part for c in (self.candidate, *self.same_as)))
 
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI."""
+        c = self.candidate
+        return {
+            "candidate": c.name,
+            "effect": c.effect,
+            "part": c.part,
+            "of_arm": c.of_arm,
+            "p_value": self.p_value,
+            "log_evidence": self.log_evidence,
+            "moved_m": self.moved_m,
+            "sizes": [
+                {
+                    "parameter": s.parameter,
+                    "unit": s.unit,
+                    "value": s.value,
+                    "std": s.std,
+                    "z": s.z,
+                    "before": None if s.before is None else s.before[0],
+                    "before_std": None if s.before is None else s.before[1],
+                }
+                for s in self.sizes
+            ],
+            "same_as": [o.name for o in self.same_as],
+        }
+
 
 @dataclass(frozen=True, slots=True)
 class Limit:
@@ -80,6 +106,16 @@ class Limit:
     unit: str
     size: float
     moved_m: float
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI; null for what is infinite."""
+        return {
+            "candidate": self.candidate,
+            "part": self.part,
+            "unit": self.unit,
+            "size": self.size if self.size < float("inf") else None,
+            "moved_m": self.moved_m if self.moved_m < float("inf") else None,
+        }
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from hilcal.diagnosis.change import LEVEL
 from hilcal.diagnosis.change_found import Changes
 from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit
@@ -13,6 +14,7 @@ from hilcal.identification.parameter_differences import Differences
 from hilcal.identification.residual import error_block
 from hilcal.identification.validation import Validation
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Shown
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +49,7 @@ class Today:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Comparison:
+class Comparison(Shown):
     """An earlier campaign and a later one of the same arm; what `compare` returns.
 
     Attributes:
@@ -85,6 +87,39 @@ class Comparison:
     def another_arm(self) -> bool:
         """Whether the later readings look as if they were of another arm of the same type."""
         return not self.changes.explained and not self.today.better_than_drawn
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI: the document of `compare --json` without its sentences."""
+        t, found = self.today, self.changes
+        return {
+            "revision": self.number,
+            "model": list(self.fit.model.names),
+            "readings": self.mode,
+            "n_readings": self.readings,
+            "n_fitted": self.shared,
+            "n_measurements": len(t.prediction.raw),
+            "tracker": "anew" if self.anew else "same",
+            "tool_differs": list(self.tool),
+            "added_to_earlier": list(self.lacked),
+            "error": t.prediction.error.to_json(),
+            "expected_m": t.stated_m,
+            "z": t.z,
+            "p_value": t.p_value,
+            "drawing_rms_m": t.drawing_m,
+            "n_outside": int(t.beyond.outside.sum()),
+            "outside": [v.variable for v in t.beyond.variables],
+            "changed": bool(found.found) or not found.explained,
+            "another_arm": self.another_arm,
+            "changes": [change.to_dict() for change in found.found],
+            "explained": found.explained,
+            "left_p_value": found.unexplained,
+            "left_over_stated": found.scatter,
+            "tested": found.tested,
+            "level": LEVEL,
+            "would_have_been_seen": [limit.to_dict() for limit in found.limits],
+            "not_to_be_seen": [h.name for h in found.hidden],
+            "parameters": None if self.differences is None else self.differences.to_dict(),
+        }
 
 
 def error_today(at: Setting, changes: Changes, drawing: float | None) -> Today:

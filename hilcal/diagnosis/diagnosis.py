@@ -1,7 +1,6 @@
 """The judgement of a fit: one frozen value that commands, `refine`, plans, studies and files carry.
 
-It holds data only; `hilcal.present.verdict` writes its sentence, and
-`hilcal.present.diagnosis_json` its JSON.
+It holds data only; `hilcal.present.verdict` writes its sentence.
 """
 
 from dataclasses import dataclass
@@ -9,6 +8,7 @@ from typing import Literal
 
 from hilcal.diagnosis.background_evidence import BackgroundEffect
 from hilcal.diagnosis.catalogue_sufficiency import Insufficiency
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.misfit_breakdown import MisfitShare
 from hilcal.diagnosis.noise import PureError
@@ -20,6 +20,7 @@ from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.shown import Shown
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 Reason = Literal[
@@ -72,7 +73,7 @@ class History:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Diagnosis:
+class Diagnosis(Shown):
     """What is wrong with a fitted model.
 
     Attributes:
@@ -169,7 +170,4 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, object]:
         """Return the JSON document of `hilcal diagnose --json`, the sentence included."""
-        # The one import upwards: words are written in `report`, and a script has only this value.
-        from hilcal.present.diagnosis_json import to_json
-
         return to_json(self)

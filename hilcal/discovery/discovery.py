@@ -34,6 +34,7 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import left_out_by_pose, linearise
 from hilcal.regression.evidence import score_family
+from hilcal.shown import Shown
 from hilcal.types import Floats
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
@@ -57,7 +58,7 @@ MOST_RIVALS = 2
 
 
 @dataclass(frozen=True, eq=False)
-class Discovery:
+class Discovery(Shown):
     """What the search for laws came to.
 
     Attributes:

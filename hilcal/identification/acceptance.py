@@ -1,14 +1,16 @@
 """Prediction errors by load and by pose, against the stated uncertainty and against a limit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy.stats import chi2
 
 from hilcal.identification.extrapolation import Extrapolation
 from hilcal.identification.validation import Validation
+from hilcal.model.model import Model
 from hilcal.readings.whitening import Mode
+from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
 BAND = 0.95
@@ -105,6 +107,43 @@ class Acceptance:
     def undecided(self) -> bool:
         """Whether the limit is not kept, and the readings are too noisy to show that it could."""
         return self.passed is False and self.limit_m is not None and self.limit_m < self.noise_m
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `validate --json` on loads, poses and the limit."""
+        limit = self.limit_m
+
+        def document(s: Share, own: str, other: str) -> dict[str, object]:
+            d = {own if k == "name" else k: v for k, v in asdict(s).items()}
+            d[f"worst_{other}"] = d.pop("worst")
+            return d if limit is None else {**d, "passed": s.passes(limit)}
+
+        return {
+            "within_95": self.everything.within,
+            "loads": [document(s, "load", "pose") for s in self.loads],
+            "poses": [document(s, "pose", "load") for s in self.poses],
+            "limit": None
+            if limit is None
+            else {"limit_m": limit, "passed": self.passed, "n_over": self.over},
+        }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CampaignValidation(Shown):
+    """Readings of another campaign against a revision.
+
+    Attributes:
+        model: of the revision.
+        judged: which of the readings are judged.
+        prediction: of these.
+        beyond: what the fit states of them, and which lie outside of what was measured.
+        shares: errors by load and by pose, and against a limit.
+    """
+
+    model: Model
+    judged: Judged
+    prediction: Validation
+    beyond: Extrapolation
+    shares: Acceptance
 
 
 def acceptance(

@@ -32,12 +32,15 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.priors import prior_of
+from hilcal.identification.priors import names_of, prior_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Scaling, whitening
+from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
+LEVEL = 0.95
+"""Of the percentile interval, unless another is asked for."""
 DRAWS = 200
 """Usual number of draws: the standard deviation is known to 5 %; Efron and Tibshirani, 6.4."""
 LEAST_DRAWS = 20
@@ -74,7 +77,7 @@ class _Campaign:
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
+class Bootstrap(Shown):
     """Parameters of a model, fitted to B draws of whole poses.
 
     Attributes:
@@ -114,7 +117,7 @@ class Bootstrap:
         out[self.compared] = self.std[self.compared] / self.fit.uncertainty.std[self.compared]
         return out
 
-    def interval(self, level: float = 0.95) -> Floats:
+    def interval(self, level: float = LEVEL) -> Floats:
         """(2, P) ends of the percentile interval.
 
         Raises:
@@ -124,6 +127,31 @@ class Bootstrap:
             raise InputError(f"level {level:g}; valid: between 0 and 1")
         tail = (1 - level) / 2
         return np.asarray(np.quantile(self.theta, [tail, 1 - tail], axis=0))
+
+    def to_dict(self) -> dict[str, object]:
+        """Return it as JSON, SI."""
+        fit, ends = self.fit, self.interval()
+        units = [p.unit for e in fit.model.effects for p in e.parameters]
+        rows = [
+            {
+                "name": name,
+                "unit": units[k],
+                "value": float(fit.theta[k]),
+                "std": float(fit.uncertainty.std[k]) if self.compared[k] else None,
+                "bootstrap_std": float(self.std[k]),
+                "ratio": float(self.ratio[k]) if self.compared[k] else None,
+                "interval": [float(ends[0, k]), float(ends[1, k])],
+            }
+            for k, name in enumerate(names_of(fit.model))
+            if fit.solution.estimated[k]
+        ]
+        return {
+            "draws": len(self.theta),
+            "failed": self.failed,
+            "poses": self.poses,
+            "level": LEVEL,
+            "parameters": rows,
+        }
 
 
 def bootstrap(

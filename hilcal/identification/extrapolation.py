@@ -68,6 +68,35 @@ class Extrapolation:
     inside_error: ErrorBlock | None
     outside_error: ErrorBlock | None
 
+    def to_dict(self) -> dict[str, object]:
+        """Return the keys of `validate --json` on extrapolation and stated standard deviations."""
+        z, outside = self.z, self.outside
+        errors = {"inside": self.inside_error, "outside": self.outside_error}
+        members = {"inside": ~outside, "outside": outside}
+        return {
+            "stated_rms_m": _rms(self.stated_m),
+            "z_rms": _rms(z),
+            "extrapolation": {
+                "n_outside": int(outside.sum()),
+                "variables": [
+                    {
+                        "variable": v.variable,
+                        "unit": v.unit,
+                        "measured": [v.low, v.high],
+                        "n_outside": v.count,
+                        "beyond": v.most,
+                    }
+                    for v in self.variables
+                ],
+                **{f"error_{k}": None if e is None else e.to_json() for k, e in errors.items()},
+                **{f"z_{k}": _rms(z[mine]) if mine.any() else None for k, mine in members.items()},
+            },
+        }
+
+
+def _rms(x: Floats) -> float:
+    return float(np.sqrt(np.mean(x**2)))
+
 
 def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
     """Compare readings with those that a model was fitted to.

@@ -17,7 +17,7 @@ Source: Anderson and Duffin, *Series and parallel addition of matrices*, J. Math
 (1969) 576-594.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from scipy.stats import chi2
@@ -92,6 +92,14 @@ class Differences:
     rows: tuple[Difference, ...]
     effects: tuple[EffectDifference, ...]
     apart: tuple[str, ...]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return them as JSON, SI."""
+        return {
+            "rows": [{**asdict(r), "z": r.z} for r in self.rows],
+            "effects": [asdict(e) for e in self.effects],
+            "not_in_both": list(self.apart),
+        }
 
 
 def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:

@@ -2,10 +2,12 @@
 
 from scipy.stats import chi2
 
+from hilcal.shown import Shown
+
 CONFIDENCE = 0.95
 
 
-class WithVarianceFactor:
+class WithVarianceFactor(Shown):
     """What has a whitened sum of squares and its degrees of freedom."""
 
     __slots__ = ()

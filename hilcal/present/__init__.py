@@ -1,1 +1,18 @@
-"""Reports: the story as data, in rerun, as pictures."""
+"""What results say: a document of words, tables and charts, made once, and what renders it."""
+
+
+def html_of(value: object) -> str:
+    """Return a result as a notebook shows it."""
+    from hilcal.present import notebook  # loads all kinds of results
+
+    return notebook.html_of(value)
+
+
+def message(of: object) -> str:
+    """Return a diagnosis in a sentence."""
+    from hilcal.diagnosis.diagnosis import Diagnosis
+    from hilcal.present import verdict
+
+    if not isinstance(of, Diagnosis):
+        raise TypeError(f"no sentence for a {type(of).__name__}")
+    return verdict.message(of)

@@ -10,7 +10,6 @@ from hilcal.identification.priors import names_of
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import kind, model_name
 
-LEVEL = 0.95
 WIDER = 1.5
 """Ratio from which on the stated standard uncertainty is called too small; a choice. The standard
 deviation of 200 draws is known to 5 %, but that of few poses to much less."""
@@ -41,7 +40,7 @@ def _table(found: Bootstrap) -> Table:
         "parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit",
         left=(0, 6),
     )  # fmt: skip
-    fit, (low, high) = found.fit, found.interval(LEVEL)
+    fit, (low, high) = found.fit, found.interval()
     units = [p.unit for e in fit.model.effects for p in e.parameters]
     for k, name in enumerate(names_of(fit.model)):
         if not found.compared[k]:
@@ -100,30 +99,3 @@ def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:
             f"{found.failed} further draws are left out: their poses do not determine the "
             "parameters. What is said of the others is too good by that."
         )
-
-
-def bootstrap_json(found: Bootstrap) -> dict[str, object]:
-    """Return the bootstrap as a JSON document says it, SI."""
-    fit, ends = found.fit, found.interval(LEVEL)
-    units = [p.unit for e in fit.model.effects for p in e.parameters]
-    rows = [
-        {
-            "name": name,
-            "unit": units[k],
-            "value": float(fit.theta[k]),
-            "std": float(fit.uncertainty.std[k]) if found.compared[k] else None,
-            "bootstrap_std": float(found.std[k]),
-            "ratio": float(found.ratio[k]) if found.compared[k] else None,
-            "interval": [float(ends[0, k]), float(ends[1, k])],
-        }
-        for k, name in enumerate(names_of(fit.model))
-        if fit.solution.estimated[k]
-    ]
-    return {
-        "draws": len(found.theta),
-        "failed": found.failed,
-        "poses": found.poses,
-        "level": LEVEL,
-        "parameters": rows,
-        "remarks": list(bootstrap_remarks(found)),
-    }

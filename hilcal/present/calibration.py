@@ -20,7 +20,6 @@ from hilcal.present.registration import base_line
 from hilcal.present.running import spoken
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
 from hilcal.readings.whitening import Mode
-from hilcal.robot import se3
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -392,48 +391,3 @@ def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
     yield out
     if any(f.blend_m > 0 and f.done == "corrected" for f in found):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."
-
-
-def compensation_json(
-    calibration: Calibration, names: Sequence[str], c: Compensation
-) -> dict[str, object]:
-    """Return the JSON document, SI.
-
-    `expected_error_m` is the rms error to be expected at the corrected joint values: what the
-    inversion leaves, and the standard deviation of the position.
-    """
-    expected, inside = np.hypot(c.inverse.residual_m, c.after.std_m), c.inside
-    return {
-        "calibration": dict(calibration.source),
-        "readings": calibration.mode,
-        "base_in_tracker": se3.six(calibration.base_in_tracker()),
-        "base_is": calibration.frames.base_is,
-        "n_points": len(names),
-        "error_before": _block(c.before.error_m),
-        "error_after": {
-            "std_m": _rms(c.after.std_m),
-            "band_m": float(c.after.band_m.max()),
-            "band_share": BAND,
-        },
-        "points": [
-            {
-                "name": name,
-                "q_command": c.given[k].tolist(),
-                "q_corrected": c.q[k].tolist(),
-                "expected_error_m": float(expected[k]),
-                "inside": bool(inside[k]),
-                "q_rad": c.q[k].tolist(),
-                "before_m": float(c.before.error_m[k]),
-                "before_rad": float(c.before.error_rad[k]),
-                "residual_m": float(c.inverse.residual_m[k]),
-                "std_m": float(c.after.std_m[k]),
-                "band_m": float(c.after.band_m[k]),
-                "refused": None,
-            }
-            for k, name in enumerate(names)
-        ],
-    }
-
-
-def _block(values: Floats) -> dict[str, float]:
-    return {"mean_m": float(values.mean()), "rms_m": _rms(values), "max_m": float(values.max())}

@@ -1,7 +1,6 @@
 """What `compare A B` says: the error of the earlier calibration today, and what has changed."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER
@@ -288,80 +287,7 @@ def next_command(c: Comparison, earlier: str, later: str) -> str | None:
 
 
 def comparison_json(c: Comparison, earlier: str, later: str) -> dict[str, object]:
-    """Return the comparison as JSON; SI."""
-    t, found = c.today, c.changes
-    return {
-        "revision": c.number,
-        "model": list(c.fit.model.names),
-        "readings": c.mode,
-        "n_readings": c.readings,
-        "n_fitted": c.shared,
-        "n_measurements": len(t.prediction.raw),
-        "tracker": "anew" if c.anew else "same",
-        "tool_differs": list(c.tool),
-        "added_to_earlier": list(c.lacked),
-        "error": t.prediction.error.to_json(),
-        "expected_m": t.stated_m,
-        "z": t.z,
-        "p_value": t.p_value,
-        "drawing_rms_m": t.drawing_m,
-        "n_outside": int(t.beyond.outside.sum()),
-        "outside": [v.variable for v in t.beyond.variables],
-        "changed": bool(found.found) or not found.explained,
-        "another_arm": c.another_arm,
-        "changes": [_change_json(change) for change in found.found],
-        "explained": found.explained,
-        "left_p_value": found.unexplained,
-        "left_over_stated": found.scatter,
-        "tested": found.tested,
-        "level": LEVEL,
-        "would_have_been_seen": [
-            {
-                "candidate": limit.candidate,
-                "part": limit.part,
-                "unit": limit.unit,
-                "size": limit.size if limit.size < float("inf") else None,
-                "moved_m": limit.moved_m if limit.moved_m < float("inf") else None,
-            }
-            for limit in found.limits
-        ],
-        "not_to_be_seen": [h.name for h in found.hidden],
-        "parameters": None if c.differences is None else _parameters_json(c.differences),
-        "next": next_step(c, earlier),
-        "next_command": next_command(c, earlier, later),
-    }
-
-
-def _parameters_json(d: Differences) -> dict[str, object]:
-    return {
-        "rows": [{**asdict(r), "z": r.z} for r in d.rows],
-        "effects": [asdict(e) for e in d.effects],
-        "not_in_both": list(d.apart),
-    }
-
-
-def _change_json(change: Change) -> dict[str, object]:
-    c = change.candidate
-    return {
-        "candidate": c.name,
-        "effect": c.effect,
-        "part": c.part,
-        "of_arm": c.of_arm,
-        "words": sentence(change),
-        "p_value": change.p_value,
-        "log_evidence": change.log_evidence,
-        "moved_m": change.moved_m,
-        "sizes": [
-            {
-                "parameter": s.parameter,
-                "unit": s.unit,
-                "value": s.value,
-                "std": s.std,
-                "z": s.z,
-                "before": None if s.before is None else s.before[0],
-                "before_std": None if s.before is None else s.before[1],
-            }
-            for s in change.sizes
-        ],
-        "same_as": [o.name for o in change.same_as],
-    }
+    """Return the comparison as JSON, SI, with its sentences."""
+    changes = [{**x.to_dict(), "words": sentence(x)} for x in c.changes.found]
+    after = {"next": next_step(c, earlier), "next_command": next_command(c, earlier, later)}
+    return {**c.to_dict(), "changes": changes, **after}

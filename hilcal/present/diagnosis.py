@@ -16,11 +16,15 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
 from hilcal.present.fit import CERTAIN, follows, misses, model_name, where_table
-from hilcal.present.story import REVISION_HEADS
 from hilcal.present.verdict import broken, headline, implausible, message
 from hilcal.types import Floats
 
 SUSPECTS = 6
+REVISION_HEADS = (
+    *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
+    *("variance\nfactor", "verdict"),
+)
+"""Of a table of revisions."""
 
 
 def verdict_line(d: Diagnosis) -> Words:

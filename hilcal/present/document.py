@@ -1,8 +1,8 @@
 """What a result says: words, tables and charts, made once; terminal, page and viewer render them.
 
-A builder yields blocks from the values of the library (`fit_report(fit)`); rich prints them, and
-`html.page.render` and `viewer.markdown` write them down. A plain string is a paragraph, and its
-ends of lines are for the terminal.
+A builder yields blocks from the values of the library (`fit_report(fit)`); rich prints them,
+`html.page` and `viewer.style.markdown` write them down. A plain string is a paragraph, and its ends
+of lines are for the terminal.
 """
 
 from collections.abc import Iterable, Sequence

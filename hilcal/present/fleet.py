@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
     from hilcal.transfer.pooled import Odd, Pooled, Seen, Spread
 
+FAR = 3.0
+"""Standard deviations between which most arms lie; a choice."""
 KNOWN = {
     "list": "arms.csv",
     "serial number": "the serial number that the arm told",

@@ -23,9 +23,8 @@ from typing import IO, Any
 
 from hilcal.cell import Cell
 from hilcal.measuring.progress import ArmAt
-from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.progress import Say
-from hilcal.present.story import Story
+from hilcal.present.story import Chapter, Story, build_story
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog

@@ -2,7 +2,6 @@
 
 import itertools
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, Table
 from hilcal.doctor.finding import Finding
@@ -53,11 +52,6 @@ def reference_page(tables: Sequence[Table]) -> str:
             lines.append("| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |")
         lines.append("")
     return "\n".join(lines)
-
-
-def sections_json(tables: Sequence[Table]) -> dict[str, object]:
-    """Return the document of `config --json`."""
-    return {"sections": [asdict(t) for t in tables]}
 
 
 MARKS = {"ok": "✓", "warning": "!", "problem": "✗"}

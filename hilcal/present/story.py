@@ -1,14 +1,42 @@
-"""A campaign as it is drawn: its readings, and one model revision after another, in base axes."""
+"""A campaign as charts and viewer draw it: readings and the revisions of its model, base axes."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
 from scipy import stats
 
+from hilcal import numbers
+from hilcal.cell import Cell
+from hilcal.diagnosis.added_variable import added_variable
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.residual_regression import Dependence
+from hilcal.discovery.drawn_law import drawn_laws
+from hilcal.discovery.law import Coefficient
+from hilcal.errors import InputError
+from hilcal.identification.fit import Fit, all_left_out, mahalanobis2
+from hilcal.identification.full_prediction import FullPrediction, full_prediction
+from hilcal.identification.residual import ErrorBlock
+from hilcal.model.model import Model
+from hilcal.present.diagnosis import (
+    diagnosis_report,
+    moves,
+    revision_cells,
+    shown_suspects,
+    suspects_table,
+)
+from hilcal.present.discovery import coefficient
 from hilcal.present.document import Block
+from hilcal.present.fit import errors, misses, model_name, parameters
+from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
+from hilcal.robot.body import body_poses
+from hilcal.store.revision import change
 from hilcal.types import Floats, Ints
 
 Mode = Literal["deflection", "absolute"]
@@ -16,11 +44,6 @@ LEVEL_NAMES = ("inside the noise", "doubtful", "outside the noise")
 LIMITS = (0.99, 0.9999)
 """Quantiles of χ²(3) from which a reading is doubtful, and outside: noise does that once in 100,
 and in 10,000 readings."""
-REVISION_HEADS = (
-    *("rev.", "model", "poses\nfitted", "\nσ", "poses\nleft out", "\nσ"),
-    *("variance\nfactor", "verdict"),
-)
-"""Of a table of revisions."""
 
 
 def levels(norm2: Floats) -> Ints:
@@ -79,8 +102,8 @@ class StoryRevision:
         residual: (N, 3) measured - predicted, base axes, m.
         predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
         whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
-        error_fit: error of the fitted readings, keys "rms_m", "mean_m", "max_m", "rms_sigma".
-        error_holdout: error of whole poses left out, same keys.
+        error: of the fitted readings.
+        holdout: of whole poses left out.
         cells: of its row in a table of revisions.
         panels: "verdict", "details" and "parameters" in words and tables.
         follows: what the residual follows: the variable that carries most of it, where the first
@@ -95,12 +118,27 @@ class StoryRevision:
     residual: Floats
     predicted: Floats
     whitened_norm2: Floats
-    error_fit: Mapping[str, float]
-    error_holdout: Mapping[str, float]
+    error: ErrorBlock
+    holdout: ErrorBlock
     cells: tuple[str, ...] = ()
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
     follows: Curve | None = None
     laws: tuple[Curve, ...] = ()
+
+    @property
+    def size_m(self) -> Floats:
+        """(N,) lengths of the residuals, m."""
+        return np.asarray(np.linalg.norm(self.residual, axis=1))
+
+    @property
+    def sigma(self) -> Floats:
+        """(N,) Mahalanobis distances, σ."""
+        return np.sqrt(self.whitened_norm2)
+
+    @property
+    def level(self) -> Ints:
+        """(N,) index of each reading into `LEVEL_NAMES`."""
+        return levels(self.whitened_norm2)
 
     @property
     def name(self) -> str:
@@ -108,7 +146,7 @@ class StoryRevision:
         return self.change or (self.cells[1] if self.cells else "first model")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Story:
     """N readings and the revisions of the model that was fitted to them; SI, base axes.
 
@@ -146,6 +184,49 @@ class Story:
     time_s: Floats | None = None
     growing: bool = False
 
+    @cached_property
+    def _of_poses(self) -> tuple[Ints, Ints, Ints]:
+        return np.unique(self.pose, return_index=True, return_inverse=True)
+
+    @property
+    def poses(self) -> Ints:
+        """(P,) the numbers of its poses, growing."""
+        return self._of_poses[0]
+
+    @property
+    def first(self) -> Ints:
+        """(P,) the first reading of each pose."""
+        return self._of_poses[1]
+
+    @property
+    def row(self) -> Ints:
+        """(N,) index into `poses` of each reading."""
+        return self._of_poses[2]
+
+    @cached_property
+    def bodies(self) -> Floats:
+        """(P, n + 2, 4, 4) poses of the arm's bodies at each pose."""
+        return body_poses(self.arm, self.q[self.first])
+
+    @cached_property
+    def targets(self) -> Floats:
+        """(T, 3) places of the targets that were read, flange axes, m."""
+        flange = self.bodies[self.row, -1]
+        offset = np.einsum("nij,ni->nj", flange[:, :3, :3], self.anchor - flange[:, :3, 3])
+        number = np.zeros(len(self), dtype=np.int64) if self.target is None else self.target
+        return np.array([np.median(offset[number == k], axis=0) for k in np.unique(number)])
+
+    def deviation(self, value: Floats) -> Floats:
+        """Deflection (N, 3) of measured or predicted values: absolute ones less the nominal."""
+        return value if self.mode == "deflection" else value - self.anchor
+
+    def last_of_poses(self, badness: Floats) -> Ints:
+        """(P,) the reading of each pose that has the largest of (N,)."""
+        order = np.lexsort((badness, self.row))
+        return np.asarray(
+            order[np.append(np.flatnonzero(np.diff(self.row[order])), len(order) - 1)]
+        )
+
     def pose_name(self, i: int) -> str:
         """Return the name of reading i's pose, as everywhere else."""
         return self.pose_names[i] if self.pose_names else str(self.pose[i])
@@ -153,3 +234,243 @@ class Story:
     def __len__(self) -> int:
         """Return the number of readings N."""
         return len(self.pose)
+
+
+MOST_NUMBER = 10**9
+UNDIAGNOSED = "not diagnosed"
+LITTLE = 0.2
+"""Share of the predictable misfit that the first suspect must explain for its own chart to be
+shown, not those of the variables; a guess."""
+LEAST_CARRIED = 0.02
+"""Share of the misfit below which a variable is not shown; a guess."""
+MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chapter:
+    """One revision.
+
+    Attributes:
+        number: of the revision.
+        added: the effect that it added.
+        fit: the fit.
+        diagnosis: of it, or None where it was not diagnosed.
+        removed: the effect that it took out.
+    """
+
+    number: int
+    added: str | None
+    fit: Fit
+    diagnosis: Diagnosis | None
+    removed: str | None = None
+
+
+def build_story(chapters: Sequence[Chapter]) -> Story:
+    """Build the story of successive revisions of one campaign, in base axes.
+
+    All readings are shown, also those that were set aside as gross errors. The base is that of
+    the last revision. An arrow starts where the rigid
+    nominal arm would hold the target.
+
+    Raises:
+        InputError: no revision, or revisions of different readings.
+    """
+    if not chapters:
+        raise InputError("no revision to show; run hilcal identify first")
+    parts = [full_prediction(c.fit) for c in chapters]
+    last = parts[-1]
+    mode: Mode = chapters[-1].fit.mode
+    for c, part in zip(chapters, parts, strict=True):
+        if c.fit.mode != mode or not np.array_equal(part.whitening.reading, last.whitening.reading):
+            raise InputError(
+                f"revision {c.number} was fitted to other readings; nothing to compare"
+            )
+    readings, rows = last.readings, last.whitening.reading
+    frames = chapters[-1].fit.frames
+    axes = np.broadcast_to(frames.base[:3, :3].T, (len(rows), 3, 3))
+    nominal = _nominal(chapters[-1].fit.model.cell.with_targets(frames.declared), last)
+    if mode == "absolute":
+        chain, predicted = frames.chain, last.prediction.observation.base_position
+        measured = chain[:3, 3] + predicted @ chain[:3, :3].T + _turn(axes, last.raw[:, :3])
+    else:
+        measured = _turn(axes, last.whitening.raw(readings.value[:, :3]))
+    covariance = axes @ last.whitening.covariance[:, :3, :3] @ np.swapaxes(axes, 1, 2)
+    return Story(
+        arm=chapters[-1].fit.model.cell.arm,
+        mode=mode,
+        q=readings.states.q[rows],
+        pose=pose_numbers(readings.pose_names)[readings.pose[rows]],
+        load_names=tuple(readings.load_names[k] for k in readings.load[rows]),
+        anchor=nominal[rows],
+        measured=measured,
+        covariance=0.5 * (covariance + np.swapaxes(covariance, 1, 2)),
+        noise_floor_m=last.noise_floor,
+        revisions=tuple(
+            _revision(c, part, axes, measured) for c, part in zip(chapters, parts, strict=True)
+        ),
+        target=None if readings.states.target is None else readings.target[rows],
+        target_names=readings.target_names,
+        pose_names=tuple(readings.pose_names[k] for k in readings.pose[rows]),
+        time_s=None if readings.states.time is None else readings.states.time[rows],
+    )
+
+
+def of_left_out(revision: StoryRevision, fit: Fit) -> StoryRevision:
+    """Return a revision with the errors of poses left out in place of those of its fit."""
+    raw, w = all_left_out(fit)
+    residual = raw[:, :3] @ fit.frames.base[:3, :3]
+    return replace(
+        revision,
+        residual=residual,
+        predicted=revision.predicted + revision.residual - residual,
+        whitened_norm2=mahalanobis2(raw[:, :3], w.covariance[:, :3, :3]),
+    )
+
+
+def pose_numbers(names: Sequence[str]) -> Ints:
+    """Number of each pose, by which the viewer orders them.
+
+    It is that which its name ends in, 13 of "p13". A pose without, as the reference, has the
+    smallest number from 0 that is free. Where two names end in the same number: 1, 2, ...
+    """
+    ends = [re.search(r"[0-9]+$", name) for name in names]
+    given = [int(end.group()) for end in ends if end is not None]
+    if not given or len(set(given)) < len(given) or max(given) >= MOST_NUMBER:
+        return np.arange(1, len(names) + 1)
+    free = (k for k in itertools.count() if k not in set(given))
+    numbers = [next(free) if end is None else int(end.group()) for end in ends]
+    return np.array(numbers, dtype=np.int64)
+
+
+def _nominal(cell: Cell, e: FullPrediction) -> Floats:
+    """Target positions (N, 3) of the rigid nominal arm, base axes."""
+    prediction = Model(cell, ()).predict(e.readings.states, np.zeros(0))
+    return prediction.observation.base_position
+
+
+def _turn(axes: Floats, vectors: Floats) -> Floats:
+    return np.asarray(np.einsum("dij,dj->di", axes, vectors))
+
+
+def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> StoryRevision:
+    residual, d = _turn(axes, e.raw[:, :3]), c.diagnosis
+    changed = change(c.added, c.removed, c.fit.readings.arm_scatter is not None)
+    verdict = UNDIAGNOSED if d is None else d.verdict
+    return StoryRevision(
+        revision=c.number,
+        change=changed,
+        verdict=verdict,
+        message="run hilcal diagnose for a verdict" if d is None else message(d),
+        residual=residual,
+        predicted=measured - residual,
+        whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
+        error=c.fit.error,
+        holdout=c.fit.holdout,
+        cells=revision_cells(c.number, changed, c.fit, verdict),
+        panels=_panels(c),
+        follows=None if d is None else _follows(d),
+        laws=laws(c.fit),
+    )
+
+
+def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
+    d = c.diagnosis
+    verdict: list[Block] = [f"{UNDIAGNOSED.capitalize()}: run hilcal diagnose for a verdict."]
+    details: list[Block] = [misses(c.fit)]
+    if d is not None:
+        verdict = [numbers.sentence(message(d), d.fit.model.catalogue.names)]
+        if d.significant:
+            verdict.append(suspects_table(d, MOST_SUSPECTS))
+        details = list(diagnosis_report(d))
+        if (drawn := _follows(d)) is not None:
+            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
+    return {
+        "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
+        "details": (*details, errors(c.fit)),
+        "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
+    }
+
+
+def _follows(d: Diagnosis) -> Curve | None:
+    known = 0.0 if d.lead is None else d.lead.holdout_share
+    explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
+    carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
+    if carried and d.verdict != "adequate" and not explained:
+        return curve(carried[0])
+    suspects = [] if d.lead is None else shown_suspects(d)
+    return regressor(d.fit, suspects[0]) if suspects else None
+
+
+def laws(fit: Fit) -> tuple[Curve, ...]:
+    """Return the curves of laws from files, in units for people; see `drawn_laws`."""
+    out = []
+    for law in drawn_laws(fit):
+        told = [
+            f"{p.name.partition('.')[2]} = "
+            + coefficient(Coefficient(p.name, p.value or 0.0, p.std or 0.0, p.unit))
+            for p in fit.parameters
+            if p.name.startswith(f"{law.name}.") and p.value is not None
+        ]
+        acts, coefficients = ", ".join(law.acts_on), ", ".join(told)
+        facts = (("law", law.formula), ("acts on", acts), ("coefficients", coefficients))
+        for c in law.curves:
+            x, y, error, _ = c.binned
+            x_unit, x_factor = numbers.angle_or(c.quantity_unit)
+            y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
+            out.append(
+                Curve(
+                    law.name,
+                    f"{law.formula}: where it is right, the readings lie on it.",
+                    x_factor * x,
+                    factor * y,
+                    c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]",
+                    f"{c.of} of {c.site} [{y_unit}]",
+                    factor * error,
+                    line=np.vstack([x_factor * c.line[0], factor * c.line[1]]),
+                    facts=facts,
+                )
+            )
+    return tuple(out)
+
+
+def curve(d: Dependence) -> Curve:
+    """Return a dependence in units for people."""
+    x_unit, x_factor = _unit_of(d)
+    y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
+    return Curve(
+        d.variable,
+        f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}.",
+        x_factor * d.x,
+        y_factor * d.y,
+        f"{d.variable} [{x_unit}]" if x_unit else d.variable,
+        f"error of {moves(d)} [{y_unit}]",
+        y_factor * d.error,
+        d.labels,
+    )
+
+
+def _unit_of(d: Dependence) -> tuple[str, float]:
+    """Unit for people, and its factor, of the variable."""
+    if d.unit == "rad":
+        return "°", 180.0 / np.pi
+    if d.unit == "s":
+        span = float(np.ptp(d.x))
+        return ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60) if span > 120 else ("s", 1.0)
+    return d.unit, 1.0
+
+
+def regressor(fit: Fit, suspect: Suspect) -> Curve | None:
+    """Return the added variable of a suspect, see `added_variable`; None where it has none."""
+    found = added_variable(fit, suspect)
+    return (
+        None
+        if found is None
+        else Curve(
+            suspect.effect,
+            f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
+            1e6 * found[0],
+            1e6 * found[1],
+            f"what {suspect.effect} would explain [µm]",
+            "residual along it [µm]",
+        )
+    )

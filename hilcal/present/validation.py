@@ -1,14 +1,12 @@
 """Readings that were never fitted: their errors by load, by pose, by a limit."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict
 
 import numpy as np
 
 from hilcal import numbers
 from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
 from hilcal.identification.extrapolation import Beyond, Extrapolation
-from hilcal.identification.residual import ErrorBlock
 from hilcal.identification.validation import Validation
 from hilcal.present.document import Block, Table, note, table
 from hilcal.store.plan import UNLOADED
@@ -167,53 +165,5 @@ def validation_failure(found: Acceptance, judged: Judged) -> str:
     )
 
 
-def shares_json(found: Acceptance) -> dict[str, object]:
-    """Return the keys of `validate --json` on loads, poses and the limit."""
-    limit = found.limit_m
-
-    def document(s: Share, own: str, other: str) -> dict[str, object]:
-        d = {own if k == "name" else k: v for k, v in asdict(s).items()}
-        d[f"worst_{other}"] = d.pop("worst")
-        return d if limit is None else {**d, "passed": s.passes(limit)}
-
-    return {
-        "within_95": found.everything.within,
-        "loads": [document(s, "load", "pose") for s in found.loads],
-        "poses": [document(s, "pose", "load") for s in found.poses],
-        "limit": None
-        if limit is None
-        else {"limit_m": limit, "passed": found.passed, "n_over": found.over},
-    }
-
-
 def _rms(x: Floats) -> float:
     return float(np.sqrt(np.mean(x**2)))
-
-
-def extrapolation_json(beyond: Extrapolation) -> dict[str, object]:
-    """Return the keys of `validate --json` on extrapolation and stated standard deviations."""
-
-    def block(e: ErrorBlock | None) -> dict[str, float] | None:
-        return None if e is None else e.to_json()
-
-    return {
-        "stated_rms_m": _rms(beyond.stated_m),
-        "z_rms": _rms(beyond.z),
-        "extrapolation": {
-            "n_outside": int(beyond.outside.sum()),
-            "variables": [
-                {
-                    "variable": v.variable,
-                    "unit": v.unit,
-                    "measured": [v.low, v.high],
-                    "n_outside": v.count,
-                    "beyond": v.most,
-                }
-                for v in beyond.variables
-            ],
-            "error_inside": block(beyond.inside_error),
-            "error_outside": block(beyond.outside_error),
-            "z_inside": _rms(beyond.z[~beyond.outside]) if (~beyond.outside).any() else None,
-            "z_outside": _rms(beyond.z[beyond.outside]) if beyond.outside.any() else None,
-        },
-    }

@@ -194,3 +194,76 @@ def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] |
         if event["kind"] == kind:
             return {k: v for k, v in event.items() if k not in ("kind", "utc", "wall_s")}
     return None
+
+
+def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
+    """Return the document of `info --json`.
+
+    Args:
+        o: what the campaign holds.
+        path: of its file.
+        covariance: what the covariances consist of, in words.
+    """
+    return {
+        "campaign": path,
+        "created": o.created,
+        "program_version": o.program_version,
+        "source": o.source,
+        "robot": o.config.robot.model,
+        "n_readings": 0 if o.readings is None else len(o.readings),
+        "n_poses": o.poses,
+        "elements": None if o.readings is None else o.readings.m,
+        "loads": dict(o.loads),
+        "targets": dict(o.targets),
+        "covariance": covariance,
+        "plans": o.plans,
+        "planned": o.planned,
+        "measured": o.measured,
+        "instruments": [
+            {
+                "device": i.part,
+                "driver": i.driver,
+                "name": i.name,
+                "serial_number": i.serial,
+                "facts": dict(i.facts),
+                "utc": i.utc,
+            }
+            for i in o.instruments
+        ],
+        "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
+        "drift": {
+            "limit_sigma": o.config.acquire.drift_limit_sigma,
+            "returns": [
+                {"utc": r.utc, "shift_m": r.metres.tolist(), "sigma": r.sigma, "over": r.over}
+                for r in o.returns
+            ],
+        },
+        "tool": o.tool,
+        "repeatability": o.repeatability,
+        "events": [dict(e) for e in o.events],
+        "accepted": o.accepted,
+        "in_use": o.in_use,
+        "revisions": [_revision_json(r, o) for r in o.revisions],
+    }
+
+
+def _revision_json(r: RevisionRecord, o: Overview) -> dict[str, object]:
+    fit = r.result_json["identify"]
+    return {
+        "revision": r.number,
+        "from": r.made_from,
+        "model": list(r.effects),
+        "added": r.added,
+        "removed": r.removed,
+        "cell": r.cell,
+        "readings": r.options["readings"],
+        "scaling": r.options["scaling"],
+        "n_readings": fit["n_readings"],
+        "variance_factor": fit["variance_factor"],
+        "error": fit["error"],
+        "verdict": r.result_json.get("diagnose", {}).get("verdict"),
+        "created": r.created,
+        "program_version": r.program_version,
+        "accepted": r.number == o.accepted,
+        "in_use": r.number == o.in_use,
+    }

@@ -45,6 +45,12 @@ class Fleet:
     members: tuple[Member, ...]
     failures: tuple[Failure, ...]
 
+    def _repr_html_(self) -> str:
+        from hilcal.present.fleet import fleet_report  # notebooks alone need them
+        from hilcal.present.html.page import fragment
+
+        return fragment(fleet_report(self))
+
 
 def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Fleet:
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.

@@ -136,6 +136,17 @@ class Pooled:
     off: Floats
     off_std: Floats
 
+    @property
+    def distance(self) -> Floats:
+        """(A, K) `off` over the root of the spread between arms and the arm's own uncertainty, σ.
+
+        NaN where an arm did not determine the parameter.
+        """
+        between = np.array([p.between for p in self.parameters])
+        seen = np.isfinite(self.off_std)
+        std = np.hypot(between, np.where(seen, self.off_std, 1.0))
+        return np.where(seen, self.off / std, np.nan)
+
 
 def effects_seen(members: Sequence[Member]) -> tuple[Seen, ...]:
     """Return the effects that diagnoses added, and on how many arms."""

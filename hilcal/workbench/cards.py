@@ -288,8 +288,7 @@ def readings(view: View, d: Snapshot) -> None:
 
 def picked_table(d: Snapshot, picked: list[int]) -> None:
     """Draw the picked readings, the furthest off first."""
-    sigma = np.sqrt(d.revision.whitened_norm2)
-    size = np.linalg.norm(d.revision.residual, axis=1)
+    sigma, size = d.revision.sigma, d.revision.size_m
     order = sorted(picked, key=lambda k: -sigma[k])[:FURTHEST]
     rows = [
         {

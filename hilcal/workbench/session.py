@@ -25,9 +25,8 @@ from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
-from hilcal.present.build_story import Chapter, build_story, regressor
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import Curve
+from hilcal.present.story import Chapter, Curve, build_story, regressor
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import RevisionRecord

@@ -7,8 +7,7 @@ from hilcal.config import Target
 from hilcal.config.changes import CHANGEABLE, INSTRUMENT_NOISE, Changes, described, write_value
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.fit import Fit
-from hilcal.present.build_story import Chapter
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Chapter, Story, StoryRevision
 from hilcal.store.revision import RevisionRecord
 
 Stamp = tuple[int, int, int]

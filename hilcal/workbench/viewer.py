@@ -71,17 +71,16 @@ class WebViewer:
         Raises:
             HilcalError: the viewer cannot be had, or the story not be recorded.
         """
-        from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
-        from hilcal.present.viewer.digest import digest
-        from hilcal.present.viewer.layout import blueprint
-        from hilcal.present.viewer.stream import APPLICATION
+        # loads the viewer's library, which takes a while
+        from hilcal.present.viewer.campaign import blueprint, save
+        from hilcal.present.viewer.recording import APPLICATION
 
         say("recording")
         names = (f"story-{count}.rrd", f"layout-{count}.rbl")
         with tempfile.TemporaryDirectory() as folder:
             paths = [Path(folder) / name for name in names]
             save(story, paths[0])
-            blueprint(digest(story)).save(APPLICATION, str(paths[1]))
+            blueprint(story).save(APPLICATION, str(paths[1]))
             recorded = {path.name: path.read_bytes() for path in paths}
         if not self._files:
             say("preparing the viewer")
@@ -99,7 +98,7 @@ class WebViewer:
 
 def _fetched() -> dict[str, bytes]:
     """Return the files of the web viewer that came with rerun-sdk."""
-    from hilcal.present.viewer.stream import executable  # loads the viewer's library
+    from hilcal.present.viewer.recording import executable  # loads the viewer's library
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -12,12 +12,12 @@ import pytest
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
-from hilcal.present.build_story import build_story
-from hilcal.present.diagnosis_json import to_json
+from hilcal.present.story import build_story
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

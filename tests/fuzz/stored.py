@@ -19,12 +19,12 @@ from hilcal.effects import template
 from hilcal.effects.catalogue import installed
 from hilcal.identification import posterior_document
 from hilcal.identification.carried import carried_prior, check_arm
-from hilcal.present.campaign import info_json, info_report, two_revisions
+from hilcal.present.campaign import info_report, two_revisions
 from hilcal.procedure.state import next_step, settings_of
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import revision, run_log
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.overview import overview
+from hilcal.store.overview import overview, to_json
 from hilcal.store.rows import _reading_crc, text_crc
 from hilcal.tables.guessing.propose import propose
 from hilcal.tables.parquet_stream import open_stream
@@ -91,7 +91,7 @@ def _told(file: CampaignFile) -> None:
     console = Console(file=io.StringIO(), width=100)
     for part in info_report(found, "x", "instrument"):
         console.print(part)
-    info_json(found, "x", "instrument")
+    to_json(found, "x", "instrument")
     revision_table(found.revisions, found.in_use)
     for record in found.revisions:
         two_revisions(record, record)

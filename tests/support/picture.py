@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilcal.errors import HilcalError, InputError
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.recording import executable
 
 if TYPE_CHECKING:
     from rerun.experimental import ViewerClient, ViewerState

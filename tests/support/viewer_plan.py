@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
@@ -19,7 +18,7 @@ from hilcal.design.summary import (
     PredictedParameter,
 )
 from hilcal.design.timing import Duration
-from hilcal.present.viewer.plan_stream import record_plan
+from hilcal.present.viewer.plan import record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 
@@ -116,23 +115,6 @@ def recording(shadowed, tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("plan") / "plan.rrd"
     record_plan(*shadowed, PLAN, SUMMARY, path)
     return path
-
-
-def rows(path: Path, entity: str, component: str) -> dict[int, list]:
-    """Return the values of a component by step, under 0 what is static."""
-    out: dict[int, list] = {}
-    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
-        batch = chunk.to_record_batch()
-        if component not in batch.schema.names:
-            continue
-        values = batch.column(component).to_pylist()
-        steps = batch.column("step").to_pylist() if "step" in batch.schema.names else [0]
-        out |= {int(t): v for t, v in zip(steps, values, strict=True) if v is not None}
-    return out
-
-
-def entities(path: Path) -> set[str]:
-    return {str(c.entity_path) for c in RrdReader(path).stream().to_chunks()}
 
 
 def rgb(value: int) -> tuple[int, int, int]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
 from hilcal.present.story import Curve, Story, StoryRevision
 from hilcal.robot.arm import Arm
@@ -132,12 +133,12 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         "ni,ni->n", residual, np.linalg.solve(covariance, residual[..., None])[..., 0]
     )
     length = np.linalg.norm(residual, axis=1)
-    error = {
-        "rms_m": float(np.sqrt((length**2).mean())),
-        "mean_m": float(length.mean()),
-        "max_m": float(length.max()),
-        "rms_sigma": float(np.sqrt(norm2.mean() / 3)),
-    }
+    error = ErrorBlock(
+        rms_m=float(np.sqrt((length**2).mean())),
+        mean_m=float(length.mean()),
+        max_m=float(length.max()),
+        rms_sigma=float(np.sqrt(norm2.mean() / 3)),
+    )
     left = EFFECTS[k + 1 :]
     shares = [(e + names, f"{86 * 0.13**i:.0f} %", "84 %") for i, e in enumerate(left)]
     words = "What is left looks like noise."
@@ -153,8 +154,8 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         residual=residual,
         predicted=predicted + offset,
         whitened_norm2=norm2,
-        error_fit=error,
-        error_holdout={key: 1.06 * v for key, v in error.items()},
+        error=error,
+        holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else []))},
         follows=Curve(

@@ -8,12 +8,12 @@ import pytest
 
 from drivers.simulated.rehearsal import Rehearsal
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
+from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import plain, to_json
-from hilcal.present.diagnosis_json import to_json as diagnosis_json
 from hilcal.readings.whitening import usual_mode
 from hilcal.refinement import add
 from hilcal.store.records import content_hash

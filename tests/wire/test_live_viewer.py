@@ -11,7 +11,7 @@ import psutil
 import pytest
 from rerun.chunk import RrdReader
 
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.recording import executable
 from tests.support.campaign_cases import (
     STARVED,
     TRIES,

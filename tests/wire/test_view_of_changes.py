@@ -13,7 +13,7 @@ import psutil
 import pytest
 from rerun.chunk import RrdReader
 
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.recording import executable
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.bench_cases import BASE, stored
 

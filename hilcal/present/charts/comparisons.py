@@ -8,9 +8,8 @@ import plotly.graph_objects as go
 from hilcal import numbers
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.present.charts import style
-from hilcal.present.charts.evidence import bars
-from hilcal.present.charts.readings import escaped
 from hilcal.present.comparison import words_of
+from hilcal.present.fleet import FAR
 from hilcal.present.story import Story, StoryRevision
 from hilcal.store.plan import UNLOADED
 
@@ -18,8 +17,8 @@ if TYPE_CHECKING:
     from hilcal.transfer.pooled import Pooled
 
 SERIES = (
-    ("error_fit", "fitted poses", style.MEASURED),
-    ("error_holdout", "poses left out", style.HOLDOUT),
+    ("error", "fitted poses", style.MEASURED),
+    ("holdout", "poses left out", style.HOLDOUT),
 )
 
 
@@ -29,7 +28,7 @@ def error_per_revision(story: Story) -> go.Figure:
     names = [label(r, k == 0) for k, r in enumerate(story.revisions)]
     traces: list[object] = []
     for key, name, color in SERIES:
-        rms = [1e6 * float(getattr(r, key)["rms_m"]) for r in story.revisions]
+        rms = [1e6 * float(getattr(r, key).rms_m) for r in story.revisions]
         traces.append(
             go.Bar(
                 x=rms,
@@ -62,20 +61,20 @@ def error_per_revision(story: Story) -> go.Figure:
 def label(revision: StoryRevision, first: bool) -> str:
     """Return the name of a revision on the axis: what it changed."""
     change = "" if first else revision.change
-    return escaped(f"{revision.revision}: {change or 'start'}")
+    return style.label(f"{revision.revision}: {change or 'start'}")
 
 
 def _words(story: Story, first: StoryRevision, later: list[StoryRevision]) -> str:
     floor = f"noise alone would leave {numbers.length(story.noise_floor_m)}."
-    before = numbers.length(first.error_holdout["rms_m"])
+    before = numbers.length(first.holdout.rms_m)
     if not later:
         return f"One revision: {before} rms error on poses left out; {floor}"
-    after = numbers.length(later[-1].error_holdout["rms_m"])
+    after = numbers.length(later[-1].holdout.rms_m)
     fitted = (
-        numbers.length(first.error_fit["rms_m"]),
-        numbers.length(later[-1].error_fit["rms_m"]),
+        numbers.length(first.error.rms_m),
+        numbers.length(later[-1].error.rms_m),
     )
-    went = "fell" if later[-1].error_holdout["rms_m"] < first.error_holdout["rms_m"] else "went"
+    went = "fell" if later[-1].holdout.rms_m < first.holdout.rms_m else "went"
     return (
         f"The rms error {went} from {before} to {after} on poses left out, and from {fitted[0]} to "
         f"{fitted[1]} on the fitted ones, over {len(story.revisions)} revisions; {floor}"
@@ -90,9 +89,9 @@ def error_by_pose(c: Comparison) -> go.Figure:
     stated = 1e6 * c.today.beyond.stated_m
     names = [r.pose_names[k] for k in r.pose[rows]]
     loads = ["unloaded" if n == UNLOADED else n for n in (r.load_names[k] for k in r.load[rows])]
-    poses = [escaped(n) for n in names]
+    poses = [style.label(n) for n in names]
     hover = [
-        escaped(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
+        style.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
         for n, load, e, s in zip(names, loads, error, stated, strict=True)
     ]
     traces = [
@@ -118,49 +117,31 @@ def changes_chart(c: Comparison) -> go.Figure:
     names = [words_of(x.candidate) for x in found]
     hover = [f"{n}: {m:.0f} µm rms" for n, m in zip(names, moved, strict=True)]
     says = f"{names[0]} moves the target most: {moved[0]:.0f} µm rms." if found else "No change."
-    return bars(names, moved, hover, says, "moves the target by, rms [µm]")
-
-
-FAR = 3.0
-"""Standard deviations between which most arms lie; a choice."""
+    return style.bars(names, moved, hover, says, "moves the target by, rms [µm]")
 
 
 def arms_chart(t: "Pooled") -> go.Figure:
-    """Draw each arm's parameters, over what an arm of the type is let expect.
-
-    The distance is divided by the root of the spread from arm to arm and the arm's own uncertainty.
-    """
-    between = np.array([p.between for p in t.parameters])
-    names = [p.parameter for p in t.parameters]
-    seen = np.isfinite(t.off_std)
-    off = t.off / np.sqrt(between**2 + np.where(seen, t.off_std, 1.0) ** 2)
+    """Draw each arm's parameters by their distance from the type, over what most arms have."""
+    names, off = [p.parameter for p in t.parameters], t.distance
     odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
+    told = [
+        (off[a, k], n, arm, (arm, n) in odd)
+        for k, n in enumerate(names)
+        for a, arm in enumerate(t.arms)
+        if np.isfinite(off[a, k])
+    ]
     traces = []
     for unlike, name, color, symbol in (
         (False, "like its type", style.MEASURED, "circle"),
         (True, "unlike its type", style.RED, "x"),
     ):
-        chosen = [
-            (k, a)
-            for k, parameter in enumerate(names)
-            for a, arm in enumerate(t.arms)
-            if seen[a, k] and ((arm, parameter) in odd) == unlike
-        ]
-        if not chosen:
-            continue
-        traces.append(
-            go.Scatter(
-                x=style.drawn(np.array([off[a, k] for k, a in chosen])),
-                y=[escaped(names[k]) for k, _ in chosen],
-                mode="markers",
-                name=name,
-                marker={"color": color, "symbol": symbol, "size": 9, "opacity": 0.8},
-                hovertext=[
-                    escaped(f"{t.arms[a]}, {names[k]}: {off[a, k]:+.1f} σ") for k, a in chosen
-                ],
-                hoverinfo="text",
+        if chosen := [one for one in told if one[-1] == unlike]:
+            at, names_of = np.array([x for x, *_ in chosen]), [n for _, n, *_ in chosen]
+            hover = [style.label(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen]
+            drawn = (at, [style.label(n) for n in names_of], color, symbol, 9)
+            traces.append(
+                style.marks(*drawn, name=name, opacity=0.8, hovertext=hover, hoverinfo="text")
             )
-        )
     arms = sorted({arm for arm, _ in odd})
     says = (
         f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."

@@ -1,7 +1,5 @@
 """Charts of evidence: a suspect, what the misfit follows, a law, correlations, the noise."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import plotly.graph_objects as go
 from scipy.stats import norm
@@ -11,7 +9,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.fit import Fit
 from hilcal.present.charts import style
-from hilcal.present.charts.readings import escaped
 from hilcal.present.fit import CERTAIN, follows
 from hilcal.present.story import Curve, worst_and_even
 from hilcal.types import Floats, Ints
@@ -63,18 +60,17 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     ]
     colors = [style.MEASURED if v.p_value < CERTAIN else style.GREY for v in rows]
     says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
-    return bars(names, shares, hover, says, "share of the misfit [%]", colors)
+    return style.bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
 def curve_chart(c: Curve) -> go.Figure:
     """Draw means over a variable with standard uncertainties, and the law, where there is one."""
-    joined = not c.names and c.line is None
-    points = go.Scatter(
-        x=[escaped(n) for n in c.names] if c.names else c.x,
-        y=c.y,
+    points = style.marks(
+        [style.label(n) for n in c.names] if c.names else c.x,
+        c.y,
+        size=8,
         error_y={"type": "data", "array": c.error, "color": style.GREY},
-        mode="lines+markers" if joined else "markers",
-        marker={"color": style.MEASURED, "size": 8},
+        mode="markers" if c.names or c.line is not None else "lines+markers",
         line={"color": style.MEASURED},
         name="readings, mean ± standard uncertainty",
         hovertemplate="%{x}: %{y:.3g} ± %{error_y.array:.2g}<extra></extra>",
@@ -82,41 +78,8 @@ def curve_chart(c: Curve) -> go.Figure:
     )
     says = f"{c.y_label} over {c.x_label}, from {c.y.min():.3g} to {c.y.max():.3g}; {c.says}"
     traces = [points] if c.line is None else [style.line(c.line[0], c.line[1], "law"), points]
-    x, y = escaped(c.x_label), escaped(c.y_label)
+    x, y = style.label(c.x_label), style.label(c.y_label)
     return style.figure(says, x=x, y=y, traces=traces, height=320)
-
-
-def bars(
-    names: Sequence[str],
-    values: Sequence[float],
-    hover: Sequence[str],
-    says: str,
-    x: str,
-    colors: Sequence[str] | str = style.MEASURED,
-) -> go.Figure:
-    """Draw horizontal bars, the first on top."""
-    trace = go.Bar(
-        x=list(values),
-        y=[escaped(n) for n in names],
-        orientation="h",
-        marker={"color": colors},
-        text=[_short(v) for v in values],
-        textposition="auto",
-        hovertext=[escaped(h) for h in hover],
-        hoverinfo="text",
-        showlegend=False,
-    )
-    height = 90 + 28 * len(names)
-    out = style.figure(says, x=x, traces=[trace], height=height)
-    out.update_yaxes(autorange="reversed")
-    return out
-
-
-def _short(value: float) -> str:
-    """A value at the end of its bar, with two digits; what rounds to nothing is 0."""
-    if abs(value) < 0.005:
-        return "0"
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 
 MOST_CORRELATED = 30
@@ -150,7 +113,7 @@ def correlations(fit: Fit) -> go.Figure:
     some: Ints = np.sort(np.argsort(-away.max(axis=1), kind="stable")[:MOST_CORRELATED])
     if len(some) < len(names):
         says += f" The {len(some)} most correlated of {len(names)} parameters are drawn."
-    shown = [escaped(names[k]) for k in some]
+    shown = [style.label(names[k]) for k in some]
     trace = go.Heatmap(
         z=style.drawn(of[np.ix_(some, some)]),
         y=shown,

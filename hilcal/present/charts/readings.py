@@ -1,6 +1,5 @@
 """Charts of readings: residuals in σ over any variable, measured against predicted, in space."""
 
-import html
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -9,9 +8,8 @@ import numpy as np
 import plotly.graph_objects as go
 
 from hilcal import numbers
-from hilcal.names import escaped as without_controls
 from hilcal.present.charts import style
-from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, levels, worst_and_even
+from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, worst_and_even
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
@@ -24,60 +22,51 @@ class Drawn:
     """The readings that a chart draws of one revision.
 
     Attributes:
+        story: N readings.
+        revision: of the model.
         index: (K,) readings, growing.
-        of: number of all readings N.
-        sigma: (K,) Mahalanobis distance, σ.
-        size_m: (K,) length of the residual, m.
-        level: (K,) 0 inside the noise, 1 doubtful, 2 outside.
-        names: (K,) pose, load, size and distance in words.
     """
 
+    story: Story
+    revision: StoryRevision
     index: Ints
-    of: int
-    sigma: Floats
-    size_m: Floats
-    level: Ints
-    names: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Floats:
+        """(K,) Mahalanobis distance, σ."""
+        return self.revision.sigma[self.index]
 
     @property
     def note(self) -> str:
         """What is said where not all readings are drawn; else empty."""
-        if len(self.index) == self.of:
+        if len(self.index) == len(self.story):
             return ""
         worst = max(1, len(self.index) // 5)
         return (
-            f" Of {self.of} readings {len(self.index)} are drawn: the {worst} furthest off and an "
-            "even choice of the others."
+            f" Of {len(self.story)} readings {len(self.index)} are drawn: the {worst} furthest off "
+            "and an even choice of the others."
         )
 
     def by_level(self) -> Iterator[tuple[int, Bools]]:
         """Yield each level that occurs with its members (K,)."""
+        level = self.revision.level[self.index]
         for k in range(len(style.LEVELS)):
-            mine = self.level == k
+            mine = level == k
             if mine.any():
                 yield k, mine
 
-    def named(self, mine: Bools) -> list[str]:
-        """Return the names of some."""
-        return [self.names[i] for i in np.flatnonzero(mine)]
+    def named(self, mine: Bools | None = None) -> list[str]:
+        """Return some, or all, in words: pose, load, size and distance."""
+        size, sigma = self.revision.size_m, self.revision.sigma
+        return [
+            f"{place(self.story, i)}: {numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
+            for i in (self.index if mine is None else self.index[mine]).tolist()
+        ]
 
 
 def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> Drawn:
-    """Choose at most `most` readings, and name them."""
-    sigma = np.sqrt(revision.whitened_norm2)
-    size = np.linalg.norm(revision.residual, axis=1)
-    index = worst_and_even(revision.whitened_norm2, most)
-    return Drawn(
-        index=index,
-        of=len(story),
-        sigma=sigma[index],
-        size_m=size[index],
-        level=levels(revision.whitened_norm2[index]),
-        names=tuple(
-            f"{place(story, int(i))}: {numbers.length(float(size[i]))}, {sigma[i]:.1f} σ"
-            for i in index
-        ),
-    )
+    """Choose at most `most` readings."""
+    return Drawn(story, revision, worst_and_even(revision.whitened_norm2, most))
 
 
 def place(story: Story, i: int) -> str:
@@ -86,12 +75,7 @@ def place(story: Story, i: int) -> str:
     words = f"{story.pose_name(i)}, {'unloaded' if load == UNLOADED else load}"
     if story.target is not None and len(story.target_names) > 1:
         words += f", {story.target_names[int(story.target[i])]}"
-    return escaped(words)
-
-
-def escaped(words: str) -> str:
-    """Return words without a meaning in the HTML that plotly takes for labels."""
-    return html.escape(without_controls(words), quote=False)
+    return style.label(words)
 
 
 MOST_POSES = 16
@@ -107,7 +91,7 @@ def residual_by_pose(story: Story, revision: StoryRevision) -> go.Figure:
     out = chart(d, of.reshape(-1)[d.index].astype(float), "", _by(story, revision, "pose"))
     full = [story.pose_name(int(i)) for i in first]
     short = [n if len(n) <= LONGEST_NAME else f"…{n[1 - LONGEST_NAME :]}" for n in full]
-    names = [escaped(n) for n in short]
+    names = [style.label(n) for n in short]
     step = -(-len(names) // MOST_POSES)
     out.update_xaxes(tickvals=list(range(0, len(names), step)), ticktext=names[::step])
     return out
@@ -121,7 +105,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     # beside each other within a load, so that points do not hide each other
     beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
     out = chart(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
-    names = ["unloaded" if name == UNLOADED else escaped(name) for name in loads]
+    names = ["unloaded" if name == UNLOADED else style.label(name) for name in loads]
     out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
     return out
 
@@ -174,7 +158,7 @@ def _by(story: Story, revision: StoryRevision, what: str) -> str:
     names = story.load_names
     if what == "pose":
         names = tuple(story.pose_name(i) for i in range(len(story)))
-    sigma = np.sqrt(revision.whitened_norm2 / 3)
+    sigma = revision.sigma / 3**0.5
     (name, rms, _), *rest = worst_of(names, sigma)
     name = "the unloaded readings" if name == UNLOADED else f"{what} {name}"
     if not rest:
@@ -184,7 +168,7 @@ def _by(story: Story, revision: StoryRevision, what: str) -> str:
 
 def over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
     """Say how the residual differs between small and large values (N,) of a variable."""
-    sigma = np.sqrt(revision.whitened_norm2 / 3)
+    sigma = revision.sigma / 3**0.5
     middle = np.median(x)
     low, high = x <= middle, x > middle
     if not high.any():
@@ -238,7 +222,7 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
                 y[at, k],
                 *((style.MEASURED, style.HOLDOUT, style.AMBER)[k], style.SYMBOLS[k]),
                 name=f"base {axis}",
-                text=list(d.names),
+                text=d.named(),
                 hovertemplate=f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} "
                 "µm<extra></extra>",
             )
@@ -275,7 +259,8 @@ def workspace(
     d = drawn(story, revision, most=1000)
     axes = ["xyz".index(a) for a in plane]
     at, residual = story.anchor[d.index][:, axes], revision.residual[d.index][:, axes]
-    times = magnification(float(d.size_m.max(initial=0.0)))
+    largest = float(revision.size_m.max(initial=0.0))
+    times = magnification(largest)
     traces: list[object] = []
     for k, mine in d.by_level():
         worst = np.flatnonzero(mine)[np.argsort(-d.sigma[mine])][:MOST_ARROWS]
@@ -292,11 +277,11 @@ def workspace(
                 hovertemplate="%{text}<extra></extra>",
             )
         )
-    outside = int((levels(revision.whitened_norm2) == len(style.LEVELS) - 1).sum())
+    outside = int((revision.level == len(style.LEVELS) - 1).sum())
     says = (
         f"Targets with their errors, {times:g} times enlarged: {outside} of {len(story)} readings "
         f"are outside the noise (crosses, red); the largest error is "
-        f"{numbers.length(float(d.size_m.max(initial=0.0)))}.{d.note}"
+        f"{numbers.length(largest)}.{d.note}"
     )
     if plane == "xz":
         says = "The same from the side."

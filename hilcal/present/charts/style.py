@@ -5,6 +5,7 @@ or lighter where that is needed for a contrast of 3 : 1 on both papers (WCAG 2.2
 tells anything by colour alone.
 """
 
+import html
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -99,12 +100,50 @@ def line(
 
 
 def marks(
-    x: object, y: Floats, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
+    x: object, y: object, color: str = MEASURED, symbol: str = "circle", size: int = 6, **more: Any
 ) -> go.Scatter:
-    """Return points; `more` is their name and what they tell."""
-    x = drawn(x) if isinstance(x, np.ndarray) else x
+    """Return points, at numbers or names; `more` is their name and what they tell."""
+    x, y = (drawn(v) if isinstance(v, np.ndarray) else v for v in (x, y))
     marker = {"color": color, "symbol": symbol, "size": size}
-    return go.Scatter(x=x, y=drawn(y), mode="markers", marker=marker, **more)
+    return go.Scatter(**{"x": x, "y": y, "mode": "markers", "marker": marker, **more})
+
+
+def bars(
+    names: Sequence[str],
+    values: Sequence[float],
+    hover: Sequence[str],
+    says: str,
+    x: str,
+    colors: Sequence[str] | str = MEASURED,
+) -> go.Figure:
+    """Draw horizontal bars, the first on top."""
+    trace = go.Bar(
+        x=list(values),
+        y=[label(n) for n in names],
+        orientation="h",
+        marker={"color": colors},
+        text=[_short(v) for v in values],
+        textposition="auto",
+        hovertext=[label(h) for h in hover],
+        hoverinfo="text",
+        showlegend=False,
+    )
+    height = 90 + 28 * len(names)
+    out = figure(says, x=x, traces=[trace], height=height)
+    out.update_yaxes(autorange="reversed")
+    return out
+
+
+def _short(value: float) -> str:
+    """A value at the end of its bar, with two digits; what rounds to nothing is 0."""
+    if abs(value) < 0.005:
+        return "0"
+    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
+
+
+def label(words: str) -> str:
+    """Return words without a meaning in the HTML that plotly takes for labels."""
+    return html.escape(escaped(words), quote=False)
 
 
 def says(chart: go.Figure) -> str:

@@ -102,8 +102,8 @@ def _limit(m: ReportContent) -> Iterator[Block]:
     else:
         yield Words(words, "strong")
     if m.tested is not None:
-        t = m.tested
-        yield f"Validation campaign {t.name}"
+        t = m.tested.found
+        yield f"Validation campaign {m.tested.name}"
         yield from opening(t.judged, t.prediction)
         told = validation_report(t.judged, t.prediction, t.beyond)
         yield from captioned(told, "Validation")
@@ -176,7 +176,7 @@ def not_tested(m: ReportContent) -> Iterator[str]:
     s, fit = m.fit.readings.states, m.fit
     if m.tested is None:
         yield "No validation campaign: the errors are those of poses left out in turn."
-    elif not m.tested.judged.unseen:
+    elif not m.tested.found.judged.unseen:
         yield f"{m.tested.name} was fitted itself: it tests nothing."
     yield "Joint angles outside of the ranges above, and loads other than those above."
     if not np.any(s.wrench):

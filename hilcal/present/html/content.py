@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.identification.acceptance import Acceptance, Judged
-from hilcal.identification.extrapolation import Extrapolation
+from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
-from hilcal.identification.validation import Validation
-from hilcal.present.build_story import Chapter
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import Chapter, Story, StoryRevision
 from hilcal.readings.whitening import Scaling
 from hilcal.store.overview import Overview
 from hilcal.store.plan import Plan
@@ -24,18 +21,12 @@ class Tested:
     Attributes:
         name: of the campaign's file.
         sha256: of that file.
-        judged: which readings.
-        prediction: of them.
-        beyond: what the fit states of them.
-        shares: errors by load and pose, and the limit.
+        found: errors of its readings, what the fit states of them, and the limit.
     """
 
     name: str
     sha256: str
-    judged: Judged
-    prediction: Validation
-    beyond: Extrapolation
-    shares: Acceptance
+    found: CampaignValidation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

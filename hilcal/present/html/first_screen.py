@@ -1,49 +1,21 @@
 """The first screen: is the model good, where is it wrong, what is missing; before, after, limit."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import error_before, names
+from hilcal.identification.variance_factor import CONFIDENCE
 from hilcal.present.fit import follows, misses
 from hilcal.present.html.content import ReportContent
+from hilcal.present.html.page import Card, FirstScreen
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
-
-
-@dataclass(frozen=True, slots=True)
-class Card:
-    """One number of the first screen: `label`, `value` with unit, and a note."""
-
-    label: str
-    value: str
-    note: str
-
-
-@dataclass(frozen=True, slots=True)
-class FirstScreen:
-    """What the first screen says.
-
-    Attributes:
-        headline: the verdict in a few words.
-        tone: "good", "doubt" or "bad", for the colour; the headline says it in words.
-        answers: question and answer: is it good, where is it wrong, what is missing.
-        cards: before and after.
-        limit: "PASSED" or "FAILED" and why; empty without a limit.
-        passed: whether the limit is kept; None without one.
-    """
-
-    headline: str
-    tone: str
-    answers: tuple[tuple[str, str], ...]
-    cards: tuple[Card, ...]
-    limit: str
-    passed: bool | None
 
 
 def first_screen(m: ReportContent) -> FirstScreen:
@@ -93,15 +65,31 @@ def how_good(m: ReportContent) -> str:
 
 def where_wrong(m: ReportContent) -> str:
     """Say in a sentence where it is worst, and what the misfit follows."""
-    d = m.diagnosis
-    if d is not None and d.residual_is_noise:
-        return "Nowhere beyond the noise: all poses and loads are predicted within it."
-    fit, error = m.fit, left_out_errors(m.fit)
+    d, fit, error = m.diagnosis, m.fit, left_out_errors(m.fit)
     furthest = int(fit.whitening.reading[np.argmax(error)])
     pose, load = names(fit.readings[~fit.outlier], furthest)
     at = "unloaded" if load == UNLOADED else f"under {load}"
     said = f"Of the poses left out, {pose} {at} is furthest off: {numbers.length(error.max())}."
-    return said if d is None else f"{said} {follows(d.misfit_breakdown)}"
+    if d is None:
+        return said
+    if not d.residual_is_noise:
+        return f"{said} {follows(d.misfit_breakdown)}"
+    if not beyond_noise(fit):
+        return "Nowhere beyond the noise: all poses and loads are predicted within it."
+    return (
+        "Nowhere in particular: what is left of the fitted poses is noise. Poses left out are off "
+        f"by {fit.holdout.rms_sigma:.2f} times the noise, more than by chance; more poses would "
+        f"lower that. {said}"
+    )
+
+
+def beyond_noise(fit: Fit) -> bool:
+    """Whether poses left out are further off than the noise alone leaves them by chance.
+
+    With R whitened elements of standard deviation 1 their sum of squares is χ²(R).
+    """
+    count = fit.whitening.rank
+    return bool(fit.holdout.rms_sigma**2 * count > chi2.isf((1 - CONFIDENCE) / 2, count))
 
 
 def missing(d: Diagnosis | None) -> str:
@@ -130,8 +118,8 @@ def _cards(m: ReportContent, fit: Fit) -> Iterator[Card]:
         f"rms; largest {numbers.length(before.max_m)}; {what}",
     )
     if m.tested is not None:
-        e = m.tested.prediction.error
-        seen = "never fitted" if m.tested.judged.unseen else "fitted, so no test"
+        e = m.tested.found.prediction.error
+        seen = "never fitted" if m.tested.found.judged.unseen else "fitted, so no test"
         yield Card(
             "After, validation",
             numbers.length(e.rms_m),
@@ -164,7 +152,7 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         return "", None
     limit = numbers.length(m.limit_m)
     if m.tested is not None:
-        a = m.tested.shares
+        a = m.tested.found.shares
         passed = bool(a.passed)
         head = "PASSED" if passed else "FAILED"
         so = f"{a.everything.count - a.over} of {a.everything.count} errors are within {limit}"

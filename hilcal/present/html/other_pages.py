@@ -10,8 +10,7 @@ from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_b
 from hilcal.present.comparison import comparison_report, headline, next_step, sentence
 from hilcal.present.document import Block, Chart, Section, Words, captioned, heading, table
 from hilcal.present.fleet import closing, type_report, unlike_words
-from hilcal.present.html.first_screen import Card, FirstScreen
-from hilcal.present.html.page import render
+from hilcal.present.html.page import Card, FirstScreen, render
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet

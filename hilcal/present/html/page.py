@@ -1,7 +1,8 @@
 """The page: template, style, script and plotly.js in one file that loads nothing else."""
 
 import json
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -12,24 +13,39 @@ from plotly.offline import get_plotlyjs
 
 from hilcal.names import escaped
 from hilcal.present.charts import style
-from hilcal.present.document import (
-    Chart,
-    Section,
-    captioned,
-)
-from hilcal.present.html.certificate import certificate
-from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import FirstScreen, first_screen
-from hilcal.present.html.sections import appendix, sections
+from hilcal.present.document import Block, Chart, Section, captioned
 
 HERE = Path(__file__).parent
 
 
-def page(m: ReportContent) -> str:
-    """Return the report of one campaign as HTML."""
-    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
-    parts = (certificate(m), *sections(m), *(appendix(m) if m.appendix else ()))
-    return render("Calibration report", about, first_screen(m), parts)
+@dataclass(frozen=True, slots=True)
+class Card:
+    """One number of the first screen: `label`, `value` with unit, and a note."""
+
+    label: str
+    value: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class FirstScreen:
+    """What the first screen says.
+
+    Attributes:
+        headline: the verdict in a few words.
+        tone: "good", "doubt" or "bad", for the colour; the headline says it in words.
+        answers: question and answer: is it good, where is it wrong, what is missing.
+        cards: before and after.
+        limit: "PASSED" or "FAILED" and why; empty without a limit.
+        passed: whether the limit is kept; None without one.
+    """
+
+    headline: str
+    tone: str
+    answers: tuple[tuple[str, str], ...]
+    cards: tuple[Card, ...]
+    limit: str
+    passed: bool | None
 
 
 def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...]) -> str:
@@ -61,6 +77,12 @@ def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...
             script=Markup((HERE / "script.js").read_text(encoding="utf-8")),  # noqa: S704
         )
     )
+
+
+def fragment(blocks: Iterable[Block]) -> str:
+    """Return blocks as a piece of HTML without style or script, which charts would need."""
+    part = _environment().get_template("blocks.html").module.part  # type: ignore[attr-defined]
+    return "".join(str(part(block, _figure)) for block in captioned(blocks))
 
 
 def in_script(json: str) -> str:

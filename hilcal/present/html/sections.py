@@ -10,7 +10,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.fit import Fit
-from hilcal.present.build_story import curve, regressor
 from hilcal.present.campaign import info_report
 from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import (
@@ -27,7 +26,7 @@ from hilcal.present.charts.readings import (
     residual_by_time,
     workspace,
 )
-from hilcal.present.diagnosis import could_have_been_seen, doubtful, redundant_line
+from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
 from hilcal.present.document import (
     Block,
     Chart,
@@ -40,9 +39,12 @@ from hilcal.present.document import (
     table,
 )
 from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
+from hilcal.present.html.certificate import certificate
 from hilcal.present.html.content import ReportContent
+from hilcal.present.html.first_screen import first_screen
+from hilcal.present.html.page import render
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import REVISION_HEADS
+from hilcal.present.story import curve, regressor
 from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
 from hilcal.store.command_line import COMMAND
@@ -52,6 +54,13 @@ MOST_LISTED = 6
 """Suspects that stand on the page; a choice, as the others are."""
 MOST_PARAMETERS = 48
 MOST_LAWS = 4
+
+
+def page(m: ReportContent) -> str:
+    """Return the report of one campaign as HTML."""
+    about = f"{m.overview.config.robot.model}, {m.name}, {m.made[:10]}"
+    parts = (certificate(m), *sections(m), *(appendix(m) if m.appendix else ()))
+    return render("Calibration report", about, first_screen(m), parts)
 
 
 def sections(m: ReportContent) -> tuple[Section, ...]:
@@ -229,7 +238,7 @@ def _joints(m: ReportContent) -> Iterator[Block]:
     for j in range(m.story.arm.n):
         yield Chart(f"Over joint {j + 1}", residual_by_joint(m.story, m.left_out, j))
     if m.tested is not None:
-        yield replace(worst_table(m.tested.shares), caption="Worst poses")
+        yield replace(worst_table(m.tested.found.shares), caption="Worst poses")
 
 
 def _rejected(m: ReportContent) -> Iterator[Block]:

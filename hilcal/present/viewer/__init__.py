@@ -9,6 +9,6 @@ except ImportError as error:
         "the viewer needs rerun-sdk, which is not installed: pip install rerun-sdk"
     ) from error
 
-from hilcal.present.viewer.stream import Served, record, save, serve
+from hilcal.present.viewer.campaign import Served, record, save, serve
 
 __all__ = ["Served", "record", "save", "serve"]

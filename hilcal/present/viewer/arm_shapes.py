@@ -134,6 +134,35 @@ def log_targets(
         )
 
 
+def quaternions_of(rotation: Floats) -> Floats:
+    """(N, 4) quaternions x y z w of (N, 3, 3) rotations, w >= 0."""
+    from scipy.spatial.transform import Rotation
+
+    q: Floats = Rotation.from_matrix(rotation).as_quat(canonical=True)
+    return q
+
+
+def stand(rec: rr.RecordingStream, bodies: Floats) -> None:
+    """Log where the arm's bodies (n + 2, 4, 4) are at the recording's current time."""
+    quaternion = quaternions_of(bodies[:, :3, :3])
+    for i in range(1, len(bodies)):
+        rec.log(
+            f"world/arm/body{i}",
+            rr.Transform3D(
+                translation=bodies[i, :3, 3], quaternion=rr.Quaternion(xyzw=quaternion[i])
+            ),
+        )
+
+
+def send_stands(rec: rr.RecordingStream, time: rr.TimeColumn, bodies: Floats) -> None:
+    """Send where the arm's bodies (K, B, 4, 4) are at K times."""
+    for i in range(1, bodies.shape[1]):
+        placed = rr.Transform3D.columns(
+            translation=bodies[:, i, :3, 3], quaternion=quaternions_of(bodies[:, i, :3, :3])
+        )
+        rec.send_columns(f"world/arm/body{i}", indexes=[time], columns=placed)
+
+
 def labels(places: Sequence[Floats] | Floats, texts: Sequence[str]) -> rr.Points3D:
     """Return words at places (K, 3), in the colour that is legible in both themes."""
     return rr.Points3D(

@@ -1,4 +1,4 @@
-"""The blueprint: which view stands where, what its title says, and where its eye stands."""
+"""What blueprints share: the frame of all views, 3-D views, and where their eye stands."""
 
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -7,8 +7,6 @@ import numpy as np
 import rerun.blueprint as rrb
 
 from hilcal.config import Obstacle
-from hilcal.present.viewer.digest import Digest
-from hilcal.present.viewer.scene import center, seen
 from hilcal.types import Bools, Floats
 
 _TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
@@ -72,15 +70,19 @@ def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
     return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
 
 
+def center(points: Floats, reach: float) -> tuple[Floats, float]:
+    """Middle of points (K, 3) and the origin, and half their size: where the eye looks, m."""
+    points = np.vstack([points, np.zeros((1, 3))])
+    lo, hi = points.min(0), points.max(0)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * reach)
+
+
 def near(look: Floats, way: Floats, points: Floats) -> Floats:
     """Return the place (3,) of the eye, as near along `way` from `look` as shows all points."""
     places = [look + f * way for f in _FACTORS]
     return next((x for x in places if in_view(x, look, points).all()), places[-1])
 
 
-FOLLOWS = "What the residual follows"
-LAW = "Law beyond the catalogue"
-ERRORS = "Error of each revision [µm]"
 EYE = np.array([1.05, -1.35, 0.55])
 # Views that draw with light colours stay dark in the light theme too.
 BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
@@ -125,74 +127,3 @@ def view3d(
         ),
         **more,
     )
-
-
-def blueprint(d: Digest) -> rrb.Blueprint:
-    """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
-
-    It opens at the first revision and stands there; that of a growing story goes along with it.
-    """
-    left = rrb.Vertical(
-        rrb.Tabs(_residuals(d), _deflections(d)),
-        rrb.Tabs(
-            rrb.TimeSeriesView(origin="errors", name=ERRORS),
-            _bars("bars", bars_title(d)),
-        ),
-        row_shares=[11, 4],
-    )
-    laws = [_bars("law", LAW)] if any(r.laws for r in d.story.revisions) else []
-    right = rrb.Vertical(
-        rrb.Tabs(
-            rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
-            rrb.TextDocumentView(origin="words/details", name="Details"),
-            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
-        ),
-        rrb.Tabs(
-            _bars("follows", FOLLOWS),
-            *laws,
-            rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
-            rrb.TextDocumentView(origin="words/revisions", name="Table"),
-            rrb.TextLogView(origin="log", name="Log"),
-        ),
-        row_shares=[5, 4],
-    )
-    play: Literal["following", "paused"] = "following" if d.story.growing else "paused"
-    return whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "revision", play, fps=1.0)
-
-
-def residual_title(d: Digest) -> str:
-    """Return the title of the residual view, with its scale and how much it shows."""
-    shown, n = len(d.shown(d.story.revisions[0])), len(d.row)
-    part = f" (about {shown} of {n} readings)" if shown < n else ""
-    scale = f"{d.residual_scale:g}"
-    return f"Residual ×{scale}{part}: an arrow that leaves its noise ball = model wrong"
-
-
-def deflection_title(d: Digest) -> str:
-    """Return the title of the deflection view, with its scale."""
-    what = "Deflection" if d.story.mode == "deflection" else "Deviation from nominal"
-    return f"{what} ×{d.deflection_scale:g}: blue measured, white predicted, red missed"
-
-
-def bars_title(d: Digest) -> str:
-    """Return the title of the bars, with what one bar stands for."""
-    part = f" ({d.poses_per_bar} poses per bar)" if d.poses_per_bar > 1 else ""
-    return f"Worst reading of each pose, in σ{part}: grey noise, amber doubtful, red model wrong"
-
-
-def _view3d(d: Digest, name: str, hidden: str) -> rrb.Spatial3DView:
-    middle, size = center(d)
-    contents = ["+ $origin/**", f"- $origin/{hidden}/**", "- $origin/live/**"]
-    return view3d("world", name, near(middle, EYE * size, seen(d)), middle, contents)
-
-
-def _residuals(d: Digest) -> rrb.Spatial3DView:
-    return _view3d(d, residual_title(d), "deflection")
-
-
-def _deflections(d: Digest) -> rrb.Spatial3DView:
-    return _view3d(d, deflection_title(d), "residual")
-
-
-def _bars(origin: str, name: str) -> rrb.BarChartView:
-    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))

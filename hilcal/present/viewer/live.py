@@ -16,7 +16,7 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.measuring.progress import ArmAt
 from hilcal.present.live_viewer import Measuring, Revised
 from hilcal.present.viewer.live_scene import LiveScene
-from hilcal.present.viewer.stream import APPLICATION, Sink, disable_analytics, free
+from hilcal.present.viewer.recording import APPLICATION, Sink, disable_analytics, free
 
 PORTS = 20
 """Ports that are tried, from the wanted one; a choice."""

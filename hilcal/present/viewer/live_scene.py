@@ -1,31 +1,272 @@
-"""Draws a command while it works: readings as they come, revisions as they are found."""
+"""A command drawn while it works: readings as they come, revisions as they are found."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint import archetypes
+from scipy import stats
 
-from hilcal.measuring.progress import ArmAt, GoalMet, Phase, ReadingStored, Remark
+from hilcal import numbers
+from hilcal.measuring.progress import ArmAt, GoalMet, LiveResidual, Phase, ReadingStored, Remark
+from hilcal.present.document import Block, Items, heading, table
 from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.running import figures, met_words
-from hilcal.present.story import Story
-from hilcal.present.viewer import layout, live_digest, stream, style
+from hilcal.present.running import figures, met_words, spoken, status_words
+from hilcal.present.story import LIMITS, Story, levels
+from hilcal.present.viewer import campaign, layout, style
 from hilcal.present.viewer.arm_shapes import MovingArm, labels
-from hilcal.present.viewer.digest import Digest, digest
-from hilcal.present.viewer.live_digest import BALL, LIMIT, LiveDigest, arrow
-from hilcal.present.viewer.markdown import document
 from hilcal.robot.body import body_poses
+from hilcal.store.plan import UNLOADED, Step
 from hilcal.types import Floats
+
+SIGMA_LENGTH = 0.02
+"""One σ of a residual is drawn this long, m; a choice."""
+ARROW_CAP = 0.4
+"""Longest arrow, m; a choice."""
+BALL = SIGMA_LENGTH * style.BALL_SIGMAS
+"""Radius of the ball that holds 99 % of the readings where the model is right, m."""
+LIMIT = style.BALL_SIGMAS / 3**0.5
+"""The same in the σ of a reading."""
+ALARM = 0.001
+"""Chance that noise alone leaves as many readings outside their balls as is called wrong."""
+WORST = 3
+FLUENT = 1000
+"""Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
+processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
+GROUPS = 150
+"""Groups that more of them are divided into: as many as a finished recording has bars."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """A reading against the model.
+
+    Attributes:
+        step: its step.
+        target: name of the target; empty where there is one.
+        length: of the residual r, m.
+        norm2: rᵀ V⁻¹ r, V the covariance of reading and prediction; 3 degrees of freedom.
+        stands_out: whether it is the worst of its group so far, see `LiveTally.group`.
+    """
+
+    step: Step
+    target: str
+    length: float
+    norm2: float
+    stands_out: bool = True
+
+    @property
+    def sigma(self) -> float:
+        """sqrt(rᵀ V⁻¹ r / 3), as the terminal has it: 1 where the model is right."""
+        return float(np.sqrt(self.norm2 / 3))
+
+    @property
+    def level(self) -> int:
+        """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
+        return int(levels(np.array([self.norm2]))[0])
+
+
+@dataclass(slots=True, eq=False)
+class LiveTally:
+    """A campaign that is being measured.
+
+    Attributes:
+        told: what is measured.
+        bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan.
+        anchor: (P, T, 3) nominal position of each target at each pose, base axes, m.
+        done: readings that are stored.
+        left: real seconds that the rest takes.
+        phase: what is being done.
+        last: the last reading.
+        judged: how many readings were compared with a model.
+        outside: of these how many are outside their ball, by load; and all of them.
+        worst: those that are farthest from the model.
+        remarks: that people should look at, newest last.
+        places: index of each pose by its name; filled when it is first asked for.
+        group_worst: largest `Judged.norm2` of the group that is being measured.
+    """
+
+    told: Measuring
+    bodies: Floats
+    anchor: Floats
+    done: int = 0
+    left: float = 0.0
+    phase: str = ""
+    last: ReadingStored | None = None
+    judged: int = 0
+    outside: int = 0
+    loads: dict[str, list[int]] = field(default_factory=dict)
+    worst: list[Judged] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    places: dict[str, int] = field(default_factory=dict)
+    group_worst: float = 0.0
+
+    @classmethod
+    def of(cls, told: Measuring) -> "LiveTally":
+        """Return that of a campaign that begins, or goes on."""
+        bodies = body_poses(told.arm, told.plan.q)
+        flange = bodies[:, None, -1]
+        anchor = flange[..., :3, 3] + np.einsum("pkij,tj->pti", flange[..., :3, :3], told.targets)
+        done = len({step for _, step in told.earlier})
+        return cls(told, bodies, anchor, done)
+
+    @property
+    def total(self) -> int:
+        """Readings that are planned."""
+        return len(self.told.plan.steps)
+
+    @property
+    def group(self) -> int:
+        """Residuals, one after the other, of which a viewer keeps those that stand out; 1: all."""
+        planned = self.total * len(self.told.targets)
+        return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
+
+    def place(self, step: Step, target: int = 0) -> Floats:
+        """(3,) where the nominal arm holds a target, m."""
+        if not self.places:
+            self.places.update({name: k for k, name in enumerate(self.told.plan.pose_names)})
+        return np.asarray(self.anchor[self.places[step.pose], target])
+
+    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, Judged | None]]:
+        """Take note of a reading.
+
+        Returns:
+            Each target that was read, with its residual; judged, or None without a model yet.
+        """
+        self.last, self.done, self.left = event, event.done, event.left_real
+        read = ((event.target, event.live), *event.others)
+        return [(k, live, self._judge(event.step, k, live)) for k, live in read]
+
+    def _judge(self, step: Step, target: int, live: LiveResidual) -> Judged | None:
+        found = judged(step, live, self.told.names[target] if self.told.names else "")
+        if found is None:
+            return None
+        self.judged += 1
+        of_load = self.loads.setdefault(step.load, [0, 0])
+        of_load[0] += 1
+        if found.level > 0:
+            self.outside += 1
+            of_load[1] += 1
+        self.worst = sorted([*self.worst, found], key=lambda j: -j.norm2)[:WORST]
+        begins = (self.judged - 1) % self.group == 0
+        found = replace(found, stands_out=begins or found.norm2 > self.group_worst)
+        self.group_worst = max(found.norm2, 0.0 if begins else self.group_worst)
+        return found
+
+    @property
+    def wrong(self) -> bool:
+        """Whether more readings are outside than noise leaves there, see `ALARM`."""
+        chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
+        return self.outside > 0 and bool(chance < ALARM)
+
+    @property
+    def loaded(self) -> bool:
+        """Whether any load is planned."""
+        return any(step.load != UNLOADED for step in self.told.plan.steps)
+
+
+def judged(step: Step, live: LiveResidual, target: str = "") -> Judged | None:
+    """Return a reading as `Judged`; None where it was not compared."""
+    if live.vector is None or live.covariance is None:
+        return None
+    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
+    return Judged(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+
+
+def arrow(live: LiveResidual, found: Judged) -> Floats:
+    """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
+    length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
+    return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
+
+
+_REMARKS = 3
+
+GUIDE = """### How to read this
+Each reading is compared with a simple model, that of frames and joint compliance, fitted to the
+readings **before** it.
+
+**Residuals** (3-D): a small grey dot is a pose of the plan. A green ball is where noise and what
+the model does not know yet would leave 99 % of the readings; an arrow that leaves its ball = the
+model is wrong there. All arrows are in units of that noise. Grey: noise. Amber: beyond 99 %.
+Red: beyond 99.99 %. Blue dots were measured before there was a model, or in an earlier session.
+After 300 readings only arrows that leave their balls are drawn; below stand all.
+
+A campaign of more than 1000 readings is divided into 150 groups, one after the other. The last
+reading is always drawn; of the earlier ones only those stay that were the worst of their group so
+far, here and below. The words count all readings, and the log lists them.
+
+**Residual of each reading** (below): the same along the time of day, in σ as on the
+terminal (rms of the three axes): 1 is noise, the green line 99 %.
+
+What is missing in the model is not asked while measuring: `hilcal refine` does, afterwards.
+"""
+
+
+def status(d: LiveTally) -> str:
+    """Return how far the campaign is, and what the readings say so far."""
+    return style.markdown(_status(d))
+
+
+def _status(d: LiveTally) -> Iterator[Block]:
+    left = f", {spoken(d.left)} left" if d.left > 0 else ""
+    yield from (heading(_heading(d)), _sentence(d))
+    yield f"{d.done} of {d.total} readings{left}. {d.phase}"
+    goal = None if d.last is None else d.last.goal
+    if goal is not None and (told := status_words(goal)):
+        yield f"Goal: {told}."
+    if len(d.loads) > 1 and d.outside:
+        rows = ((n, str(a), str(b), numbers.percent(b / a)) for n, (a, b) in d.loads.items())
+        yield table("load", "compared", "outside", "", rows=rows)
+    if d.worst and d.worst[0].level > 0:
+        worst = (
+            (
+                f"{j.step.pose} {j.target}".rstrip(),
+                j.step.load,
+                numbers.length(j.length),
+                f"{j.sigma:.1f}",
+            )
+            for j in d.worst
+            if j.level > 0
+        )
+        yield table("worst so far", "load", "residual", "in σ", rows=worst, left=(0, 1))
+    yield Items(tuple(f"note: {text}" for text in d.remarks[-_REMARKS:]))
+
+
+def residual(found: Judged) -> str:
+    """Return a residual for people, with its size in σ."""
+    return f"{numbers.length(found.length)} ({found.sigma:.1f} σ)"
+
+
+def _heading(d: LiveTally) -> str:
+    if d.judged == 0:
+        return "Measuring: no judgement yet"
+    if d.wrong:
+        return "✗ The simple model fails: look at the red arrows"
+    return "✓ So far noise explains the readings"
+
+
+def _sentence(d: LiveTally) -> str:
+    if d.judged == 0:
+        return "The first readings tell where tracker and target are; then each one is compared."
+    share = numbers.percent(d.outside / d.judged)
+    told = (
+        f"{d.outside} of {d.judged} ({share}) compared readings are outside their 99 % noise "
+        "ball (noise alone: 1 %)."
+    )
+    if d.wrong:
+        told += " Something is missing in it: hilcal refine says what, after measuring."
+    return told
+
 
 TIMELINE = "time"
 RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
 IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
 
 
-def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
+def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     """Return the blueprint.
 
     Args:
@@ -39,7 +280,7 @@ def live_blueprint(d: LiveDigest, world: str, series: str) -> rrb.Blueprint:
         end=rrb.TimeRangeBoundary.cursor_relative(),
     )
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = _live_center(d)
+    middle, size = layout.center(d.anchor.reshape(-1, 3), d.told.arm.reach)
     scene = layout.view3d(
         "world",
         f"{of} {RESIDUALS}",
@@ -82,16 +323,9 @@ def _log() -> rrb.TextLogView:
     return rrb.TextLogView(origin="log", name="Log", columns=shown)
 
 
-def live_seen(d: LiveDigest) -> Floats:
+def live_seen(d: LiveTally) -> Floats:
     """(K, 3) what is to be in the picture: targets and the arm in the first pose, m."""
     return np.vstack([d.anchor.reshape(-1, 3), d.bodies[0, :, :3, 3]])
-
-
-def _live_center(d: LiveDigest) -> tuple[Floats, float]:
-    points = np.vstack([d.anchor.reshape(-1, 3), np.zeros((1, 3))])
-    lo, hi = points.min(0), points.max(0)
-    half = float(np.linalg.norm(hi - lo)) / 2
-    return (lo + hi) / 2, max(half, 0.3 * d.told.arm.reach)
 
 
 _ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
@@ -110,7 +344,7 @@ class LiveScene:
         self._arm: MovingArm | None = None
         self._passed: list[tuple[float, tuple[float, ...]]] = []
         self._since = 0  # those of them that came before the last reading
-        self._now: LiveDigest | None = None
+        self._now: LiveTally | None = None
         self._acts = 0
         self._story: Story | None = None
         self._titles: tuple[str, ...] = ()
@@ -149,11 +383,11 @@ class LiveScene:
         if self._story is None:
             return
         self._rec.reset_time()
-        d = digest(replace(self._story, growing=False))
-        stream.tell(self._rec, d)
+        story = replace(self._story, growing=False)
+        campaign.tell(self._rec, story)
         self._rec.reset_time()
-        d = d if to_open else digest(self._story)
-        self._rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
+        views = campaign.blueprint(story if to_open else self._story)
+        self._rec.send_blueprint(views, make_active=True, make_default=True)
 
     # measuring
 
@@ -166,12 +400,12 @@ class LiveScene:
         return f"live/{self._acts}"
 
     def _measuring(self, wall: float, told: Measuring) -> None:
-        rec, d = self._rec, LiveDigest.of(told)
+        rec, d = self._rec, LiveTally.of(told)
         self._acts, self._now = self._acts + 1, d
         rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
         rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._arm = MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
-        rec.log("words/live_guide", document(live_digest.GUIDE), static=True)
+        rec.log("words/live_guide", style.document(GUIDE), static=True)
         rec.log(
             f"{self._world}/planned",
             rr.Points3D(d.anchor.reshape(-1, 3), colors=[style.GREY], radii=[0.006]),
@@ -191,7 +425,7 @@ class LiveScene:
         blueprint = live_blueprint(d, self._world, self._series)
         rec.send_blueprint(blueprint, make_active=True, make_default=True)
 
-    def _earlier(self, d: LiveDigest) -> None:
+    def _earlier(self, d: LiveTally) -> None:
         """Send what earlier sessions measured as one batch."""
         known = [(wall, d.place(step)) for wall, step in d.told.earlier]
         if not known:
@@ -216,7 +450,7 @@ class LiveScene:
             bodies = body_poses(self._now.told.arm, np.array([q for _, q in passed]))
             self._arm.send(TIMELINE, [wall for wall, _ in passed], bodies)
 
-    def _event(self, d: LiveDigest, what: object) -> None:
+    def _event(self, d: LiveTally, what: object) -> None:
         if isinstance(what, ReadingStored):
             if (
                 self._batches and d.done > MANY
@@ -236,7 +470,7 @@ class LiveScene:
         if not self._batches:
             self._words(d)
 
-    def _reading(self, d: LiveDigest, event: ReadingStored) -> None:
+    def _reading(self, d: LiveTally, event: ReadingStored) -> None:
         """Draw a reading: each target's arrow in its ball and place in time, and a label."""
         rec, before = self._rec, d.judged
         dots, arrows, balls, now = [], [], [], []
@@ -271,11 +505,11 @@ class LiveScene:
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
         words = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
-            words += f"{', ' * bool(worst.target)}{worst.target}: {live_digest.residual(worst)}"
+            words += f"{', ' * bool(worst.target)}{worst.target}: {residual(worst)}"
         rec.log(f"{self._world}/last", labels([d.place(event.step, target) + _ABOVE], [words]))
 
-    def _words(self, d: LiveDigest) -> None:
-        self._rec.log("words/measuring", document(live_digest.status(d)))
+    def _words(self, d: LiveTally) -> None:
+        self._rec.log("words/measuring", style.document(status(d)))
 
     def _log(self, text: str, level: str = "INFO") -> None:
         self._rec.log("log", rr.TextLog(style.safe(text), level=level))
@@ -292,15 +526,15 @@ class LiveScene:
             else tuple(r for r in before.revisions if r.revision < new.revision)
         )
         self._story = replace(story, revisions=(*earlier, *story.revisions), growing=True)
-        d = digest(self._story)
         if not earlier:
-            stream.begin(rec, d)
+            campaign.begin(rec, self._story)
         rec.set_time("revision", sequence=new.revision)
-        stream.tell_revision(rec, d, new)
+        campaign.tell_revision(rec, self._story, new)
         rec.disable_timeline("revision")
-        titles = _titles(d)
+        titles = _titles(self._story)
         if titles != self._titles or not earlier:
-            rec.send_blueprint(layout.blueprint(d), make_active=True, make_default=True)
+            views = campaign.blueprint(self._story)
+            rec.send_blueprint(views, make_active=True, make_default=True)
             self._titles = titles
 
 
@@ -327,5 +561,5 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
     )
 
 
-def _titles(d: Digest) -> tuple[str, ...]:
-    return layout.residual_title(d), layout.deflection_title(d), layout.bars_title(d)
+def _titles(of: Story) -> tuple[str, ...]:
+    return campaign.residual_title(of), campaign.deflection_title(of), campaign.bars_title(of)

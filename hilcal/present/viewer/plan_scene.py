@@ -1,21 +1,208 @@
-"""The 3-D view of a plan: the cell with a bead per reading, and what moves at every step."""
+"""A plan in its cell, and its 3-D view: a bead per reading, and what moves at every step."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from hilcal.config import Obstacle
+from hilcal.cell import Cell
+from hilcal.config import CellConfig, Obstacle
+from hilcal.design.next import PairPower
+from hilcal.design.summary import PlanSummary
+from hilcal.design.timing import pace, timeline
+from hilcal.errors import InputError
+from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
+from hilcal.measuring.route import route
 from hilcal.present.plan import load_name
 from hilcal.present.viewer import arm_shapes, style
-from hilcal.present.viewer.digest import quaternions_of
-from hilcal.present.viewer.plan_digest import SEEN, PlanDigest
 from hilcal.robot import body
-from hilcal.store.plan import UNLOADED
-from hilcal.types import Floats, Ints
+from hilcal.robot import chain as chains
+from hilcal.robot.body import body_poses
+from hilcal.store.plan import UNLOADED, Plan
+from hilcal.types import Bools, Floats, Ints
+
+SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
+"""Does the tracker see the target: yes; it is turned too far away; something is between; not
+known, as the tracker's place is not."""
+_WAY_STEP_RAD = 0.08  # distance of the drawn points of a motion, of the leading joint
+
+
+@dataclass(frozen=True, eq=False)
+class PlanView:
+    """A plan in its cell: where everything is at each of its S steps, base axes, SI.
+
+    Attributes:
+        cell: the cell.
+        config: its loads, obstacles, limits and sight.
+        plan: poses and steps.
+        summary: cost, predicted precision and efficiency.
+        powers: of the suspects that the plan separates, pair by pair; else empty.
+
+    Raises:
+        InputError: the plan's poses do not have as many joints as the arm.
+    """
+
+    cell: Cell
+    config: CellConfig
+    plan: Plan
+    summary: PlanSummary
+    powers: tuple[PairPower, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a plan of another arm."""
+        joints, arm = self.plan.q.shape[1], self.cell.arm
+        if joints != arm.n:
+            raise InputError(
+                f"the plan has {joints} joint angles per pose; {arm.name} has {arm.n} joints"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.plan.steps)
+
+    @cached_property
+    def shapes(self) -> Clearance:
+        """Shapes of arm, tool, obstacles and loads, as collisions are checked."""
+        return clearance_of(self.cell, self.config)
+
+    @cached_property
+    def _view(self) -> LineOfSight | None:
+        return sight_of(self.shapes)
+
+    @property
+    def tracker(self) -> Floats | None:
+        """(3,) where the tracker stands; None where that is not known."""
+        return None if self._view is None else self._view.tracker
+
+    @cached_property
+    def loads(self) -> tuple[str, ...]:
+        """Names of the loads, in the order in which they are hung."""
+        return self.plan.loads
+
+    @cached_property
+    def load(self) -> Ints:
+        """(S,) index into `loads`."""
+        return np.array([self.loads.index(s.load) for s in self.plan.steps], dtype=np.int64)
+
+    @cached_property
+    def pose(self) -> Ints:
+        """(S,) index of the step's pose."""
+        row = {name: k for k, name in enumerate(self.plan.pose_names)}
+        return np.array([row[s.pose] for s in self.plan.steps], dtype=np.int64)
+
+    @property
+    def q(self) -> Floats:
+        """(S, n) joint angles, rad."""
+        return self.plan.q[self.pose]
+
+    @cached_property
+    def bodies(self) -> Floats:
+        """(S, n + 2, 4, 4) poses of base, bodies and flange."""
+        return body_poses(self.cell.arm, self.q)
+
+    @cached_property
+    def target(self) -> Floats:
+        """(S, 3) the target, or the flange where its place is not known."""
+        return chains.evaluate(self.cell.arm, self.q).point(self.cell.target[:3, 3])
+
+    @cached_property
+    def hook(self) -> Floats:
+        """(S, 3) the load point."""
+        return chains.evaluate(self.cell.arm, self.q).point(self.cell.load_point)
+
+    @cached_property
+    def incidence(self) -> Floats | None:
+        """(S,) angle between the target's normal and the beam; None where not given."""
+        return None if self._view is None else self._view.incidence(self.q)
+
+    @cached_property
+    def sight(self) -> Ints:
+        """(S,) `SEEN` and so on."""
+        if self._view is None:
+            return np.full(len(self), UNKNOWN)
+        free = np.zeros(len(self), dtype=np.bool_)
+        for k, name in enumerate(self.loads):
+            free[self.load == k] = self._view.free(self.q[self.load == k], name)
+        angle, most = self.incidence, self.config.sight.incidence_max_rad
+        turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
+        return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
+
+    def why(self, step: int) -> str:
+        """Return why the target is not seen at a step; empty where it is."""
+        if self._view is None or self.sight[step] == SEEN:
+            return ""
+        q, load = self.q[step : step + 1], self.loads[self.load[step]]
+        told = self._view.problems(q, load, "")
+        if words := "; ".join(line.removeprefix(": ") for line in told):
+            return words
+        hidden = self._view.hidden(q, load)  # some of several targets
+        return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
+
+    @cached_property
+    def rank(self) -> Ints:
+        """(S,) how many other loads are measured before in the same pose: its bead's place."""
+        order: dict[int, list[int]] = {}
+        pairs = list(zip(self.pose.tolist(), self.load.tolist(), strict=True))
+        for p, k in dict.fromkeys(pairs):
+            order.setdefault(p, []).append(k)
+        return np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
+
+    @cached_property
+    def ways(self) -> tuple[Floats, ...]:
+        """Of each step, (K, 3) the target's way there from the step before, straight in joints."""
+        stops = route(self.plan, self.cell.arm, self.config.limits.joint_margin_rad)
+        legs: list[list[Floats]] = [[]]
+        for a, b in pairwise(stops):
+            count = max(1, int(np.ceil(np.abs(b.q - a.q).max(initial=0.0) / _WAY_STEP_RAD)))
+            share = np.linspace(0.0, 1.0, count + 1)[:, None]
+            legs[-1].append(a.q + share * (b.q - a.q))
+            if b.step is not None:
+                legs.append([])
+        joined = [np.vstack(leg) for leg in legs if leg]
+        chain = chains.evaluate(self.cell.arm, np.vstack(joined))
+        ends = np.cumsum([len(leg) for leg in joined])[:-1]
+        return tuple(np.split(chain.point(self.cell.target[:3, 3]), ends))
+
+    @cached_property
+    def time(self) -> Floats:
+        """(S,) middle of each reading since the start, s."""
+        margin = self.config.limits.joint_margin_rad
+        return timeline(self.plan, self.cell.arm, margin, pace(self.config))[1]
+
+    @property
+    def reach(self) -> float:
+        """The arm's reach, m: sizes are drawn by it."""
+        return max(self.cell.arm.reach, 0.1)
+
+    @property
+    def numbers(self) -> Ints:
+        """(S,) numbers of the steps on the timeline, from 1."""
+        return np.arange(1, len(self) + 1)
+
+    @property
+    def unseen(self) -> Bools:
+        """(S,) steps whose target the tracker does not see."""
+        return np.asarray((self.sight == TURNED) | (self.sight == HIDDEN))
+
+    @property
+    def beads(self) -> Ints:
+        """Return the first step of every pose and load, one for each bead."""
+        pairs = np.stack([self.pose, self.load], 1)
+        return np.sort(np.unique(pairs, axis=0, return_index=True)[1]).astype(np.int64)
+
+    @property
+    def stints(self) -> tuple[tuple[int, int], ...]:
+        """Return first step and end of every stretch under one load."""
+        starts = [0, *(np.flatnonzero(np.diff(self.load)) + 1).tolist(), len(self)]
+        return tuple(pairwise(starts))
+
 
 Colors = NDArray[np.uint8]
 
-# In the order of PlanDigest's SEEN, TURNED, HIDDEN, UNKNOWN.
+# In the order of SEEN, TURNED, HIDDEN, UNKNOWN.
 SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
 SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
 # Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
@@ -60,7 +247,7 @@ _TRACKER = (235, 235, 240)
 _HEAD = 0.07  # m, of the drawn tracker
 
 
-def static_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
     rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     own = len(body.capsules(d.cell.arm))
@@ -72,7 +259,7 @@ def static_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
         _tracker(rec, d.tracker)
 
 
-def bead_places(d: PlanDigest, steps: Ints) -> Floats:
+def bead_places(d: PlanView, steps: Ints) -> Floats:
     """(K, 3) where the beads of some steps are: stacked upwards from the target, m."""
     up = np.zeros((len(steps), 3))
     up[:, 2] = d.rank[steps] * BEAD_GAP * d.reach
@@ -126,7 +313,7 @@ def _named_at(thing: Obstacle) -> Floats:
     return np.asarray(np.array(thing.bottom_m) + up)
 
 
-def _workspace(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log the outline of every side of the workspace that is given."""
     limits = d.config.limits
     reach = 1.1 * d.reach
@@ -149,7 +336,7 @@ def _workspace(rec: rr.RecordingStream, d: PlanDigest) -> None:
         )
 
 
-def _beads(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log a bead per pose and load, and a cage around those that the tracker does not see."""
     steps = d.beads
     rec.log(
@@ -201,18 +388,10 @@ _DIM = 0.42  # of a colour: lines have no transparency
 _PARTS = ("capsules", "arrow")
 
 
-def step_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send what changes with every step, as columns on `step`."""
     time = [rr.TimeColumn("step", sequence=d.numbers)]
-    for i in range(1, d.bodies.shape[1] - 1):
-        rec.send_columns(
-            f"world/arm/body{i}",
-            indexes=time,
-            columns=rr.Transform3D.columns(
-                translation=d.bodies[:, i, :3, 3],
-                quaternion=quaternions_of(d.bodies[:, i, :3, :3]),
-            ),
-        )
+    arm_shapes.send_stands(rec, time[0], d.bodies[:, :-1])
     colors = load_colors(d.loads)[d.load]
     rec.send_columns(
         "world/target/now",
@@ -228,7 +407,7 @@ def step_scene(rec: rr.RecordingStream, d: PlanDigest) -> None:
     _ways(rec, d, time)
 
 
-def framed(d: PlanDigest) -> tuple[Floats, float]:
+def framed(d: PlanView) -> tuple[Floats, float]:
     """Middle of what should be in the picture and its half size, m; a far tracker counts less."""
     reach = d.reach
     points = [np.zeros((1, 3)), d.target]
@@ -239,7 +418,7 @@ def framed(d: PlanDigest) -> tuple[Floats, float]:
     return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.35 * reach)
 
 
-def pull_arrow(d: PlanDigest, name: str) -> Floats | None:
+def pull_arrow(d: PlanView, name: str) -> Floats | None:
     """(3,) the arrow of a load's pull as drawn, m; None where it has none."""
     forces = {x.name: np.array(x.force_N) for x in d.config.loads}
     most = max((float(np.linalg.norm(f)) for f in forces.values()), default=0.0)
@@ -249,7 +428,7 @@ def pull_arrow(d: PlanDigest, name: str) -> Floats | None:
     return np.asarray(_FORCE_LENGTH * force / most)
 
 
-def _beam(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn], place: Floats) -> None:
+def _beam(rec: rr.RecordingStream, d: PlanView, time: list[rr.TimeColumn], place: Floats) -> None:
     strips = np.stack([np.broadcast_to(place, d.target.shape), d.target], 1)
     colors = sight_colors(d.sight)
     rec.send_columns(
@@ -261,7 +440,7 @@ def _beam(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn], pla
     )
 
 
-def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) -> None:
+def _label(rec: rr.RecordingStream, d: PlanView, time: list[rr.TimeColumn]) -> None:
     above = d.target + np.array([0.0, 0.0, _LABEL_ABOVE])
     above[:, 2] += d.rank.max(initial=0) * BEAD_GAP * d.reach
     words = [
@@ -284,12 +463,12 @@ def _label(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) ->
     )
 
 
-def _sight_words(d: PlanDigest, step: int) -> str:
+def _sight_words(d: PlanView, step: int) -> str:
     sight = int(d.sight[step])
     return f": {SIGHT_WORDS[sight]}" if d.unseen[step] or sight == SEEN else ""
 
 
-def _loads(rec: rr.RecordingStream, d: PlanDigest) -> None:
+def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
     """Log what hangs or pulls, at the steps where there is some; cleared where there is none."""
     colors = load_colors(d.loads)
     for k, name in enumerate(d.loads):
@@ -321,7 +500,7 @@ def _loads(rec: rr.RecordingStream, d: PlanDigest) -> None:
     rec.reset_time()
 
 
-def _ways(rec: rr.RecordingStream, d: PlanDigest, time: list[rr.TimeColumn]) -> None:
+def _ways(rec: rr.RecordingStream, d: PlanView, time: list[rr.TimeColumn]) -> None:
     """Log the target's whole way under the load of the step, and bright the last motion."""
     colors = load_colors(d.loads)
     rec.send_columns(

@@ -1,15 +1,15 @@
-"""Colours, scales and words shared by the views; all pure functions of a story."""
+"""What all views share: colours, nice scales, text without a missing glyph, markdown."""
 
 import math
 import re
+from collections.abc import Iterable
 
 import numpy as np
+import rerun as rr
 from scipy import stats
 
 from hilcal.present import story
-from hilcal.present.story import LIMITS, levels
-
-__all__ = ["levels"]
+from hilcal.present.document import Block, Chart, Items, Table, Words
 
 Color = tuple[int, int, int]
 
@@ -29,7 +29,7 @@ LEVEL_NAMES = tuple(name.split()[0] for name in story.LEVEL_NAMES)
 """Of entities."""
 
 _NICE = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)
-BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(LIMITS[0], 3)))
+BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(story.LIMITS[0], 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
@@ -53,3 +53,43 @@ def nice(value: float) -> float:
         return 1.0
     power = 10.0 ** math.floor(math.log10(value))
     return float(max(f for f in _NICE if f * power <= value * (1 + 1e-9)) * power)
+
+
+MARKS = {"good": "✓ ", "doubt": "✗ "}
+
+
+def markdown(blocks: Iterable[Block]) -> str:
+    """Return blocks as markdown in which no text has a meaning, nor lacks a glyph."""
+    return "\n\n".join(filter(None, map(_one, blocks)))
+
+
+def document(text: str) -> rr.TextDocument:
+    """Return markdown as the viewer takes it."""
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+def _one(block: Block) -> str:
+    if isinstance(block, Table):
+        return _table(block)
+    if isinstance(block, Items):
+        return "\n".join(f"- {escaped(row)}" for row in block.rows)
+    if isinstance(block, Chart):
+        return escaped(str((block.figure.layout.meta or {}).get("says", "")))
+    words = block if isinstance(block, Words) else Words(block)
+    lines = [escaped(line) for line in words.text.split("\n") if line.strip()]
+    if not lines:
+        return ""
+    if words.tone in ("good", "doubt"):
+        lines[0] = f"**{MARKS[words.tone]}{lines[0]}**"
+    elif words.tone in ("heading", "strong"):
+        lines[0] = f"### {lines[0]}" if words.tone == "heading" else f"**{lines[0]}**"
+    return "  \n".join(lines)
+
+
+def _table(of: Table) -> str:
+    if not any(of.heads):
+        return "\n".join(f"- **{escaped(name)}** {escaped(said)}" for name, said in of.rows)
+    cells = [of.heads, *of.rows]
+    lines = [f"| {' | '.join(escaped(c) or ' ' for c in row)} |" for row in cells]
+    sides = ["---" if k in of.left else "---:" for k in range(len(of.heads))]
+    return "\n".join([lines[0], f"| {' | '.join(sides)} |", *lines[1:]])

@@ -8,6 +8,7 @@ import pytest
 from hilcal.config import load_config
 from hilcal.diagnosis.catalogue_sufficiency import forward_selection, insufficiency
 from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.stepwise import Refits, add
 from hilcal.diagnosis.verdict import diagnose
@@ -15,7 +16,6 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_json import to_json
 from hilcal.present.verdict import message
 from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir

@@ -9,6 +9,7 @@ from scipy.stats import kstest, poisson
 
 from drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.noise import pure_error
@@ -19,7 +20,6 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import could_have_been_seen
-from hilcal.present.diagnosis_json import to_json
 from hilcal.present.verdict import headline, message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

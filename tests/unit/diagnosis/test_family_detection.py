@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from hilcal.diagnosis.document import least
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.minimum_detectable_effect import least_strength
 from hilcal.diagnosis.verdict import diagnose
@@ -10,7 +11,6 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.diagnosis import could_have_been_seen
-from hilcal.present.diagnosis_json import least
 from tests.support.campaigns import campaign
 
 ERROR = "transmission_error"

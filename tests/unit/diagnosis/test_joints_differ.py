@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from hilcal.diagnosis.document import suspect_json
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.stepwise_alternatives import StepwiseAlternatives
@@ -12,7 +13,6 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.diagnosis import finer
-from hilcal.present.diagnosis_json import suspect_json
 from hilcal.present.verdict import message
 from hilcal.refinement import refine
 from tests.support.campaigns import NOTHING, Campaign, campaign

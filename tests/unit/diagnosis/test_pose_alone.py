@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.diagnosis.more_poses import chance, enough
@@ -13,7 +14,6 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.diagnosis_json import to_json
 from hilcal.present.verdict import message
 from tests.support.campaigns import campaign, measured, plan
 

@@ -11,11 +11,11 @@ from hilcal.cell import Cell
 from hilcal.cli.demo import CELL
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import VERDICTS
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.serial_noise import MOST_READINGS, serial_noise, with_serial_noise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.diagnosis_json import to_json
 from hilcal.present.verdict import message
 from hilcal.readings.covariance import symmetric_root
 from hilcal.readings.readings import Readings

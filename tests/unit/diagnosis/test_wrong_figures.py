@@ -8,10 +8,10 @@ import pytest
 
 import hilcal as hc
 from hilcal.cell import Cell
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.wrong_figures import wrong_figures
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
-from hilcal.present.diagnosis_json import to_json
 from hilcal.present.verdict import message
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilcal.discovery.discovery import Discovery
+from hilcal.discovery.document import discovery_json
 from hilcal.discovery.known_effects import Instead, instead_of_law, known_effects, tells_more
 from hilcal.discovery.problem import Problem
 from hilcal.discovery.screen import screen
@@ -17,7 +18,7 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.discovery import discovery_json, silence
+from hilcal.present.discovery import silence
 from tests.unit.discovery.test_discover import campaign
 
 

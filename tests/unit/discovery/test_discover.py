@@ -12,6 +12,7 @@ import hilcal as hc
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery, discover
+from hilcal.discovery.document import discovery_json, laws_json
 from hilcal.discovery.law import Form, Part
 from hilcal.discovery.problem import Problem
 from hilcal.discovery.proposal import LawSearch
@@ -30,9 +31,7 @@ from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.present.discovery import (
-    discovery_json,
     discovery_report,
-    laws_json,
     refined_laws,
     silence,
 )

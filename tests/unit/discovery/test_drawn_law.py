@@ -20,9 +20,9 @@ from hilcal.effects.example import example_cell, example_situation, example_stat
 from hilcal.effects.from_file import effects_of
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.charts import style
 from hilcal.present.charts.evidence import curve_chart
+from hilcal.present.story import Chapter, build_story
 from hilcal.present.viewer import save
 from tests.support.campaigns import NOTHING, campaign
 

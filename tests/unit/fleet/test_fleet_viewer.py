@@ -5,17 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from hilcal.identification.posterior import Posterior
 from hilcal.present.viewer import style
-from hilcal.present.viewer.fleet_scene import places, type_digest
-from hilcal.present.viewer.fleet_stream import record_fleet
+from hilcal.present.viewer.fleet import drawn_type, places, record_fleet
 from hilcal.robot.body import capsules
 from hilcal.transfer.fleet import Fleet
 from hilcal.transfer.pooled import Pooled, pooled
 from tests.support.picture import Shot, pictures, vulkan_available
-from tests.support.viewer_plan import entities, rgb, rows
+from tests.support.recordings import chunks, entities, rows
+from tests.support.viewer_plan import rgb
 from tests.unit.fleet.test_fleet import ARMS, ODD, members, posterior_of, readings_of
 
 
@@ -42,7 +41,7 @@ def recorded(one: Posterior, path: Path, odd: float) -> Path:
 
 def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None:
     whole, of = fleet(one, 1.5)
-    d = type_digest(of, whole.members)
+    d = drawn_type(of, whole.members)
     assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
     assert d.joints == tuple(int(name[-1]) for name in d.names)
     assert (d.units.shape, d.campaigns.shape) == ((ARMS, len(d.names)), (2 * ARMS, len(d.names)))
@@ -56,7 +55,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None
 
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path: Path) -> None:
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
-    d = type_digest(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
+    d = drawn_type(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)
     shapes = capsules(d.arm)
     colors = [rgb(c) for c in rows(path, "/arms0/arms", "Capsules3D:colors")[0]]
     red = [k for k, c in enumerate(colors) if c == style.RED]
@@ -67,8 +66,7 @@ def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path:
     assert f"arm{ODD} is unlike the others" in words
     drifts = {e for e in entities(path) if e.startswith("/date0/")}
     assert [e for e in drifts if "unlike" in e] == [f"/date0/2/zunlike/{ODD}"]
-    chunks = RrdReader(path).stream().filter(content=f"/date0/2/zunlike/{ODD}").to_chunks()
-    told = [c.to_record_batch() for c in chunks]
+    told = [c.to_record_batch() for c in chunks(path, f"/date0/2/zunlike/{ODD}")]
     assert sum(b.num_rows for b in told if "date" in b.schema.names) == 2
 
 

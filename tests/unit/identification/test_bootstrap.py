@@ -11,7 +11,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.bootstrap import Bootstrap, again, bootstrap
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import distinct_poses
-from hilcal.present.bootstrap import bootstrap_json, bootstrap_remarks
+from hilcal.present.bootstrap import bootstrap_remarks
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
@@ -121,7 +121,7 @@ def test_its_document_says_which_parameters_are_compared() -> None:
     c = campaign("transmission_error", "absolute", poses=20)
     model = baseline(c.cell, c.readings, "absolute")
     found = drawn(fit(model, c.readings, "absolute"), 20)
-    document = bootstrap_json(found)
+    document = found.to_dict()
     rows = document["parameters"]
     assert isinstance(rows, list)
     assert [r["name"] for r in rows][:2] == ["base_frame.x", "base_frame.y"]

@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from hilcal import numbers
+from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.options import typical_compliances
@@ -14,13 +15,12 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.full_prediction import error_before, full_prediction
-from hilcal.present.build_story import Chapter, build_story
 from hilcal.present.diagnosis import diagnosis_report, suspects_table
-from hilcal.present.diagnosis_json import to_json as diagnosis_json
 from hilcal.present.fit import before_and_after, errors, fit_report, worst_poses
+from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
-from hilcal.present.viewer import words
-from hilcal.present.viewer.digest import digest
+from hilcal.present.viewer import campaign as viewer
+from hilcal.present.viewer import campaign_scene as viewer_scene
 from tests.support.campaigns import campaign
 
 
@@ -85,7 +85,7 @@ def test_a_p_value_reads_the_same_wherever_it_stands(absolute):
     assert re.search(rf"{lead.effect} .*{re.escape(value)}", shown(suspects_table(d)))
     story = build_story([Chapter(1, None, absolute, d)])
     revision = story.revisions[0]
-    panel = words.verdict(digest(story), revision)
+    panel = viewer.verdict(story, revision)
     assert f"| {value.replace('<', chr(92) + '<')} |" in panel
     assert numbers.p_equals(lead.score.p_value) in revision.message
 
@@ -110,7 +110,7 @@ def test_how_many_were_tested_stands_where_p_values_do(absolute):
     kinds = [v for v in d.misfit_breakdown if v.group not in ("pose", "direction")]
     assert f"{len(kinds)} variables were tested" in report
     story = build_story([Chapter(1, None, absolute, d)])
-    details = words.details(digest(story), story.revisions[0])
+    details = viewer.details(story, story.revisions[0])
     assert f"{tests['count']} effects were tested" in details
 
 
@@ -122,7 +122,7 @@ def test_a_suspect_counts_only_below_the_shared_level(absolute):
 def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
     worst = worst_poses(full_prediction(absolute))[0]
     story = build_story([Chapter(1, None, absolute, None)])
-    d = digest(story)
     assert worst.pose in absolute.readings.pose_names
-    assert story.pose_name(d.worst(story.revisions[0])) == worst.pose
-    assert f"Worst: pose {worst.pose}, load {worst.load}," in words.details(d, story.revisions[0])
+    assert story.pose_name(viewer_scene.worst(story.revisions[0])) == worst.pose
+    details = viewer.details(story, story.revisions[0])
+    assert f"Worst: pose {worst.pose}, load {worst.load}," in details

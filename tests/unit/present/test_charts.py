@@ -11,7 +11,6 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
-from hilcal.present.build_story import Chapter, build_story, of_left_out, regressor
 from hilcal.present.charts import style
 from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import (
@@ -33,7 +32,7 @@ from hilcal.present.charts.readings import (
     residual_by_time,
     workspace,
 )
-from hilcal.present.story import LEVEL_NAMES
+from hilcal.present.story import LEVEL_NAMES, Chapter, build_story, of_left_out, regressor
 from tests.support.campaigns import campaign
 from tests.support.viewer_story import ANGLE, LOAD, story
 
@@ -56,8 +55,8 @@ def points(figure, axis: str) -> np.ndarray:
 def test_each_revision_has_a_bar_for_both_errors_and_the_noise_is_shown():
     told = story()
     figure = error_per_revision(told)
-    for trace, key in zip(figure.data[:2], ("error_fit", "error_holdout"), strict=True):
-        rms = [1e6 * getattr(r, key)["rms_m"] for r in told.revisions]
+    for trace, key in zip(figure.data[:2], ("error", "holdout"), strict=True):
+        rms = [1e6 * getattr(r, key).rms_m for r in told.revisions]
         np.testing.assert_allclose(np.asarray(trace.x), rms)
         assert list(trace.text) == [numbers.digits(v) for v in rms]
     (floor,) = figure.layout.shapes

@@ -7,15 +7,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
-from rerun.chunk import RrdReader
 
 from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
 from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.viewer import live, live_digest, style
-from hilcal.present.viewer.live_digest import BALL, FLUENT, GROUPS, LIMIT, LiveDigest, judged
-from hilcal.present.viewer.live_scene import MANY, LiveScene
+from hilcal.present.viewer import live, live_scene, style
+from hilcal.present.viewer.live_scene import (
+    BALL,
+    FLUENT,
+    GROUPS,
+    LIMIT,
+    MANY,
+    LiveScene,
+    LiveTally,
+    judged,
+)
 from tests.support.live_story import BLIND, events, measuring, plan, residual
 from tests.support.picture import Shot, pictures, vulkan_available
+from tests.support.recordings import chunks, values
 from tests.support.viewer_story import story
 
 
@@ -32,16 +40,6 @@ def recorded(path: Path, told, end: bool = True) -> Path:
     rec.disconnect()
     rr.set_strict_mode(False)
     return path
-
-
-def rows(path: Path, entity: str, column: str) -> list:
-    """Every value of one component of an entity, row after row."""
-    found = []
-    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
-        batch = chunk.to_record_batch()
-        if column in batch.schema.names:
-            found += batch[column].to_pylist()
-    return [value for value in found if value is not None]
 
 
 def revisions(begun: float = 0.0):
@@ -63,16 +61,16 @@ def refined(tmp_path_factory) -> Path:
 def test_each_reading_has_its_arrow_and_leaves_its_ball_where_the_model_is_wrong(measured):
     stored = [e for _, e in events(measuring()) if isinstance(e, ReadingStored)]
     found = [judged(e.step, e.live) for e in stored[BLIND:]]
-    arrows = np.array(rows(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
+    arrows = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:vectors"))[:, 0]
     assert len(arrows) == len(found) == len(stored) - BLIND
-    assert len(rows(measured, "/world/live/1/dots", "Points3D:positions")) == BLIND
+    assert len(values(measured, "/world/live/1/dots", "Points3D:positions")) == BLIND
     outside = np.linalg.norm(arrows, axis=1) > BALL
     assert outside.tolist() == [j.level > 0 for j in found]
     assert 5 < outside.sum() < len(found) / 2
     red = (style.LEVEL_COLORS[2].astype(int) * [1 << 24, 1 << 16, 1 << 8]).sum() + 255
-    colors = np.array(rows(measured, "/world/live/1/arrows", "Arrows3D:colors"))[:, 0]
+    colors = np.array(values(measured, "/world/live/1/arrows", "Arrows3D:colors"))[:, 0]
     assert ((colors == red) == [j.level == 2 for j in found]).all()
-    sigma = rows(measured, "/live/1/outside", "Scalars:scalars")
+    sigma = values(measured, "/live/1/outside", "Scalars:scalars")
     assert len(sigma) == sum(j.level == 2 for j in found)
     assert np.ravel(sigma) == pytest.approx([j.sigma for j in found if j.level == 2])
 
@@ -82,9 +80,9 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     path = recorded(tmp_path / "many.rrd", events(told))
     stored = [e for _, e in events(told) if isinstance(e, ReadingStored)][BLIND:]
     outside = [judged(e.step, e.live).level > 0 for e in stored]
-    arrows = rows(path, "/world/live/1/arrows", "Arrows3D:vectors")
+    arrows = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(arrows) == MANY + sum(outside[MANY:]) < len(stored)
-    shown = [rows(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
+    shown = [values(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
     assert sum(map(len, shown)) == len(stored)
 
 
@@ -95,15 +93,15 @@ def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
     sigma = np.array([judged(e.step, e.live).sigma for e in stored])
     group = -(-len(told.plan.steps) // GROUPS)
     shown = np.sort(np.concatenate(
-        [np.ravel(rows(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
+        [np.ravel(values(path, f"/live/1/{n}", "Scalars:scalars")) for n in style.LEVEL_NAMES]
     ))  # fmt: skip
-    assert LiveDigest.of(told).group == group == 8
+    assert LiveTally.of(told).group == group == 8
     assert len(shown) < 0.45 * len(sigma)
     worst = [sigma[k : k + group].max() for k in range(0, len(sigma), group)]
     assert all(np.abs(shown - w).min() < 1e-9 for w in worst)
-    last = rows(path, "/world/live/1/now/arrow", "Arrows3D:vectors")
+    last = values(path, "/world/live/1/now/arrow", "Arrows3D:vectors")
     assert len(last) == len(stored)  # each reading is drawn while it is the last
-    kept = rows(path, "/world/live/1/arrows", "Arrows3D:vectors")
+    kept = values(path, "/world/live/1/arrows", "Arrows3D:vectors")
     assert len(kept) <= len(shown)
     outside = [w for w in worst if w > LIMIT]
     assert sum(np.linalg.norm(v[0]) > BALL for v in kept) >= len(outside) > 20
@@ -120,21 +118,21 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
             e = replace(e, others=((1, right),))
         shown.append((wall, e))
     path = recorded(tmp_path / "two.rrd", shown)
-    starts = rows(path, "/world/live/1/arrows", "Arrows3D:origins")
+    starts = values(path, "/world/live/1/arrows", "Arrows3D:origins")
     last = [e for _, e in shown if isinstance(e, ReadingStored)][-1]
-    d = LiveDigest.of(told)
+    d = LiveTally.of(told)
     assert np.allclose(starts[-1], [d.place(last.step, 0), d.place(last.step, 1)], atol=1e-6)
     assert np.linalg.norm(d.place(last.step, 1) - d.place(last.step, 0)) == pytest.approx(
         float(np.linalg.norm(targets[1] - targets[0]))
     )
-    label = rows(path, "/world/live/1/last", "Points3D:labels")[-1][0]
+    label = values(path, "/world/live/1/last", "Points3D:labels")[-1][0]
     assert "right" in label
     for _, e in shown:
         if isinstance(e, ReadingStored):
             d.add(e)
     assert d.judged == 2 * (len(told.plan.steps) - BLIND)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in live_digest.status(d)
+    assert " right |" in live_scene.status(d)
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
@@ -146,26 +144,26 @@ def test_a_long_campaign_is_a_small_file(tmp_path):
         outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))
     outlet.end()
     assert path.stat().st_size < 2.5e6  # 5.5 MB, when each reading was handed on by itself
-    levels = [rows(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
+    levels = [values(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
     assert sum(map(len, levels)) == 500 - BLIND
 
 
 def test_the_arm_moves_through_every_place_that_is_told(measured):
     told = [e for _, e in events(measuring()) if type(e).__name__ == "ArmAt"]
-    places = np.array(rows(measured, "/world/live/1/arm", "Capsules3D:translations"))
+    places = np.array(values(measured, "/world/live/1/arm", "Capsules3D:translations"))
     assert len(places) == len(told) + 1  # and where it begins
     assert np.abs(np.diff(places, axis=0)).max(axis=(1, 2)).max() > 0.05
 
 
 def test_words_say_whether_the_model_fails_and_under_which_load():
     def status(wrong: float) -> str:
-        d = LiveDigest.of(measuring())
+        d = LiveTally.of(measuring())
         for _, e in events(measuring(), wrong):
             if isinstance(e, ReadingStored):
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return live_digest.status(d)
+        return live_scene.status(d)
 
     bad, good = status(6.0), status(0.0)
     assert "✗ The simple model fails" in bad
@@ -178,29 +176,29 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
 
 
 def test_without_a_model_there_is_no_judgement():
-    assert "no judgement yet" in live_digest.status(LiveDigest.of(measuring()))
+    assert "no judgement yet" in live_scene.status(LiveTally.of(measuring()))
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):
     made = plan(6)
     told = measuring(made, tuple((1000.0 + k, step) for k, step in enumerate(made.steps[:4])))
     path = recorded(tmp_path / "resumed.rrd", [(2000.0, told)])
-    assert len(rows(path, "/world/live/1/dots", "Points3D:positions")) == 4
-    chunks = RrdReader(path).stream().filter(content="/world/live/1/dots").to_chunks()
-    times = [t for c in chunks for t in c.to_record_batch()["time"].to_pylist()]
+    assert len(values(path, "/world/live/1/dots", "Points3D:positions")) == 4
+    found = chunks(path, "/world/live/1/dots")
+    times = [t for c in found for t in c.to_record_batch()["time"].to_pylist()]
     assert [t.timestamp() for t in times] == [1000.0, 1001.0, 1002.0, 1003.0]
 
 
 def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refined, tmp_path):
     growing = recorded(tmp_path / "growing.rrd", revisions(), end=False)
-    assert len(rows(growing, "/errors/fit", "Scalars:scalars")) == 4
-    said = [row[0] for row in rows(growing, "/words/verdict", "TextDocument:text")]
+    assert len(values(growing, "/errors/fit", "Scalars:scalars")) == 4
+    said = [row[0] for row in values(growing, "/words/verdict", "TextDocument:text")]
     assert all(" of " not in text.splitlines()[0] for text in said)  # nobody knows the last yet
-    said = [row[0] for row in rows(refined, "/words/verdict", "TextDocument:text")]
+    said = [row[0] for row in values(refined, "/words/verdict", "TextDocument:text")]
     assert any(text.startswith("### Revision 0 (1 of 4)") for text in said)
     norms = [
         np.linalg.norm(np.array(row), axis=1).max()
-        for row in rows(growing, "/world/residual/arrows", "Arrows3D:vectors")
+        for row in values(growing, "/world/residual/arrows", "Arrows3D:vectors")
     ]
     assert norms[-1] < 0.5 * norms[0]
 
@@ -209,8 +207,8 @@ def test_other_readings_begin_another_story(tmp_path):
     other = story(poses=12)
     told = [*revisions(), (9.0, Revised(replace(other, revisions=(other.revisions[-1],))))]
     path = recorded(tmp_path / "two.rrd", told, end=False)
-    assert len(rows(path, "/errors/fit", "Scalars:scalars")) == 5
-    tables = [row[0] for row in rows(path, "/words/revisions", "TextDocument:text")]
+    assert len(values(path, "/errors/fit", "Scalars:scalars")) == 5
+    tables = [row[0] for row in values(path, "/words/revisions", "TextDocument:text")]
     assert tables[-1].count("\n|") < tables[-2].count("\n|")
 
 
@@ -228,7 +226,7 @@ def test_words_in_pictures_are_legible_in_both_themes(refined):
     boxes = (36, 38, 43), (123, 124, 126)  # of the viewer, measured in pictures of both themes
     assert min(contrast(style.LABEL, box) for box in boxes) > 4.0
     white = 0xFFFFFFFF
-    for row in rows(refined, "/world/residual/worst", "Points3D:colors"):
+    for row in values(refined, "/world/residual/worst", "Points3D:colors"):
         assert set(row) == {white}
 
 

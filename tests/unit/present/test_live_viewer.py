@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 from hilcal.measuring.progress import ReadingStored
 from hilcal.present import live_viewer
 from hilcal.present.live_viewer import LiveViewer
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.recording import executable
 from hilcal.present.viewer.style import LEVEL_NAMES
 from tests.support.live_story import BLIND, events, measuring, plan
 from tests.support.paths import ROOT

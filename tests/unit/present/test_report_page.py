@@ -17,11 +17,19 @@ from playwright.sync_api import Browser
 
 from hilcal import numbers
 from hilcal.calibration.budget import budget
+from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
 from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import first_screen, left_out_errors, limit_words
-from hilcal.present.html.page import page as page_of
+from hilcal.present.html.first_screen import (
+    first_screen,
+    left_out_errors,
+    limit_words,
+    where_wrong,
+)
+from hilcal.present.html.sections import page as page_of
 from hilcal.present.html.sections import sections
+from hilcal.present.story import Chapter
+from hilcal.refinement import Refinement, Step
 from hilcal.store.overview import Instrument
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels
@@ -173,6 +181,37 @@ def test_what_is_said_to_be_wrong_is_of_poses_left_out(made) -> None:
     by_pose = next(p for p in sections(m)[1].blocks if isinstance(p, Chart))
     drawn = np.concatenate([read(t["y"]) for t in json.loads(by_pose.figure.to_json())["data"]])
     np.testing.assert_allclose(np.sort(drawn) ** 2, np.sort(m.left_out.whitened_norm2), rtol=1e-5)
+
+
+def test_poses_left_out_beyond_the_noise_are_not_said_to_be_within_it(made) -> None:
+    m, _ = made
+    calm = replace(m.diagnosis, reason="residual_is_noise")
+    for sigma, within in ((1.0, True), (1.57, False)):
+        fit = replace(m.fit)
+        fit.__dict__["holdout"] = replace(m.fit.holdout, rms_sigma=sigma)
+        said = where_wrong(replace(m, chapters=(Chapter(1, None, fit, calm),)))
+        assert ("all poses and loads are predicted within it" in said) == within
+        assert (f"by {sigma:.2f} times the noise" in said) != within
+
+
+def test_results_show_themselves_in_a_notebook(made) -> None:
+    (m, path), shown = made, []
+    for result, words in (
+        (m.fit, numbers.length(m.fit.holdout.rms_m)),
+        (m.diagnosis, m.diagnosis.suspects[0].effect),
+        (Refinement((Step(m.fit, m.diagnosis, None),)), m.diagnosis.verdict.replace("_", " ")),
+    ):
+        text = result._repr_html_()
+        assert words in text
+        shown.append(text)
+    with Campaign.open(path.parent / "a&<b>.hilcal") as run:
+        shown.append(run._repr_html_())
+    for text in shown:
+        outline = Outline()
+        outline.feed(text)
+        tags = [tag for tag, _ in outline.tags]
+        assert tags.count("table") == tags.count("caption") > 0
+        assert EVIL not in text
 
 
 def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(made) -> None:

@@ -15,9 +15,16 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import HeldOut
-from hilcal.present.build_story import Chapter, build_story, curve, of_left_out, pose_numbers
 from hilcal.present.html.first_screen import left_out_errors
-from hilcal.present.story import Story, StoryRevision
+from hilcal.present.story import (
+    Chapter,
+    Story,
+    StoryRevision,
+    build_story,
+    curve,
+    of_left_out,
+    pose_numbers,
+)
 from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import Campaign

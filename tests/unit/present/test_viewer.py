@@ -1,7 +1,6 @@
 """The recording, read back: what the story says is what the viewer gets."""
 
 import re
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,11 +11,10 @@ from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 
 from hilcal.present.document import table
-from hilcal.present.story import worst_and_even
-from hilcal.present.viewer import charts, digest, layout, save, style
-from hilcal.present.viewer.markdown import markdown
-from hilcal.present.viewer.stream import executable
+from hilcal.present.story import levels, worst_and_even
+from hilcal.present.viewer import campaign, campaign_scene, save, style
 from hilcal.robot.body import body_poses, capsules
+from tests.support.recordings import rows, same, texts, values
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
@@ -42,62 +40,27 @@ def recording(told, tmp_path_factory) -> Path:
     return path
 
 
-def column(path: Path, entity: str, component: str, timeline: str) -> dict[int, object]:
-    """Return the values of a component by time, read back from a recording."""
-    values: dict[int, object] = {}
-    for chunk in RrdReader(path).stream().filter(content=entity).to_chunks():
-        batch = chunk.to_record_batch()
-        if timeline in batch.schema.names and component in batch.schema.names:
-            times = batch.column(timeline).to_pylist()
-            found = batch.column(component).to_pylist()
-            values.update({int(t): v for t, v in zip(times, found, strict=True) if v is not None})
-    return values
-
-
-def texts(path: Path) -> list[str]:
-    """Return every string that a viewer would have to draw."""
-    out: list[str] = []
-    for chunk in RrdReader(path).stream().to_chunks():
-        batch = chunk.to_record_batch()
-        for name in batch.schema.names:
-            if name.endswith((":text", ":labels", ":names", ":name")):
-                for row in batch.column(name).to_pylist():
-                    out += [t for t in row or [] if t is not None]
-    return out
-
-
-def static(path: Path, entity: str, component: str) -> object:
-    """Return the value of a component that does not change."""
-    (value,) = (
-        value
-        for chunk in RrdReader(path).stream().filter(content=entity).to_chunks()
-        if component in (batch := chunk.to_record_batch()).schema.names
-        for value in batch.column(component).to_pylist()
-    )
-    return value
-
-
 def test_every_revision_has_its_errors_in_micrometres(told, recording):
     expected = {
-        "fit": [r.error_fit["rms_m"] for r in told.revisions],
-        "holdout": [r.error_holdout["rms_m"] for r in told.revisions],
-        "largest": [r.error_fit["max_m"] for r in told.revisions],
+        "fit": [r.error.rms_m for r in told.revisions],
+        "holdout": [r.holdout.rms_m for r in told.revisions],
+        "largest": [r.error.max_m for r in told.revisions],
         "noise": [told.noise_floor_m] * len(told.revisions),
     }
-    for name, values in expected.items():
-        read = column(recording, f"/errors/{name}", "Scalars:scalars", "revision")
+    for name, sizes in expected.items():
+        read = rows(recording, f"/errors/{name}", "Scalars:scalars", "revision")
         assert sorted(read) == [r.revision for r in told.revisions]
-        np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(values))
-        (called,) = static(recording, f"/errors/{name}", "SeriesPoints:names")
-        assert called in {words for _, words, _ in charts.SERIES}
+        np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(sizes))
+        ((called,),) = values(recording, f"/errors/{name}", "SeriesPoints:names")
+        assert called in {words for _, words, _ in campaign.SERIES}
 
 
 def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return left and right edges and heights of the bars of a revision."""
     left, width, height = (
-        np.array(column(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
+        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
         if name != "widths"
-        else np.array(column(path, entity, f"BarChart:{name}", "revision")[revision])
+        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
         for name in ("abscissa", "widths", "values")
     )
     return left, left + width, height
@@ -110,7 +73,7 @@ def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
     np.testing.assert_allclose(height, ANGLE.y)
     assert ((left < ANGLE.x) & (ANGLE.x < right)).all()
     np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
-    assert 3 not in column(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
+    assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
 
 
 def test_loads_stand_beside_each_other_in_their_order(tmp_path):
@@ -138,7 +101,7 @@ def test_a_curve_of_one_bin_or_no_height_is_drawn(tmp_path):
 
 
 def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
-    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    read = rows(recording, "/words/verdict", "TextDocument:text", "revision")
     heads = [read[k][0].splitlines()[0] for k in range(4)]
     assert [("the last" in head) for head in heads] == [False, False, False, True]
     assert [f"({k + 1} of 4)" in head for k, head in enumerate(heads)] == [True] * 4
@@ -152,8 +115,8 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
 
 
 def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
-    strips = column(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
-    balls = digest.digest(told).half_sizes
+    strips = rows(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
+    balls, _ = campaign_scene.noise_balls(told, np.arange(len(told)))
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
         dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
@@ -167,10 +130,10 @@ def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
 
 
 def test_the_tallest_bar_is_the_worst_reading_of_the_label(told, recording):
-    labels = column(recording, "/world/residual/worst", "Points3D:labels", "revision")
+    labels = rows(recording, "/world/residual/worst", "Points3D:labels", "revision")
     for r in told.revisions:
         bars = [
-            column(recording, f"/bars/{name}", "BarChart:values", "revision")[r.revision][0]
+            rows(recording, f"/bars/{name}", "BarChart:values", "revision")[r.revision][0]
             for name in style.LEVEL_NAMES
         ]
         tallest = max(max(b["buffer"]) for b in bars)
@@ -182,11 +145,11 @@ def test_a_pose_has_its_own_name_in_every_label_and_text(told, tmp_path):
     path = tmp_path / "named.rrd"
     save(named, path)
     name = f"p{told.pose[np.argmax(told.revisions[-1].whitened_norm2)] + 40}a"
-    worst = column(path, "/world/residual/worst", "Points3D:labels", "revision")
+    worst = rows(path, "/world/residual/worst", "Points3D:labels", "revision")
     assert f"pose {name}," in worst[3][0]
-    details = column(path, "/words/details", "TextDocument:text", "revision")
+    details = rows(path, "/words/details", "TextDocument:text", "revision")
     assert f"pose {name}," in details[3][0]
-    cards = column(path, "/words/verdict", "TextDocument:text", "pose")
+    cards = rows(path, "/words/verdict", "TextDocument:text", "pose")
     assert cards[7][0].startswith("### Pose p47a:")
 
 
@@ -198,21 +161,23 @@ def test_timelines_are_revision_and_pose(recording):
 
 
 def test_every_reading_has_its_arrow(told, recording):
-    drawn = column(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = digest.digest(told).residual_scale
+    drawn = rows(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    scale = campaign_scene.residual_scale(told)
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (READINGS, 3)
         length = np.linalg.norm(r.residual, axis=1) * scale
         np.testing.assert_allclose(
-            np.linalg.norm(vectors, axis=1), np.minimum(length, digest.ARROW_CAP), rtol=1e-5
+            np.linalg.norm(vectors, axis=1),
+            np.minimum(length, campaign_scene.ARROW_CAP),
+            rtol=1e-5,
         )
 
 
 def test_one_ball_per_pose_and_arm_moves_through_poses(told, recording):
-    balls = column(recording, "/world/residual/noise", "Ellipsoids3D:half_sizes", "revision")
+    balls = rows(recording, "/world/residual/noise", "Ellipsoids3D:half_sizes", "revision")
     assert {len(b) for b in balls.values()} == {30}
-    moves = column(recording, "/world/arm/body6", "Transform3D:translation", "pose")
+    moves = rows(recording, "/world/arm/body6", "Transform3D:translation", "pose")
     bodies = body_poses(told.arm, told.q[::3])
     assert sorted(moves) == list(range(30))
     read = np.array([moves[k][0] for k in range(30)])
@@ -220,7 +185,7 @@ def test_one_ball_per_pose_and_arm_moves_through_poses(told, recording):
 
 
 def test_arm_stands_in_the_worst_pose(told, recording):
-    stands = column(recording, "/world/arm/body7", "Transform3D:translation", "revision")
+    stands = rows(recording, "/world/arm/body7", "Transform3D:translation", "revision")
     for r in told.revisions:
         i = int(np.argmax(r.whitened_norm2))
         expected = body_poses(told.arm, told.q[i : i + 1])[0, -1, :3, 3]
@@ -231,14 +196,14 @@ def test_bars_hold_every_pose_once_under_its_level(told, recording):
     for r in told.revisions:
         total = 0
         for name in style.LEVEL_NAMES:
-            bars = column(recording, f"/bars/{name}", "BarChart:values", "revision")
+            bars = rows(recording, f"/bars/{name}", "BarChart:values", "revision")
             values = np.array(bars[r.revision][0]["buffer"], dtype=float)
             total += int((values > 0).sum())
         assert total == 30
 
 
 def test_verdict_names_suspects_with_their_figures(told, recording):
-    read = column(recording, "/words/verdict", "TextDocument:text", "revision")
+    read = rows(recording, "/words/verdict", "TextDocument:text", "revision")
     first = read[0][0]
     assert "base_compliance" in first.replace("\\", "")
     assert "86 %" in first
@@ -251,13 +216,8 @@ def test_saving_twice_gives_equal_recordings(told, recording, tmp_path):
     again, other = tmp_path / "again.rrd", tmp_path / "other.rrd"
     save(told, again)
     save(story(seed=2), other)
-    assert compare(recording, again) == 0
-    assert compare(recording, other) != 0
-
-
-def compare(a: Path, b: Path) -> int:
-    command = [executable(), "rrd", "compare", str(a), str(b)]
-    return subprocess.run(command, capture_output=True, check=False).returncode
+    assert same(recording, again)
+    assert not same(recording, other)
 
 
 def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
@@ -270,7 +230,7 @@ def test_no_character_without_a_glyph_reaches_the_viewer(tmp_path):
 
 
 def test_user_names_cannot_break_a_table():
-    made = markdown([table("effect", "share", rows=[("a|b\nc", "50 %")])]).splitlines()
+    made = style.markdown([table("effect", "share", rows=[("a|b\nc", "50 %")])]).splitlines()
     assert len(made) == 3
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in made} == {3}
 
@@ -279,15 +239,15 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     big, path = story(poses=3000, loads=1, mode="absolute"), tmp_path / "big.rrd"
     save(big, path)
     assert path.stat().st_size < 20e6
-    arrows = column(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
+    arrows = rows(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = layout.residual_title(digest.digest(big))
+    title = campaign.residual_title(big)
     assert f"about {len(arrows[0])} of 3000" in title
-    balls = column(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
-    origins = column(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
+    balls = rows(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
+    origins = rows(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
     for k in range(4):
         assert {tuple(c) for c in balls[k]} <= {tuple(o) for o in origins[k]}
-    assert len(column(path, "/world/arm/body3", "Transform3D:translation", "pose")) == 3000
+    assert len(rows(path, "/world/arm/body3", "Transform3D:translation", "pose")) == 3000
 
 
 def test_subsample_keeps_the_worst():
@@ -302,7 +262,7 @@ def test_ellipsoids_give_the_covariance_back():
     rng = np.random.default_rng(3)
     a = rng.standard_normal((50, 3, 3))
     covariance = a @ a.transpose(0, 2, 1)
-    half, quaternion = digest.ellipsoids(covariance)
+    half, quaternion = campaign_scene.ellipsoids(covariance)
     x, y, z, w = quaternion.T
     rotation = np.stack(
         [
@@ -317,7 +277,7 @@ def test_ellipsoids_give_the_covariance_back():
 
 def test_levels_hold_the_share_of_noise_they_name():
     norm2 = np.random.default_rng(4).chisquare(3, 200_000)
-    share = np.bincount(style.levels(norm2), minlength=3) / len(norm2)
+    share = np.bincount(levels(norm2), minlength=3) / len(norm2)
     assert share[1] == pytest.approx(0.0099, abs=0.001)
     assert share[2] == pytest.approx(0.0001, abs=0.0001)
 
@@ -353,4 +313,4 @@ def test_arm_of_another_shape_is_drawn(tmp_path):
     told = story(poses=3)
     path = tmp_path / "four.rrd"
     save(replace(told, arm=four, q=told.q[:, :4]), path)
-    assert len(column(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3
+    assert len(rows(path, "/world/arm/body5", "Transform3D:translation", "pose")) == 3

@@ -8,7 +8,8 @@ import pytest
 import rerun as rr
 
 from hilcal.errors import HilcalError, InputError
-from hilcal.present.viewer import digest, layout, save, style
+from hilcal.present.story import levels
+from hilcal.present.viewer import campaign, save, style
 from tests.support import picture
 from tests.support.picture import Shot, pictures, pixels, vulkan_available
 from tests.support.viewer_story import doubtful, story
@@ -46,9 +47,9 @@ def colors(picture_: np.ndarray) -> int:
 @needs_vulkan
 def test_the_picture_shows_the_red_vanish(recording, tmp_path):
     told = story()
-    reached = [style.levels(r.whitened_norm2).max() for r in told.revisions]
+    reached = [levels(r.whitened_norm2).max() for r in told.revisions]
     assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
-    view = layout.residual_title(digest.digest(told))
+    view = campaign.residual_title(told)
     shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
     reports = pictures(recording, shots, SIZE, LONGEST)
     assert len(reports) >= 10
@@ -79,17 +80,17 @@ def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
 @pytest.mark.slow
 @needs_vulkan
 def test_every_view_is_drawn_without_a_report(recording, tmp_path):
-    d = digest.digest(story())
+    d = story()
     names = [
-        layout.residual_title(d),
-        layout.deflection_title(d),
-        layout.bars_title(d),
+        campaign.residual_title(d),
+        campaign.deflection_title(d),
+        campaign.bars_title(d),
         *(
             "Verdict",
             "Details",
-            layout.ERRORS,
+            campaign.ERRORS,
             "How to read this",
-            layout.FOLLOWS,
+            campaign.FOLLOWS,
             "Table",
             "Log",
         ),

@@ -2,11 +2,12 @@
 
 import numpy as np
 
-from hilcal.present.viewer import arm_shapes, plan_scene, plan_stream, style
-from hilcal.present.viewer.plan_digest import HIDDEN, SEEN, TURNED, UNKNOWN, plan_digest
-from hilcal.present.viewer.plan_stream import record_plan
+from hilcal.present.viewer import arm_shapes, plan, plan_scene, style
+from hilcal.present.viewer.plan import record_plan
+from hilcal.present.viewer.plan_scene import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED
+from tests.support.recordings import entities, rows
 from tests.support.viewer_plan import (
     BARE,
     PLAN,
@@ -14,10 +15,8 @@ from tests.support.viewer_plan import (
     TRACKER,
     Q,
     configured,
-    entities,
     recording,
     rgb,
-    rows,
     shadowed,
     strict,
     target,
@@ -38,7 +37,7 @@ def test_capsules_end_where_they_should_in_any_direction():
 
 
 def test_the_arm_is_drawn_as_what_is_checked_for_collisions(shadowed, recording):
-    d = plan_digest(*shadowed, PLAN, SUMMARY)
+    d = PlanView(*shadowed, PLAN, SUMMARY)
     parts = d.shapes.scene.parts
     drawn = []
     for i in range(7):
@@ -97,12 +96,12 @@ def test_a_reflector_that_looks_away_is_told_from_a_hidden_one(shadowed):
     sight = config.sight.model_copy(
         update={"target_normal": tuple(normal), "incidence_max_rad": 0.02}
     )
-    d = plan_digest(cell, config.model_copy(update={"sight": sight}), PLAN, SUMMARY)
+    d = PlanView(cell, config.model_copy(update={"sight": sight}), PLAN, SUMMARY)
     status = dict(zip((s.pose for s in PLAN.steps), d.sight.tolist(), strict=True))
     assert status == {REFERENCE: TURNED, "p1": HIDDEN, "p2": SEEN, "p3": TURNED}
-    assert "incidence" in plan_stream.step_card(d, 0)
-    assert "screen between" in plan_stream.step_card(d, 1)
-    assert [bool(w) for w in d.why] == [s != SEEN for s in d.sight]
+    assert "incidence" in plan.step_card(d, 0)
+    assert "screen between" in plan.step_card(d, 1)
+    assert [bool(d.why(k)) for k in range(len(d))] == [s != SEEN for s in d.sight]
 
 
 def test_without_a_tracker_nothing_is_claimed(tmp_path):
@@ -110,11 +109,11 @@ def test_without_a_tracker_nothing_is_claimed(tmp_path):
     path = tmp_path / "x.rrd"
     record_plan(cell, config, PLAN, SUMMARY, path)
     assert not {"/world/beam", "/world/tracker", "/world/target/unseen"} & entities(path)
-    d = plan_digest(cell, config, PLAN, SUMMARY)
+    d = PlanView(cell, config, PLAN, SUMMARY)
     assert set(d.sight.tolist()) == {UNKNOWN}
     assert not d.unseen.any()
-    assert "not known" in plan_stream.overview(d)
-    assert "not known" in plan_stream.step_card(d, 0)
+    assert "not known" in plan.overview(d)
+    assert "not known" in plan.step_card(d, 0)
     assert not any("seen" in v[0] for v in rows(path, "/world/label", "Points3D:labels").values())
 
 
@@ -158,7 +157,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(shadowed, recording):
 
 
 def test_ways_are_one_path_of_straight_joint_motions(shadowed):
-    d = plan_digest(*shadowed, PLAN, SUMMARY)
+    d = PlanView(*shadowed, PLAN, SUMMARY)
     assert len(d.ways) == len(PLAN.steps)
     for k, way in enumerate(d.ways):
         np.testing.assert_allclose(way[-1], d.target[k], atol=1e-12)

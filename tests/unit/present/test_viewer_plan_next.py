@@ -7,9 +7,10 @@ from rerun.chunk import RrdReader
 from hilcal.config import Obstacle
 from hilcal.design.next import PairPower
 from hilcal.present.viewer import layout
-from hilcal.present.viewer.plan_digest import plan_digest
-from hilcal.present.viewer.plan_stream import record_plan
-from tests.support.viewer_plan import PLAN, SUMMARY, configured, rows, strict
+from hilcal.present.viewer.plan import record_plan
+from hilcal.present.viewer.plan_scene import PlanView
+from tests.support.recordings import rows
+from tests.support.viewer_plan import PLAN, SUMMARY, configured, strict
 
 __all__ = ["strict"]  # fixture
 POWERS = (
@@ -61,7 +62,7 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
     cell, config = configured(obstacles=[tripod])
     path = tmp_path / "tripod.rrd"
     record_plan(cell, config, PLAN, SUMMARY, path)
-    d = plan_digest(cell, config, PLAN, SUMMARY)
+    d = PlanView(cell, config, PLAN, SUMMARY)
     arm = d.bodies[:, 1:, :3, 3].reshape(-1, 3)
     assert layout.hidden(preferred, arm, config.obstacles).mean() > 0.3
     assert layout.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02

@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 
 from hilcal.errors import InputError
 from hilcal.present.viewer import save, serve
-from hilcal.present.viewer.stream import executable
+from hilcal.present.viewer.recording import executable
 from tests.support.paths import ROOT
 from tests.support.viewer_story import story
 

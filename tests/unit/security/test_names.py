@@ -53,10 +53,10 @@ from hilcal.errors import InputError
 from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.present.charts import style as chart_style
-from hilcal.present.charts.readings import escaped as in_chart
+from hilcal.present.charts.style import label as in_chart
 from hilcal.present.document import Chart, Items, Section, Words, table
 from hilcal.present.html import page
-from hilcal.present.html.first_screen import FirstScreen
+from hilcal.present.html.page import FirstScreen
 from hilcal.present.progress import SafeConsole, counting, working
 from hilcal.present.viewer import style as viewer_style
 from hilcal.robot.catalogue import load_arm

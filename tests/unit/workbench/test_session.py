@@ -9,11 +9,11 @@ import pytest
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fits import fitted_with
+from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import carried_prior
 from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
-from hilcal.present.diagnosis_json import to_json
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
 from hilcal.workbench.session import Session

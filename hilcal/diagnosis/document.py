@@ -2,31 +2,31 @@
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, Suspect
 from hilcal.diagnosis.minimum_detectable_effect import Strength
 from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.residual_regression import Dependence
-from hilcal.present.verdict import message
+from hilcal.shown import presenter
+
+if TYPE_CHECKING:
+    from hilcal.diagnosis.diagnosis import Diagnosis
 
 
-def to_json(d: Diagnosis) -> dict[str, object]:
+def to_json(d: "Diagnosis") -> dict[str, object]:
     """Return the keys of the contract, and all else that a diagnosis holds."""
     return {
         "model": list(d.fit.model.named),
         "verdict": d.verdict,
-        "message": message(d),
+        "message": presenter().message(d),
         "reason": d.reason,
         "variance_factor": d.fit.variance_factor,
         "variance_factor_interval": list(d.fit.variance_factor_interval),
         "predictable_share": d.predictable_share,
-        "where": [
-            {"variable": v.variable, "share": v.share, "p_value": v.p_value}
-            for v in d.misfit_breakdown
-        ],
+        "where": [asdict(v) for v in d.misfit_breakdown],
         "suspects": [suspect_json(s) for s in d.suspects],
         "not_shown": list(d.not_shown),
         "tests": {

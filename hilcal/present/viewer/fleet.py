@@ -1,32 +1,35 @@
-"""The pictures of a fleet: arms of a type side by side, and their campaigns by date."""
+"""A fleet in rerun: which arm is unlike its type, in which joint, and since when."""
 
 import math
 import re
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
+import rerun.blueprint as rrb
 
-from hilcal.present.fleet import unlike_words
-from hilcal.present.viewer import arm_shapes, style
+from hilcal import numbers
+from hilcal.present.document import heading
+from hilcal.present.fleet import FAR, type_report, unlike_words
+from hilcal.present.viewer import arm_shapes, layout, recording, style
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, capsules
 from hilcal.store.revision import seconds_of
 from hilcal.types import Bools, Floats
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # above this layer
+    from hilcal.transfer.fleet import Fleet
     from hilcal.transfer.members import Member
     from hilcal.transfer.pooled import Odd, Pooled
 
-FAR = 3.0
-"""Standard deviations between which most arms lie; a choice."""
 _JOINT = re.compile(r"\.j(\d+)\b")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class TypeDigest:
+class DrawnType:
     """One type of a fleet; A arms, K pooled parameters, C campaigns.
 
     Attributes:
@@ -62,7 +65,7 @@ class TypeDigest:
         return [o for o in self.pooled.odd if o.arm == self.pooled.arms[arm]]
 
 
-def type_digest(t: "Pooled", members: "tuple[Member, ...]") -> TypeDigest:
+def drawn_type(t: "Pooled", members: "tuple[Member, ...]") -> DrawnType:
     """Derive what the views of a type need."""
     names, arms = [p.parameter for p in t.parameters], list(t.arms)
     between = np.array([p.between for p in t.parameters])
@@ -85,13 +88,11 @@ def type_digest(t: "Pooled", members: "tuple[Member, ...]") -> TypeDigest:
         odd[arms.index(o.arm), k] = True
         for c, m in enumerate(mine):
             changed[c, k] |= o.campaign == m.name
-    seen = np.isfinite(t.off_std)
-    units = np.where(seen, t.off / np.hypot(between, np.where(seen, t.off_std, 1.0)), np.nan)
     joints = tuple(int(found[1]) if (found := _JOINT.search(n)) else 0 for n in names)
-    return TypeDigest(
+    return DrawnType(
         pooled=t,
         arm=_drawn(t),
-        units=units,
+        units=t.distance,
         odd=odd,
         joints=joints,
         owner=tuple(arms.index(m.arm) for m in mine),
@@ -119,7 +120,7 @@ _ROWS = 12
 """Parameters that are drawn at most; a choice."""
 
 
-def places(d: TypeDigest) -> Floats:
+def places(d: DrawnType) -> Floats:
     """(A, 3) where the arms stand, m: in rows, the first in front."""
     count, reach = len(d.pooled.arms), max(d.arm.reach, 0.1)
     wide = max(math.ceil(math.sqrt(2.0 * count)), 1)
@@ -130,7 +131,7 @@ def places(d: TypeDigest) -> Floats:
     return at
 
 
-def arms(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
+def arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Log the arms; a joint that is unlike the type is red, one beyond `FAR` σ amber."""
     rec.log(path, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     n, shapes = d.arm.n, capsules(d.arm)
@@ -190,7 +191,7 @@ def arms(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
         )
 
 
-def _colors(d: TypeDigest, a: int) -> npt.NDArray[np.uint8]:
+def _colors(d: DrawnType, a: int) -> npt.NDArray[np.uint8]:
     """(n + 1, 3) colours of the bodies of an arm."""
     shades = [arm_shapes.METAL if i % 2 else arm_shapes.LIGHT for i in range(d.arm.n + 1)]
     out = np.array(shades, dtype=np.uint8)
@@ -201,18 +202,18 @@ def _colors(d: TypeDigest, a: int) -> npt.NDArray[np.uint8]:
     return out
 
 
-def _label(d: TypeDigest, a: int) -> str:
+def _label(d: DrawnType, a: int) -> str:
     lines = [unlike_words(o) for o in d.told(a)]
     return "\n".join(lines[:3]) or d.pooled.arms[a]
 
 
-def rows(d: TypeDigest) -> list[int]:
+def rows(d: DrawnType) -> list[int]:
     """Return the parameters that are drawn: those with the farthest arms, in their order."""
     far = np.nanmax(np.abs(np.where(np.isfinite(d.units), d.units, 0.0)), axis=0)
     return sorted(np.argsort(-far, kind="stable")[:_ROWS].tolist())
 
 
-def drift(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
+def drift(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     """Send each arm's campaigns along `date`, a view per parameter."""
     for k in rows(d):
         for a, arm in enumerate(d.pooled.arms):
@@ -237,3 +238,87 @@ def drift(rec: rr.RecordingStream, path: str, d: TypeDigest) -> None:
                 indexes=[rr.TimeColumn("date", timestamp=d.seconds[mine])],
                 columns=rr.Scalars.columns(scalars=d.campaigns[mine, k]),
             )
+
+
+_LEAST_RANGE_S = 86400.0
+GUIDE = """### How to read this
+- **Arms**: one of each, side by side. A red joint is unlike the others of the type; its arm stands
+  in a red frame. Amber: beyond 3 σ, which chance does to one parameter in some hundred.
+- **By date**: each campaign in σ of the type: the spread from arm to arm together with the
+  uncertainty of the campaign. A line that leaves the others has changed; lines that go
+  the same way are wear.
+"""
+
+
+def record_fleet(fleet: "Fleet", path: Path) -> None:
+    """Write what is known of a fleet as a recording file; equal fleets give equal recordings.
+
+    Raises:
+        InputError: the folder is missing.
+        HilcalError: the file cannot be written.
+    """
+    path = Path(path)
+    recording.require_folder(path)
+    types = [drawn_type(t, fleet.members) for t in fleet.types]
+    told = [(d.pooled.type, d.pooled.arms, d.pooled.odd, d.names) for d in types]
+    rec = recording.opened(told, *(a for d in types for a in (d.units, d.seconds, d.campaigns)))
+    recording.write(rec, _blueprint(types), lambda: _log(rec, types), path)
+
+
+def _log(rec: rr.RecordingStream, types: list[DrawnType]) -> None:
+    count = sum(len(d.pooled.arms) for d in types)
+    rec.send_recording_name(f"hilcal fleet: {count} arms")
+    for i, d in enumerate(types):
+        arms(rec, f"arms{i}", d)
+        drift(rec, f"date{i}", d)
+        rec.log(f"words/type{i}", style.document(_told(d)), static=True)
+    rec.log("words/guide", style.document(GUIDE), static=True)
+    recording.flush(rec)
+
+
+def _told(d: DrawnType) -> str:
+    odd = list(dict.fromkeys(o.arm for o in d.pooled.odd))
+    verb = "is" if len(odd) == 1 else "are"
+    title = f"{numbers.names(odd)} {verb} unlike the others" if odd else "No arm is unlike"
+    name, table, note, *lines = type_report(d.pooled)
+    return style.markdown([heading(title), name, *lines, table, note])
+
+
+def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
+    """Left: the arms over their campaigns by date. Right: the verdict and the parameters."""
+    many = len(types) > 1
+    of = [f"{d.pooled.type}: " if many else "" for d in types]
+    scenes = [_arms(f"arms{i}", of[i], d) for i, d in enumerate(types)]
+    dates = [
+        rrb.TimeSeriesView(
+            origin=f"date{i}/{k}",
+            name=f"{of[i]}{d.names[k]} by date [σ]",
+            plot_legend=rrb.PlotLegend(visible=False),
+            axis_x=_whole(d),
+        )
+        for i, d in enumerate(types)
+        for k in sorted(rows(d), key=lambda k: (not d.odd[:, k].any(), k))
+    ]
+    words = [
+        rrb.TextDocumentView(origin=f"words/type{i}", name=f"{of[i]}Unlike the type")
+        for i in range(len(types))
+    ]
+    words.append(rrb.TextDocumentView(origin="words/guide", name="How to read this"))
+    left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
+    return layout.whole(rrb.Horizontal(left, rrb.Tabs(*words), column_shares=[3, 2]), "date")
+
+
+def _whole(d: DrawnType) -> rrb.TimeAxis:
+    """Return the range of all dates, with a margin."""
+    low, high = float(d.seconds.min()), float(d.seconds.max())
+    wide = max(0.05 * (high - low), _LEAST_RANGE_S)
+    ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in (low - wide, high + wide)]
+    return rrb.TimeAxis(view_range=rrb.TimeRange(*ends))
+
+
+def _arms(origin: str, of: str, d: DrawnType) -> rrb.Spatial3DView:
+    at, reach = places(d), max(d.arm.reach, 0.1)
+    middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * reach])
+    size = float(np.ptp(at, axis=0).max()) + reach
+    name = f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where"
+    return layout.view3d(origin, name, middle + size * np.array([0.68, 0.0, 0.36]), middle)

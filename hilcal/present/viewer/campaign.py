@@ -1,0 +1,451 @@
+"""A campaign in rerun: its recording, in a file or served to viewers that join when they like."""
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hilcal import numbers
+from hilcal.errors import HilcalError, InputError
+from hilcal.present.diagnosis import REVISION_HEADS
+from hilcal.present.document import Block, heading, table
+from hilcal.present.live_viewer import PORT
+from hilcal.present.story import LEVEL_NAMES, Curve, Story, StoryRevision, levels
+from hilcal.present.viewer import campaign_scene, layout, recording, style
+from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """A recording that viewers can open at `url` for as long as it is served."""
+
+    url: str
+
+
+def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
+    """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
+
+    Args:
+        story: what is told.
+        sinks: where it goes.
+
+    Returns:
+        The open stream; it closes, and ends its sinks, when it is dropped.
+
+    Raises:
+        HilcalError: a sink does not take the data (disk full, ...).
+    """
+    rec = _opened(story)
+    rec.set_sinks(*sinks)
+    # Active, too: a viewer that has shown another recording would keep the layout of that one.
+    rec.send_blueprint(blueprint(story), make_active=True, make_default=True)
+    tell(rec, story)
+    return rec
+
+
+def save(story: Story, path: Path) -> None:
+    """Write a story as a recording file, whole or not at all; an existing file is replaced.
+
+    Raises:
+        InputError: the folder is missing.
+        HilcalError: the file cannot be written.
+    """
+    path = Path(path)
+    recording.require_folder(path)
+    rec = _opened(story)
+    recording.write(rec, blueprint(story), lambda: tell(rec, story), path)
+
+
+@contextlib.contextmanager
+def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Served]:
+    """Serve a story to viewers until the block ends; viewers may join late and rejoin.
+
+    The operator opens `rerun <url>`. The viewer's analytics are switched off for this user.
+
+    Raises:
+        InputError: the port is taken.
+        HilcalError: the port cannot be served.
+    """
+    recording.disable_analytics()
+    try:
+        recording.bind(ip, port)
+    except (OSError, OverflowError) as error:
+        raise InputError(
+            f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
+        ) from error
+    try:
+        rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
+    except (OSError, RuntimeError) as error:
+        raise HilcalError(f"viewer server {ip}:{port}: {error}") from error
+    try:
+        yield Served(f"rerun+http://{ip}:{port}/proxy")
+    finally:
+        rec.disconnect()
+
+
+def _opened(story: Story) -> rr.RecordingStream:
+    arrays = (story.q, story.pose, story.anchor, story.measured, story.covariance)
+    names = (story.arm.name, story.mode, story.load_names, story.pose_names)
+    told = [(r.revision, r.change, r.verdict, r.cells, r.panels) for r in story.revisions]
+    return recording.opened(names, *arrays, told, *(r.residual for r in story.revisions))
+
+
+def tell(rec: rr.RecordingStream, story: Story) -> None:
+    """Log the whole story, flushed after each revision."""
+    rec.send_recording_name(f"hilcal: {style.safe(story.arm.name)}, {len(story)} readings")
+    begin(rec, story)
+    for r in story.revisions:
+        rec.set_time("revision", sequence=r.revision)
+        tell_revision(rec, story, r)
+        recording.flush(rec)
+    rec.reset_time()
+    _poses(rec, story)
+    recording.flush(rec)
+
+
+def begin(rec: rr.RecordingStream, story: Story) -> None:
+    """Log what is the same in every revision."""
+    campaign_scene.static_scene(rec, story)
+    error_series(rec)
+    rec.log("words/guide", style.document(GUIDE), static=True)
+
+
+def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+    """Log one revision at the recording's current time."""
+    campaign_scene.revision_scene(rec, story, r)
+    revision_charts(rec, story, r)
+    rec.log("words/verdict", style.document(verdict(story, r)))
+    rec.log("words/parameters", style.document(style.markdown(r.panels.get("parameters", ()))))
+    rec.log("words/revisions", style.document(revisions(story, r.revision)))
+    rec.log("words/details", style.document(details(story, r)))
+    rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
+
+
+def _poses(rec: rr.RecordingStream, story: Story) -> None:
+    """Tell the last revision on the timeline `pose`, and move the arm along it."""
+    last = story.revisions[-1]
+    rec.set_time("pose", sequence=int(story.poses[0]))
+    tell_revision(rec, story, last)
+    rec.reset_time()
+    campaign_scene.pose_scene(rec, story)
+    time = [rr.TimeColumn("pose", sequence=story.poses)]
+    cards = pose_cards(story)
+    rec.send_columns(
+        "words/verdict",
+        indexes=time,
+        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
+    )
+    pose_charts(rec, story)
+
+
+FOLLOWS = "What the residual follows"
+LAW = "Law beyond the catalogue"
+ERRORS = "Error of each revision [µm]"
+
+
+def blueprint(story: Story) -> rrb.Blueprint:
+    """Left: 3-D over the error of each revision. Right: the verdict over residual and details.
+
+    It opens at the first revision and stands there; that of a growing story goes along with it.
+    """
+    left = rrb.Vertical(
+        rrb.Tabs(
+            _view3d(story, residual_title(story), "deflection"),
+            _view3d(story, deflection_title(story), "residual"),
+        ),
+        rrb.Tabs(
+            rrb.TimeSeriesView(origin="errors", name=ERRORS),
+            _bars("bars", bars_title(story)),
+        ),
+        row_shares=[11, 4],
+    )
+    laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
+    right = rrb.Vertical(
+        rrb.Tabs(
+            rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
+            rrb.TextDocumentView(origin="words/details", name="Details"),
+            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
+        ),
+        rrb.Tabs(
+            _bars("follows", FOLLOWS),
+            *laws,
+            rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
+            rrb.TextDocumentView(origin="words/revisions", name="Table"),
+            rrb.TextLogView(origin="log", name="Log"),
+        ),
+        row_shares=[5, 4],
+    )
+    play: Literal["following", "paused"] = "following" if story.growing else "paused"
+    both = rrb.Horizontal(left, right, column_shares=[3, 2])
+    return layout.whole(both, "revision", play, fps=1.0)
+
+
+def residual_title(story: Story) -> str:
+    """Return the title of the residual view, with its scale and how much it shows."""
+    shown, n = len(campaign_scene.shown(story, story.revisions[0])), len(story)
+    part = f" (about {shown} of {n} readings)" if shown < n else ""
+    scale = f"{campaign_scene.residual_scale(story):g}"
+    return f"Residual ×{scale}{part}: an arrow that leaves its noise ball = model wrong"
+
+
+def deflection_title(story: Story) -> str:
+    """Return the title of the deflection view, with its scale."""
+    what = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
+    scale = f"{campaign_scene.deflection_scale(story):g}"
+    return f"{what} ×{scale}: blue measured, white predicted, red missed"
+
+
+def bars_title(story: Story) -> str:
+    """Return the title of the bars, with what one bar stands for."""
+    several = poses_per_bar(story)
+    part = f" ({several} poses per bar)" if several > 1 else ""
+    return f"Worst reading of each pose, in σ{part}: grey noise, amber doubtful, red model wrong"
+
+
+def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
+    middle, size = layout.center(story.anchor, story.arm.reach)
+    place = layout.near(middle, layout.EYE * size, campaign_scene.seen(story))
+    contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
+    return layout.view3d("world", name, place, middle, contents)
+
+
+def _bars(origin: str, name: str) -> rrb.BarChartView:
+    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
+
+
+SERIES = (
+    ("fit", "fitted poses, rms", style.MEASURED),
+    ("holdout", "poses left out, rms", style.HOLDOUT),
+    ("largest", "largest of all", style.RED),
+    ("noise", "noise alone, rms", style.NOISE),
+)
+"""Of the errors of revisions: entity, name and colour."""
+BARS = 150
+"""Bars of poses at most."""
+_BINS = 12
+"""Of single readings over what they may follow, for their mean."""
+_PARTS = ("mean", "law")
+
+
+def error_series(rec: rr.RecordingStream) -> None:
+    """Log what the series of errors are called, and how they look."""
+    for entity, name, color in SERIES:
+        line = rr.SeriesLines(names=[name], colors=[color], widths=[1.5])
+        mark = rr.SeriesPoints(names=[name], colors=[color], markers=["circle"], marker_sizes=[4.0])
+        rec.log(f"errors/{entity}", line, mark, static=True)
+
+
+def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+    """Log one revision at the recording's current time."""
+    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m)
+    for (entity, *_), size in zip(SERIES, (*sizes, story.noise_floor_m), strict=True):
+        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
+    pose_bars(rec, story, r)
+    curve_bars(rec, "follows", r.follows)
+    if any(one.laws for one in story.revisions):
+        curve_bars(rec, "law", r.laws[0] if r.laws else None)
+
+
+def pose_charts(rec: rr.RecordingStream, story: Story) -> None:
+    """Send the bar of the current pose along `pose`, with the last revision."""
+    sigma = np.sqrt(pose_norm2(story, story.revisions[-1]))
+    starts, left, width = _bar_places(story)
+    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
+        rec.set_time("pose", sequence=int(story.poses[starts[k]]))
+        one = slice(k, k + 1)
+        bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
+        rec.log("bars/zcurrent", bar)  # the name puts it in front of the others
+    rec.reset_time()
+
+
+def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+    """Log the worst reading of each pose in σ, its Mahalanobis distance, one series per level.
+
+    The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
+    """
+    starts, left, width = _bar_places(story)
+    norm2 = np.maximum.reduceat(pose_norm2(story, r), starts)
+    height, level = np.sqrt(norm2), levels(norm2)
+    for i, name in enumerate(style.LEVEL_NAMES):
+        of = np.flatnonzero(level == i)
+        some = of if len(of) else np.arange(1)
+        rec.log(
+            f"bars/{name}",
+            rr.BarChart(
+                height[some] if len(of) else [0.0],
+                abscissa=left[some],
+                widths=width[some],
+                color=style.LEVEL_COLORS[i].tolist(),
+            ),
+        )
+
+
+def pose_norm2(story: Story, r: StoryRevision) -> Floats:
+    """(P,) largest squared Mahalanobis distance of each pose."""
+    return r.whitened_norm2[story.last_of_poses(r.whitened_norm2)]
+
+
+def poses_per_bar(story: Story) -> int:
+    """Consecutive poses that share one bar, so that bars stay wide enough to be read."""
+    return -(-len(story.poses) // BARS)
+
+
+def _bar_places(story: Story) -> tuple[Ints, Floats, Floats]:
+    """First pose (index), left edge and width of every bar, in pose numbers."""
+    starts = np.arange(0, len(story.poses), poses_per_bar(story))
+    edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
+    return starts, edges[:-1], np.diff(edges)
+
+
+def curve_bars(rec: rr.RecordingStream, entity: str, c: Curve | None) -> None:
+    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
+
+    Single readings are drawn by their mean in bins of equal count.
+    """
+    bars: dict[str, tuple[Floats, Floats]] = {}
+    if c is not None and len(c.x):
+        x, y = (c.x, c.y) if c.error is not None else _means(c)
+        bars["mean"] = np.arange(float(len(x))) if c.names else x, y
+        if c.line is not None:
+            bars["law"] = x, np.interp(x, *c.line)
+    for k, part in enumerate(_PARTS):
+        if part not in bars:
+            rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
+            continue
+        x, y = bars[part]
+        order = np.argsort(x, kind="stable")
+        edges = _edges(x[order])
+        width = np.diff(edges) / len(bars)
+        chart = rr.BarChart(
+            y[order],
+            abscissa=edges[:-1] + k * width,
+            widths=width,
+            color=(style.MEASURED, style.NOISE)[k],
+        )
+        rec.log(f"{entity}/{part}", chart)
+
+
+def _edges(x: Floats) -> Floats:
+    """(K + 1,) of bins about growing centres (K,): half-way between them."""
+    if len(x) == 1:
+        return np.array([x[0] - 0.5, x[0] + 0.5])
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
+
+
+def _means(c: Curve) -> tuple[Floats, Floats]:
+    order = np.argsort(c.x, kind="stable")
+    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
+    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])
+
+
+_MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
+_POSE_LOADS = 12
+
+
+def verdict(story: Story, r: StoryRevision) -> str:
+    """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
+    mark = _MARKS.get(r.verdict, "")
+    head = heading(f"{place(story, r)}: {mark}{r.verdict.replace('_', ' ')}")
+    return style.markdown([head, *(r.panels.get("verdict") or [r.message])])
+
+
+def place(story: Story, r: StoryRevision) -> str:
+    """Return where in the story a revision stands, e.g. "Revision 2 of 2, the last"."""
+    if story.growing:
+        return f"Revision {r.revision}"
+    told = [o.revision for o in story.revisions]
+    k, count = told.index(r.revision) + 1, len(told)
+    if told == list(range(1, count + 1)):
+        where = f"Revision {k} of {count}"
+    else:
+        where = f"Revision {r.revision} ({k} of {count})"
+    return f"{where}, the last" if k == count > 1 else where
+
+
+def details(story: Story, r: StoryRevision) -> str:
+    """Return what the verdict rests on, as the terminal has it, and the worst reading."""
+    outside = float(np.mean(r.level > 0))
+    i = campaign_scene.worst(r)
+    worst = (
+        f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
+        f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
+        f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
+    )
+    head = heading(f"Revision {r.revision}: {r.name}")
+    return style.markdown([head, worst, *r.panels.get("details", ())])
+
+
+def pose_cards(story: Story) -> list[str]:
+    """Return each pose of the last revision in words: residual of each load, and joints."""
+    r = story.revisions[-1]
+    length, sigma, level = r.size_m.tolist(), r.sigma.tolist(), r.level.tolist()
+    rms = np.sqrt(np.bincount(story.row, r.size_m**2) / np.bincount(story.row)).tolist()
+    degrees = np.rad2deg(story.q[story.first]).tolist()
+    order = np.argsort(story.row, kind="stable")
+    ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
+    out = []
+    for k, rows in enumerate(np.split(order, ends[:-1])):
+        cells = (
+            (
+                story.load_names[i],
+                numbers.length(length[i]),
+                f"{sigma[i]:.1f}",
+                LEVEL_NAMES[level[i]],
+            )
+            for i in rows[:_POSE_LOADS].tolist()
+        )
+        card: list[Block] = [
+            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(rms[k])} rms"),
+            f"With the model of revision {r.revision}: {r.name}.",
+            table("load", "residual", "in σ", "", rows=cells, left=(0, 3)),
+            f"Joints {', '.join(f'{a:.1f}' for a in degrees[k])} deg.",
+        ]
+        out.append(style.markdown(card))
+    return out
+
+
+def revisions(story: Story, upto: int) -> str:
+    """Return the table of revisions up to one of them: errors falling, step by step."""
+    rows = [r.cells for r in story.revisions if r.revision <= upto and r.cells]
+    floor = f"Noise alone would leave {numbers.length(story.noise_floor_m)} rms."
+    return style.markdown([table(*REVISION_HEADS, rows=rows, left=(0, 1, 7)), floor])
+
+
+def log_line(story: Story, r: StoryRevision) -> str:
+    """Return a revision in one line."""
+    return style.safe(
+        f"revision {r.revision} ({r.name}): {numbers.length(r.error.rms_m)} rms, "
+        f"poses left out {numbers.length(r.holdout.rms_m)}, "
+        f"noise {numbers.length(story.noise_floor_m)}: {r.verdict.replace('_', ' ')}"
+    )
+
+
+GUIDE = """### How to read this
+**Timelines** (bottom left): *revision* goes through the models, the first one first: drag the
+slider, or press Space to play. *pose* moves the arm through all poses, with the last model; the
+bright ball is the present pose.
+
+**Residuals** (3-D): each green ball is where noise alone would leave 99 % of the readings.
+An arrow that leaves its ball = the model is wrong there. Grey: noise. Amber: beyond 99 %.
+Red: beyond 99.99 %. The arm stands in the pose of the worst reading; a dotted line leads from it
+to its label and is no residual.
+
+**Deflection** (3-D): blue is measured, white is predicted, both enlarged; one pair per pose, of
+its largest deflection. The line between their tips is what the model misses. Where only blue is
+seen, the model is right.
+
+**Worst reading of each pose**: the length of its residual in σ of its own noise. The tallest bar
+is the worst reading; the order in µm can be another, where some readings are noisier.
+
+**Error of each revision**: rms over fitted poses, over poses left out, and the longest residual
+in µm, against the noise. Left-out error far above the fitted one = too many parameters.
+
+**What the residual follows**: its mean over the leading suspect, or, where that explains little of
+it, over the recorded variable that carries most of it; *Details* names both axes.
+"""

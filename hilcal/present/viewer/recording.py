@@ -1,0 +1,129 @@
+"""Recordings of any subject: opened, handed on, written whole; and the viewer that shows them."""
+
+import contextlib
+import hashlib
+import logging
+import shutil
+import socket
+import subprocess
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from hilcal.errors import HilcalError, InputError
+from hilcal.whole_file import replace_file
+
+APPLICATION = "hilcal"
+_FLUSH_TIMEOUT = 10.0
+_LOG = logging.getLogger(__name__)
+Sink = rr.FileSink | rr.GrpcServerSink
+
+
+def bind(ip: str, port: int) -> None:
+    """Bind a port and let it go; the server itself would only log that it is taken.
+
+    Raises:
+        OSError: it is taken, or not allowed.
+        OverflowError: no port has this number.
+    """
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        probe.bind((ip, port))
+
+
+def free(ip: str, port: int) -> bool:
+    """Return whether a port can be bound."""
+    try:
+        bind(ip, port)
+    except (OSError, OverflowError):
+        return False
+    return True
+
+
+def opened(*content: object) -> rr.RecordingStream:
+    """Return a stream that is equal for equal content, values or arrays: it names the recording."""
+    sha = hashlib.sha256()
+    for part in content:
+        array = isinstance(part, np.ndarray)
+        sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
+    rec = rr.RecordingStream(
+        APPLICATION,
+        recording_id=str(uuid.UUID(bytes=sha.digest()[:16])),
+        send_properties=False,
+        # Chunks end where the stream is flushed, not when a clock ticks: equal files.
+        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+    )
+    rec.set_log_time_enabled(False)
+    rec.set_log_tick_enabled(False)
+    return rec
+
+
+def require_folder(path: Path) -> None:
+    """Refuse a file in a folder that is not there.
+
+    Raises:
+        InputError: names the folder.
+    """
+    if not path.parent.is_dir():
+        raise InputError(f"recording {path}: no folder {path.parent}; make it first")
+
+
+def write(
+    rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
+) -> None:
+    """Write what is told to a stream as a file, and close the stream.
+
+    The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    memory = rec.memory_recording()
+    rec.send_blueprint(blueprint, make_active=True, make_default=True)
+    tell()
+    try:
+        replace_file(path, memory.drain_as_bytes())
+    finally:
+        rec.disconnect()
+
+
+def flush(rec: rr.RecordingStream) -> None:
+    """Hand everything logged so far to the sinks; a slow viewer only costs the time-out.
+
+    Raises:
+        HilcalError: a sink has failed: a full disk shows only here.
+    """
+    try:
+        rec.flush(timeout_sec=_FLUSH_TIMEOUT)
+    except (ValueError, RuntimeError, OSError) as error:
+        if "timeout" in str(error).lower() or "timed out" in str(error).lower():
+            _LOG.warning("recording: a viewer is slow: %s", error)
+            return
+        raise HilcalError(f"the recording's sink failed: {error}") from error
+
+
+def disable_analytics() -> None:
+    """Switch the viewer's usage statistics off for this user; they are on by default."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError, HilcalError):
+        subprocess.run(  # noqa: S603 (our own arguments)
+            [executable(), "analytics", "disable"],
+            check=False,
+            capture_output=True,
+            timeout=10,
+        )
+
+
+def executable() -> str:
+    """Return the path of the rerun viewer that was installed with its SDK."""
+    try:
+        import rerun_cli  # type: ignore[import-untyped, unused-ignore]
+    except ImportError:
+        found = shutil.which("rerun")
+        if found is None:
+            raise HilcalError("no rerun viewer: install rerun-sdk") from None
+        return found
+    return str(Path(str(rerun_cli.__file__)).parent / "rerun")
