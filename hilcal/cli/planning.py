@@ -55,8 +55,10 @@ from hilcal.present.progress import Say, working
 from hilcal.present.running import check_report
 from hilcal.procedure.next_plan import doubt_to_settle, next_plan
 from hilcal.procedure.separate import Doubt, without
+from hilcal.procedure.shared import reference_in
 from hilcal.store.plan import Plan, load_plan
 from hilcal.tables.write import plan_csv
+from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 
@@ -132,9 +134,13 @@ def plan(
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
     with working(t.progress) as say:
-        known = None if after is None else _known(t, after, revision, catalogue, say)
+        known, reference = None, None
+        if after is not None:
+            known, reference = _known(t, after, revision, catalogue, say)
         rng = np.random.default_rng(check_seed(seed))
-        chosen = make(numbers, config, wanted, rng, known, say, catalogue, carried)
+        chosen = make(
+            numbers, config, wanted, rng, known, say, catalogue, carried, reference=reference
+        )
         plan_ = replace(chosen.ordered.plan, about=about(chosen))
         summary = summarise(chosen, config, rng, say, compare=not quick, curve=not quick)
         say("checking every motion in a dry run")
@@ -156,10 +162,12 @@ def _criterion(name: str | None) -> str | None:
     return name
 
 
-def _known(t: Terminal, path: Path, revision: int | None, catalogue: Catalogue, say: Say) -> Fit:
-    """Return the fit of a campaign that is in use."""
+def _known(
+    t: Terminal, path: Path, revision: int | None, catalogue: Catalogue, say: Say
+) -> tuple[Fit, Floats | None]:
+    """Return the fit of a campaign that is in use, and the joints of its reference pose."""
     with Campaign.open(path, catalogue, read_only=True) as run:
-        return fit_of(t, run, say, revision)[1]
+        return fit_of(t, run, say, revision)[1], reference_in(run.file)
 
 
 def check(

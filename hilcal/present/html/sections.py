@@ -9,6 +9,7 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
+from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.present.campaign import info_report
 from hilcal.present.charts.comparisons import error_per_revision
@@ -18,6 +19,7 @@ from hilcal.present.charts.evidence import (
     curve_chart,
     noise_check,
 )
+from hilcal.present.charts.made_of import made_of
 from hilcal.present.charts.readings import (
     measured_predicted,
     residual_by_joint,
@@ -179,6 +181,8 @@ def _parameters(m: ReportContent) -> Section:
     for part in captioned(parameters(fit, MOST_PARAMETERS, more), "Parameters"):
         parts += _halves(part) if isinstance(part, Table) else (part,)
     parts += background_line(fit)
+    if sizes := family_sizes(fit):
+        parts.append(Chart("What this arm is made of", made_of(sizes), wide=True, height=0))
     return Section("parameters", "Parameters", tuple(parts))
 
 

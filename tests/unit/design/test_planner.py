@@ -21,7 +21,9 @@ from hilcal.design.summary import remarks, summarise
 from hilcal.measuring.dry_run import dry_run
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.appended import with_new_names
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints
 from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned, refused, rehearsal, run
@@ -236,6 +238,24 @@ def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
         assert on["predicted_std"][name] < alone["predicted_std"][name]
         assert on["predicted_std"][name] < std[name]
     assert any("planned on from" in words for words in on["remarks"])
+
+
+def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    """What is appended is measured from there: its ways are checked from there."""
+    measured, run = planned(small(), seed=7).ordered.plan, tmp_path / "run.hilcal"
+    cell, further = cell_file(tmp_path, small()), tmp_path / "p.json"
+    with CampaignFile.create(
+        run, small().to_json(), str(tmp_path), "a test", more={PLAN: measured.to_json()}
+    ) as campaign:
+        campaign.append_readings(rehearsal("nothing").readings)
+    ok(capsys, "identify", run)
+    arguments = ("plan", cell, "-o", further, "--poses", "3", "--quick")
+    ok(capsys, *arguments)
+    assert not np.allclose(load_plan(further).joints(REFERENCE), measured.joints(REFERENCE))
+    ok(capsys, *arguments, "--after", run)
+    assert np.array_equal(load_plan(further).joints(REFERENCE), measured.joints(REFERENCE))
 
 
 @pytest.mark.parametrize(

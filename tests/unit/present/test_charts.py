@@ -10,6 +10,7 @@ from hilcal import numbers
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
+from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.charts import style
 from hilcal.present.charts.comparisons import error_per_revision
@@ -21,6 +22,7 @@ from hilcal.present.charts.evidence import (
     noise_check,
     parameter_correlations,
 )
+from hilcal.present.charts.made_of import MOST, made_of
 from hilcal.present.charts.readings import (
     LONGEST,
     drawn,
@@ -236,3 +238,21 @@ def test_a_scheme_changes_the_look_and_nothing_else():
     assert dark.layout.template.layout.font.color != figure.layout.template.layout.font.color
     assert dark.data == figure.data
     assert style.says(dark) == style.says(figure)
+
+
+def test_the_sizes_of_families_are_drawn_by_those_of_an_ordinary_arm_with_their_intervals():
+    sizes = [
+        FamilySize(f"f{k}", f"f{k}", k == 0, 2.0, 1.0, 6.0, 4.0, "rad", 1e-3 / (k + 1))
+        for k in range(MOST + 3)
+    ]
+    figure = made_of(sizes)
+    named, other = figure.data
+    assert list(named.y) == ["f0"]
+    assert list(other.y) == [s.name for s in sizes[1:MOST]]
+    for trace in figure.data:
+        np.testing.assert_allclose(trace.x, 0.5)
+        np.testing.assert_allclose(trace.x + trace.error_x.array, 1.5)
+        np.testing.assert_allclose(trace.x - trace.error_x.arrayminus, 0.25)
+    assert figure.layout.yaxis.categoryarray[-1] == "f0"  # on top
+    assert "f0 moves the target most, by 1.00 mm rms" in style.says(figure)
+    assert f"The {MOST} of {MOST + 3} families" in style.says(figure)
