@@ -17,7 +17,7 @@ from hilcal.config.joints import Conventions
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.conventions import may_follow, with_conventions
+from hilcal.robot.conventions import as_counted, may_follow, with_conventions
 from hilcal.types import Bools, Floats
 
 SHIFTS = (1, -1, 2, -2)
@@ -41,6 +41,7 @@ class Described:
         base_unknown: whether the base is estimated.
         target_unknown: whether the targets are.
         shift: by how many rows the joint values come after the positions that they belong to.
+        conventions: how the controller counts the joints of any arm; None as drawn.
     """
 
     arm: Arm
@@ -50,6 +51,7 @@ class Described:
     base_unknown: bool
     target_unknown: bool
     shift: int = 0
+    conventions: Conventions | None = None
 
     @property
     def paired(self) -> Bools:
@@ -142,6 +144,11 @@ def _recounted(d: Described, h: Hypothesis) -> Described:
     return replace(d, arm=with_conventions(d.arm, sign, offset, coupling))
 
 
+def _another(d: Described, h: Hypothesis) -> Described:
+    arm = load_arm(h.arm)
+    return replace(d, arm=arm if d.conventions is None else as_counted(arm, d.conventions))
+
+
 def _mapped(name: str, by: Callable[[Any], Any]) -> Callable[[Described, Hypothesis], Described]:
     """Return what maps one attribute of the description, where there is one."""
 
@@ -194,7 +201,7 @@ def _columns_words(h: Hypothesis) -> str:
 
 KINDS: dict[str, Kind] = {
     "arm": Kind(
-        lambda d, h: replace(d, arm=load_arm(h.arm)),
+        _another,
         lambda h: f"the arm is another one, {h.arm}",
         "",
     ),

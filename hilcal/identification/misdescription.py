@@ -275,6 +275,7 @@ class _Search:
             readings.value[:, 3:] if readings.m == 6 else None,
             not cell.registration_known,
             not all(cell.known_targets),
+            conventions=None if cell.config is None else cell.config.robot,
         )
         self._few = np.unique(np.linspace(0, len(readings) - 1, ROWS).astype(int))
         flange = evaluate(cell.arm, self._whole.q).position[-1]

@@ -5,13 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilcal.cell import cell_from_config
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.hypotheses import Described, Hypothesis
 from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.conventions import as_counted
 from studies.random_descriptions import draw, judge, read
 from studies.random_descriptions import readings_of as table_of
+from tests.support.campaigns import configuration
 from tests.unit.identification.test_registration import BASE, CELL, OFFSET, pose_of, told
 
 
@@ -129,3 +133,20 @@ def test_random_arms_register_or_are_refused_for_the_right_reason(seed):
     outcome, _ = judge(draw(np.random.default_rng(seed)))
     assert outcome.right
     assert outcome.named is not False
+
+
+def test_another_arm_counts_its_joints_as_the_cell_says() -> None:
+    """The controller's signs are the cell's, whatever arm it is."""
+    config = configuration()
+    robot = config.robot.model_copy(update={"joint_sign": (1, 1, -1, 1, 1, 1)})
+    config = config.model_copy(update={"robot": robot})
+    cell = replace(cell_from_config(config), registration_known=False, target_known=False)
+    q = np.random.default_rng(2).uniform(-2, 2, (40, 6))
+    arm = as_counted(load_arm("ur5e"), robot)
+    value = read(arm, q, BASE, pose_of(np.eye(3), OFFSET), 3)
+    value = value + 5e-5 * np.random.default_rng(3).normal(size=value.shape)
+    of = table_of(q, value, np.full(3, 5e-5))
+    finding, _ = found_in(of, cell)
+    words = finding.words(cell, of)
+    assert "the arm is another one, ur5e" in words
+    assert "turns the other way" not in words
