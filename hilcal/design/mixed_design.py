@@ -43,8 +43,8 @@ from hilcal.mixed.families import families_of
 from hilcal.types import Bools, Floats, Ints
 
 DIRECTIONS = 150
-"""Most directions Q. A choice: of a UR10 the others together move a position by half of the noise,
-half of it waves of the gears that 60 poses do not tell."""
+"""Most directions Q. A choice: at the poses of a real UR10 (920 parameters) the others together
+move a reading by 0.5 of its noise (rms)."""
 SAMPLE = 300
 """Candidate poses by which they are found. A choice."""
 LEAST = 1e-3
@@ -83,17 +83,17 @@ def mixed_design(of: Problem, config: CellConfig, work: PredictionPoses) -> Mixe
     own = np.where(np.isinf(prior_std), of.scale[: len(prior_std)], prior_std)
     scale = np.concatenate([own, std])
     known = information_of(nominal, more, scale) + np.diag(~flat)
-    every = _Every(of, config, more, scale)
-    turned = _turned(known, flat, every)
-    count = int(flat.sum()) + turned.random.shape[1]
+    every = _AllColumns(of, config, more, scale)
+    coordinates = _coordinates(known, flat, every)
+    count = int(flat.sum()) + coordinates.random.shape[1]
     rows = np.zeros((*of.units.rows.shape[:2], count))
     for place, some in every.rows(of.candidates):
-        rows[place, : some.shape[1]] = turned.whitened(some)
-    v = turned.columns(position_derivative(nominal, work, more, scale)).reshape(-1, count)
+        rows[place, : some.shape[1]] = coordinates.whitened(some)
+    v = coordinates.columns(position_derivative(nominal, work, more, scale)).reshape(-1, count)
     prior = np.eye(count)
-    prior[: turned.flat.shape[1], : turned.flat.shape[1]] = turned.prior
+    prior[: coordinates.flat.shape[1], : coordinates.flat.shape[1]] = coordinates.prior
     names = [t.name for t, free in zip(of.terms, flat, strict=False) if free]
-    names += [f"direction {k}" for k in range(1, turned.random.shape[1] + 1)]
+    names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
     return MixedDesign(CandidateSet(rows, of.units.cost), prior, c, tuple(names))
 
@@ -137,7 +137,7 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Every:
+class _AllColumns:
     """The units of a problem with the columns of all effects."""
 
     of: Problem
@@ -169,7 +169,7 @@ class _Every:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Turned:
+class _Coordinates:
     """The change of coordinates.
 
     Attributes:
@@ -197,7 +197,7 @@ class _Turned:
         return np.asarray(np.linalg.solve(low, np.concatenate([rows @ self.flat, kept], axis=-1)))
 
 
-def _turned(known: Floats, flat: Bools, every: _Every) -> _Turned:
+def _coordinates(known: Floats, flat: Bools, every: _AllColumns) -> _Coordinates:
     """Complete the square, and find the directions that move the units most."""
     size, free = len(known), np.flatnonzero(flat)
     held = np.flatnonzero(~flat)
@@ -218,4 +218,4 @@ def _turned(known: Floats, flat: Bools, every: _Every) -> _Turned:
     values, vectors = np.linalg.eigh(gram / max(elements, 1))
     kept = np.flatnonzero(values > LEAST**2)[-DIRECTIONS:]
     prior = known[np.ix_(free, free)] - g @ lifted
-    return _Turned(columns, root @ vectors[:, kept], root, (prior + prior.T) / 2)
+    return _Coordinates(columns, root @ vectors[:, kept], root, (prior + prior.T) / 2)
