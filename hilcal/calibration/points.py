@@ -1,10 +1,10 @@
 """Points to put the tool at, as a table states them.
 
-One row per point, with a header; separator and decimal mark are those that the file has. A table
-of readings as `import` takes it, of the exchange format or by a mapping, is a table of points too:
-what is not listed here (covariances, cycles, actual joints, columns `x_…`) is passed over. Where no
-column has a name of ours, a mapping is guessed as `import --preview` does, and taken where nothing
-in it is unsure.
+One row per point, with a header; kind of file, separator and decimal mark are what `import` takes.
+A table of readings, of the exchange format or by a mapping, is a table of points too: what is not
+listed here (covariances, cycles, actual joints, columns `x_…`) is passed over. Where no column has
+a name of ours, a mapping is guessed as `import --preview` does, and taken where nothing in it is
+unsure.
 
 - `pose`: its name; numbered without.
 - `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
@@ -28,7 +28,6 @@ from hilcal import limits
 from hilcal.calibration.compensation import Pose, invert
 from hilcal.errors import InputError
 from hilcal.names import quoted
-from hilcal.readings.covariance import TrackerNoise
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
@@ -41,14 +40,16 @@ from hilcal.tables.columns import (
     joint_columns,
     known_columns,
     temperature_columns,
+    with_following,
 )
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import Table
-from hilcal.tables.guessing.propose import propose
+from hilcal.tables.guessing.proposal import GUESSED
+from hilcal.tables.guessing.propose import Proposed, propose
 from hilcal.tables.guessing.sniff import sniff
-from hilcal.tables.mapped import import_mapped
-from hilcal.tables.mapping import FileFormat
-from hilcal.tables.mapping import Mapping as TableMapping
+from hilcal.tables.mapped import mapped_table
+from hilcal.tables.mapping import FileFormat, PointMapping
+from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats, Ints
 
 NO_LOAD = "none"
@@ -60,6 +61,8 @@ STARTS = 300
 """Joint values from which all branches are sought; a choice: an arm of six joints has up to 16."""
 BEYOND = 1e3
 """rad; what a solution beyond the joints' limits counts farther than any within."""
+LEAST_REACH, LONGEST_TOOL = 0.05, 0.5
+"""Share of the arm's reach, and m beyond it, between which the farthest point is; choices."""
 LARGEST = 4.0 * np.pi
 """rad; a choice, twice what the joints of most arms turn: degrees in a column of rad are beyond."""
 
@@ -93,12 +96,12 @@ class _OtherNamesError(InputError):
 
 
 def read_points(
-    path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMapping | None = None
+    path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: PointMapping | None = None
 ) -> Points:
     """Read a table of points.
 
     Args:
-        path: a CSV file; with a mapping, any table that `import` reads by it.
+        path: any kind of table that `import` reads.
         arm: the arm.
         loads: (6,) wrench by the name of the load.
         mapping: what its columns hold, where they are not called as above.
@@ -106,22 +109,13 @@ def read_points(
     Raises:
         InputError: no such file, an unknown column, an incomplete group, an unknown load.
     """
-    if mapping is not None:
-        return _mapped(path, arm, loads, mapping)
+    table, taken = (None, "") if mapping is not None else _plain(path, arm)
+    if table is None:
+        if mapping is None:
+            mapping, taken = _guessed(path, arm)
+        table = _mapped(path, arm, mapping)
     groups = _groups(arm.n)
-    chosen: list[Sequence[str]] = []
-    header: list[str] = []
-
-    def check(given: Sequence[str]) -> None:
-        header.extend(given)
-        chosen.extend(_checked(path, given, groups, arm))
-
-    try:
-        table = Table.of(open_grid(path, _form(path), check), *chosen)
-    except _OtherNamesError as error:
-        mapping, taken = _guessed(path, arm, error)
-        return replace(_mapped(path, arm, loads, mapping), taken=taken)
-    found = {key: table.matrix(names) for key, names in groups.items() if names[0] in header}
+    found = {k: table.matrix(names) for k, names in groups.items() if names[0] in table.number}
     q = found.pop("q_rad", None)
     if "q_deg" in found:
         q = np.radians(found.pop("q_deg"))
@@ -145,7 +139,21 @@ def read_points(
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
     recorded = {k: v if v.shape[1] > 1 else v[:, 0] for k, v in found.items()}
-    return Points(names, q, wanted, wrench, sensed, recorded)
+    return Points(names, q, wanted, wrench, sensed, recorded, taken)
+
+
+def _plain(path: Path, arm: Arm) -> tuple[Table | None, str]:
+    """Return a table whose columns are called as above; None where none of them is."""
+    groups = _groups(arm.n)
+    chosen: list[Sequence[str]] = []
+
+    def check(given: Sequence[str]) -> None:
+        chosen.extend(_checked(path, given, groups, arm))
+
+    try:
+        return Table.of(open_grid(path, _form(path), check), *chosen), ""
+    except _OtherNamesError:
+        return None, ""
 
 
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
@@ -241,49 +249,58 @@ def _form(path: Path) -> FileFormat:
     return FileFormat(**{key: how[key] for key in ("separator", "decimal") if key in how})
 
 
-def _guessed(path: Path, arm: Arm, unknown: InputError) -> tuple[TableMapping, str]:
+def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
     """Return what the columns of a table seem to hold, and that in words.
 
     Raises:
-        InputError: something is missing, unsure or not understood; says so after `unknown`.
+        InputError: something is missing, unsure or not understood.
     """
-    found = propose(path, joints=arm.n).proposal
+    of = propose(path, joints=arm.n)
+    found = of.proposal
     understood = [
         f"{u.what} = {', '.join(u.columns)}" + f" ({u.meaning})" * bool(u.meaning)
         for u in found.understood
     ]
     # names of loads are compared with those of the campaign, and poses need none
-    unsure = [u for u in found.unsure if u[0] not in ("pose", "load")]
-    doubts = [*found.lacking, *(f"{about}: {words}" for about, words in unsure)]
+    passed = ["pose", "load", *["position"] * _certain_unit(of, arm)]
+    doubts = [
+        f"{about}: {'no convention stated' if words == GUESSED else words}"
+        for about, words in found.unsure
+        if about not in passed
+    ]
     doubts += [f"{name} is not understood" for name, _ in found.unused]
+    if not {"joints", "position"} & found.sections.keys():
+        doubts = found.lacking
     if doubts:
         raise InputError(
-            f"{unknown}; what they hold cannot be told ({'; '.join(doubts)}): write it down, "
-            f"starting from hilcal import {quoted(path)} --preview"
+            f"{path}: columns other than of a table of points, and what they hold cannot be told: "
+            f"{'; '.join(doubts)}. Write it down: hilcal import {quoted(path)} --preview -o "
+            "M.toml, correct M.toml, and give --format M.toml; or use the columns pose, load, "
+            f"q1_rad … q{arm.n}_rad or q1_deg …, x_m, y_m, z_m or x_mm …, rx_rad, ry_rad, rz_rad "
+            "or rx_deg …"
         )
-    return found.mapping(), f"taken, in base axes: {'; '.join(understood)}"
+    return found.mapping(PointMapping), f"taken, in base axes: {'; '.join(understood)}"
 
 
-def _mapped(path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: TableMapping) -> Points:
-    """Return the states of a table of readings as points, their positions in base axes."""
-    # the noise weighs nothing here
-    r = import_mapped(path, mapping, arm, TrackerNoise(1e-5, 0.0, 1e-5, 0.0, 1e-4)).readings
-    s = r.states
-    wrench = s.wrench.copy()
-    for k, load in enumerate(r.load_names):
-        if load == NO_LOAD or s.wrench[r.load == k].any():
-            continue
-        if load not in loads:
-            valid = ", ".join((NO_LOAD, *loads))
-            raise InputError(f"{path}: unknown load {load!r}; valid: {valid}")
-        wrench[r.load == k] = loads[load]
-    found = {"position_m": r.value[:, :3]}
-    if r.m == 6:
-        found["rotation_rad"] = r.value[:, 3:]
-    names = tuple(
-        f"{r.pose_names[p]} {r.load_names[k]}" for p, k in zip(r.pose, r.load, strict=True)
-    )
-    return Points(names, s.q, _poses(found, s.q, arm), wrench)
+def _certain_unit(of: Proposed, arm: Arm) -> bool:
+    """Whether positions in the guessed unit are where the arm reaches, and in others are not."""
+    section = of.proposal.sections.get("position")
+    if section is None or section["unit"] not in ("m", "mm"):
+        return False
+    position = np.stack([of.grid.numbers(c) for c in section["columns"][:3]], axis=1)
+    far = float(np.nanmax(np.linalg.norm(position, axis=1))) * LENGTHS[section["unit"]]
+    return LEAST_REACH * arm.reach < far < arm.reach + LONGEST_TOOL
+
+
+def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> Table:
+    """Return a table by its mapping, with the columns of above."""
+    of = mapped_table(path, mapping, arm)
+    table = with_following(of.table, arm)
+    text = {"pose": table.text["pose"]}
+    if mapping.load is not None:
+        text["load"] = table.text["load"]
+        text["pose"] = [f"{p} {k}" for p, k in zip(text["pose"], text["load"], strict=True)]
+    return replace(table, text=text)
 
 
 def _groups(n: int) -> dict[str, tuple[str, ...]]:
@@ -319,9 +336,10 @@ def _checked(
     ours = {*known, *exchanged} - {"pose", "load", "target"}
     for name in header:
         if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):
+            if not ours & set(header):
+                raise _OtherNamesError(f"{path}: no column of a table of points")
             valid = ", ".join(("pose", "load", *known))
-            kind = InputError if ours & set(header) else _OtherNamesError
-            raise kind(
+            raise InputError(
                 f"{path}: unknown column '{name}'; valid: {valid}, columns of the exchange table, "
                 "and x_…; other tables: --format MAPPING, as for import"
             )

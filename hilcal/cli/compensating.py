@@ -44,7 +44,7 @@ from hilcal.present.calibration import (
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.tables.columns import joint_columns
-from hilcal.tables.mapping import find_mapping
+from hilcal.tables.mapping import PointMapping, find_mapping
 from hilcal.types import Bools, Floats
 from hilcal.whole_file import replace_file
 
@@ -76,7 +76,7 @@ def compensate(
         Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
     ],
     points: Annotated[
-        Path, argument("POINTS", "Where to go: a table (CSV) or a UR program (.script).")
+        Path, argument("POINTS", "Where to go: a table (CSV, XLSX …) or a UR program (.script).")
     ],
     output: Annotated[
         list[Path] | None, option("-o --output F", "Write CSV, JSON or a UR program; repeatable.")
@@ -211,12 +211,7 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, k
         return _Task(points, given if own is None else own, program, every)
     if leave:
         raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
-    mapping = None if kind == "table" else find_mapping(kind)
-    if path.suffix != ".csv" and mapping is None:
-        raise InputError(
-            f"{path}: valid: a table .csv, a UR program {' or '.join(PROGRAMS)}, or any table with "
-            "--format MAPPING"
-        )
+    mapping = None if kind == "table" else find_mapping(kind, PointMapping)
     return _Task(read_points(path, arm, calibration.loads, mapping), given)
 
 

@@ -231,7 +231,7 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
     if found.proposal.lacking:
         return []
     try:
-        result = import_readings(table, found.proposal.mapping(), settings, cell.arm)
+        result = import_readings(table, found.proposal.mapping(Mapping), settings, cell.arm)
     except InputError as error:
         return [f"refused: {error}"]
     readings = result.readings

@@ -20,7 +20,7 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.tables import matfile
 from hilcal.tables.grid import Cell, Check, Grid, joined, unique
-from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.tables.text import grid_of_rows, read_text
 from hilcal.toml import suggest
 
@@ -39,7 +39,9 @@ REFUSED = {
 """First bytes of files that are not read, and what they are."""
 
 
-def open_tables(path: str | Path, mapping: Mapping, second: Path | None = None) -> tuple[Grid, int]:
+def open_tables(
+    path: str | Path, mapping: PointMapping, second: Path | None = None
+) -> tuple[Grid, int]:
     """Open the file or the two files that a mapping is for, as one table.
 
     Args:

@@ -76,7 +76,7 @@ def _mapping(form: str | Path) -> Mapping | None:
             f"--format {form} is unknown{suggest(str(form), names)}; valid: {', '.join(names)}, "
             f"or the path of a mapping file (.toml)"
         )
-    return find_mapping(form)
+    return find_mapping(form, Mapping)
 
 
 def _named_loads(readings: Readings, config: CellConfig) -> tuple[Readings, tuple[str, ...]]:

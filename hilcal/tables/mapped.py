@@ -1,9 +1,10 @@
 """Readings from a table of any kind, by a mapping that says what its columns hold."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Generic
 
 import numpy as np
 
@@ -16,7 +17,19 @@ from hilcal.tables import columns, units
 from hilcal.tables.columns import own_columns
 from hilcal.tables.files import open_tables
 from hilcal.tables.grid import Cell, Grid, Table
-from hilcal.tables.mapping import Column, Joints, Mapping, Name, Position, Std, Time
+from hilcal.tables.mapping import (
+    Column,
+    Joints,
+    M,
+    Mapping,
+    Name,
+    Orientation,
+    PointMapping,
+    PoseName,
+    Position,
+    Std,
+    Time,
+)
 from hilcal.tables.orientation import defect, rotations
 from hilcal.tables.table import ImportResult, readings_of
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
@@ -42,6 +55,8 @@ REPEATS_TO = 4e-4
 A choice."""
 TOOL = 0.5
 """m; the longest tool, beside the arm's reach a lever of its joints; a choice."""
+GRAVITY = (0.0, 0.0, -9.80665)
+"""m/s², base axes, of an arm that stands upright."""
 EPOCH = 1e8
 """s; times beyond three years are counted from an epoch, not from the campaign's start."""
 TARGET = "target of [position]"
@@ -53,13 +68,83 @@ _EXPECTED = {
 _LISTED = 8
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class MappedTable(Generic[M]):
+    """The rows of a table by their mapping, without what tells noise.
+
+    Attributes:
+        table: columns of the exchange table, SI.
+        grid: the rows as the file has them.
+        mapping: as it is used.
+        raw: (N,) number columns by the file's names, in its units.
+        angles: (N, k) numbers of the orientation, in the file's unit; None without.
+        notes: one sentence for each decision.
+    """
+
+    table: Table
+    grid: Grid
+    mapping: M
+    raw: dict[str, Floats]
+    angles: Floats | None
+    notes: list[str]
+
+
+def mapped_table(
+    path: str | Path,
+    mapping: M,
+    arm: Arm,
+    gravity: Sequence[float] = GRAVITY,
+    second: Path | None = None,
+) -> MappedTable[M]:
+    """Read the states of a table, or of two tables, by a mapping; arguments as below."""
+    grid, lost = open_tables(path, mapping, second)
+    notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
+    grid, mapping = one_target_per_row(grid, mapping)
+    if mapping.air is not None and mapping.air.optional and mapping.air.column not in grid.names:
+        notes.append(f"no air temperature: the file has no column {mapping.air.column}")
+        mapping = mapping.model_copy(update={"air": None})
+    raw, joints, side = _raw(grid, mapping, arm), mapping.joints, None
+    if mapping.approach is not None and mapping.approach.by_order and joints is not None:
+        side = approach_by_order(units.ANGLES[joints.unit] * _block(raw, grid, joints.columns))
+        notes.append(
+            f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
+            "last side, the first row counts as +1"
+        )
+    nowhere = _nowhere(grid, mapping.position, raw)
+    keep, left_out = _complete(grid, raw)
+    notes += left_out + nowhere
+    grid = grid.rows_with(keep)
+    raw = {column: values[keep] for column, values in raw.items()}
+    table = Table(grid.path, grid.rows, {}, {})
+    for names, named, convert in _quantities(mapping, arm):
+        for name, column in zip(names, named, strict=True):
+            _put(table, grid, name, column, convert(raw[grid.name(column)]))
+    if side is not None:
+        table.number.update(zip(columns.approach_columns(arm.n), side[keep].T, strict=True))
+    angles = _rotations(grid, mapping.orientation, raw, table)
+    for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
+        if time is not None:
+            _put(table, grid, name, time.column, seconds(grid, time))
+    wrench = _wrench(grid, mapping, np.asarray(gravity), table)
+    table.text["load"] = _loads(grid, mapping, wrench)
+    q = None
+    if joints is not None:
+        q = units.ANGLES[joints.unit] * _block(raw, grid, joints.columns)
+    table.text["pose"] = _poses(grid, mapping.pose, q)
+    if joints is not None and q is not None and joints.reported:
+        _as_commanded(table, q, arm)
+    if mapping.target is not None:
+        table.text["target"] = grid.text(mapping.target.column)
+    return MappedTable(table, grid, mapping, raw, angles, notes)
+
+
 def import_mapped(
     path: str | Path,
     mapping: Mapping,
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
-    gravity: Sequence[float] = (0.0, 0.0, -9.80665),
+    gravity: Sequence[float] = GRAVITY,
     second: Path | None = None,
     targets: Sequence[str] = (),
 ) -> ImportResult:
@@ -82,49 +167,14 @@ def import_mapped(
     Raises:
         InputError: anything that cannot be right, by file, row and column.
     """
-    grid, lost = open_tables(path, mapping, second)
-    notes = [f"{lost} rows left out: they have no partner in the second file"] * bool(lost)
-    grid, mapping = one_target_per_row(grid, mapping)
-    if mapping.air is not None and mapping.air.optional and mapping.air.column not in grid.names:
-        notes.append(f"no air temperature: the file has no column {mapping.air.column}")
-        mapping = mapping.model_copy(update={"air": None})
-    raw = _raw(grid, mapping, arm)
-    side = None
-    if mapping.approach is not None and mapping.approach.by_order:
-        joints = _block(raw, grid, mapping.joints.columns)
-        side = approach_by_order(units.ANGLES[mapping.joints.unit] * joints)
-        notes.append(
-            f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
-            "last side, the first row counts as +1"
-        )
-    nowhere = _nowhere(grid, mapping, raw)
-    keep, left_out = _complete(grid, raw)
-    notes += left_out + nowhere
-    grid = grid.rows_with(keep)
-    raw = {column: values[keep] for column, values in raw.items()}
-    table = Table(grid.path, grid.rows, {}, {})
-    for names, named, convert in _quantities(mapping, arm):
-        for name, column in zip(names, named, strict=True):
-            _put(table, grid, name, column, convert(raw[grid.name(column)]))
-    if side is not None:
-        table.number.update(zip(columns.approach_columns(arm.n), side[keep].T, strict=True))
-    angles = _rotations(grid, mapping, raw, table)
-    for name, time in (("time_s", mapping.time), ("load_time_s", mapping.load_time)):
-        if time is not None:
-            _put(table, grid, name, time.column, seconds(grid, time))
-    q = units.ANGLES[mapping.joints.unit] * _block(raw, grid, mapping.joints.columns)
-    wrench = _wrench(grid, mapping, np.asarray(gravity), table)
-    table.text["load"] = _loads(grid, mapping, wrench)
-    table.text["pose"] = _poses(grid, mapping, q)
-    if mapping.joints.reported:
-        _as_commanded(table, q, arm)
-    if mapping.target is not None:
-        table.text["target"] = grid.text(mapping.target.column)
+    of = mapped_table(path, mapping, arm, gravity, second)
+    mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
+    q = units.ANGLES[mapping.joints.unit] * _block(of.raw, grid, mapping.joints.columns)
     position = table.matrix(columns.POSITION)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
-    covariance, told = mapped_covariance(table, grid, mapping, position, angles, noise, station)
+    covariance, told = mapped_covariance(table, grid, mapping, position, of.angles, noise, station)
     unit = units.LENGTHS[mapping.position.unit]
-    rounding = rounding_variance(_block(raw, grid, mapping.position.columns), unit)
+    rounding = rounding_variance(_block(of.raw, grid, mapping.position.columns), unit)
     result = readings_of(table, arm, noise, station, covariance, targets, rounding)
     readings = result.readings
     if mapping.rows is not None and mapping.rows.plausible_only:
@@ -142,7 +192,7 @@ def import_mapped(
     return ImportResult(readings, tuple(notes))
 
 
-def one_target_per_row(grid: Grid, mapping: Mapping) -> tuple[Grid, Mapping]:
+def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     """Return the table with a row for each target, and the mapping that reads it.
 
     Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
@@ -151,9 +201,10 @@ def one_target_per_row(grid: Grid, mapping: Mapping) -> tuple[Grid, Mapping]:
     Raises:
         InputError: no such column.
     """
-    targets, rows = mapping.position.targets, range(len(grid.rows))
-    if not targets:
+    rows = range(len(grid.rows))
+    if mapping.position is None or not mapping.position.targets:
         return grid, mapping
+    targets = mapping.position.targets
     count = len(targets)
     tall = grid.rows_with(np.repeat(np.arange(len(rows)), count))
     tall = tall.with_column(TARGET, [*targets] * len(rows), 1)
@@ -179,7 +230,7 @@ def _put(table: Table, grid: Grid, name: str, column: Column, values: Floats) ->
 
 
 def _quantities(
-    mapping: Mapping, arm: Arm
+    mapping: PointMapping, arm: Arm
 ) -> Iterator[tuple[Sequence[str], Sequence[Column], Callable[[Floats], Floats]]]:
     """Columns of numbers: names in the exchange table, in the file, and what makes SI of them."""
 
@@ -190,12 +241,12 @@ def _quantities(
         return own_columns(names, len(section.columns), arm)
 
     m = mapping
-    yield columns.POSITION, m.position.columns, times(units.LENGTHS[m.position.unit])
-    names, size = of_joints(m.joints, columns.joint_columns(arm.n)), units.ANGLES[m.joints.unit]
-    yield names, m.joints.columns, times(size)
-    if (s := m.actual_joints) is not None:
-        names = of_joints(s, columns.actual_columns(arm.n))
-        yield names, s.columns, times(units.ANGLES[s.unit])
+    if m.position is not None:
+        yield columns.POSITION, m.position.columns, times(units.LENGTHS[m.position.unit])
+    commanded, reported = columns.joint_columns(arm.n), columns.actual_columns(arm.n)
+    for s, names in ((m.joints, commanded), (m.actual_joints, reported)):
+        if s is not None:
+            yield of_joints(s, names), s.columns, times(units.ANGLES[s.unit])
     if m.cycle is not None:
         yield ("cycle",), (m.cycle.column,), times(1.0)
     if m.approach is not None and m.approach.columns:
@@ -213,7 +264,7 @@ def _celsius(unit: str) -> Callable[[Floats], Floats]:
     return lambda value: (value - 32) / 1.8 if unit == "degF" else value
 
 
-def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
+def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
     """Number columns that a reading cannot do without, by the file's names, in its units."""
     needed: list[Column] = []
     per_joint = ("joints", "actual_joints", "approach", "joint_temperatures")
@@ -232,12 +283,14 @@ def _raw(grid: Grid, mapping: Mapping, arm: Arm) -> dict[str, Floats]:
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
-def _nowhere(grid: Grid, mapping: Mapping, raw: dict[str, Floats]) -> list[str]:
+def _nowhere(grid: Grid, of: Position | None, raw: dict[str, Floats]) -> list[str]:
     """Take positions that instruments write for no measurement for missing.
 
     Exactly 0, 0, 0, and numbers of nines that are a position three times over, as −9999.
     """
-    names = [grid.name(column) for column in mapping.position.columns]
+    if of is None:
+        return []
+    names = [grid.name(column) for column in of.columns]
     position, notes = _block(raw, grid, names), []
     for value in (0.0, *nines(position)):
         bad = np.asarray((position == value).all(axis=1))
@@ -300,9 +353,10 @@ def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Float
     return np.stack([raw[grid.name(name)] for name in names], axis=1)
 
 
-def _rotations(grid: Grid, mapping: Mapping, raw: dict[str, Floats], table: Table) -> Floats | None:
+def _rotations(
+    grid: Grid, o: Orientation | None, raw: dict[str, Floats], table: Table
+) -> Floats | None:
     """Add rotation vectors; returns the orientation's numbers (N, k) in the file's unit."""
-    o = mapping.orientation
     if o is None:
         return None
     angles = _block(raw, grid, o.columns)
@@ -325,7 +379,7 @@ def _rotations(grid: Grid, mapping: Mapping, raw: dict[str, Floats], table: Tabl
     return angles
 
 
-def _wrench(grid: Grid, mapping: Mapping, gravity: Floats, table: Table) -> Floats:
+def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: Table) -> Floats:
     """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
@@ -348,7 +402,7 @@ def _wrench(grid: Grid, mapping: Mapping, gravity: Floats, table: Table) -> Floa
     return wrench
 
 
-def _loads(grid: Grid, mapping: Mapping, wrench: Floats) -> list[str]:
+def _loads(grid: Grid, mapping: PointMapping, wrench: Floats) -> list[str]:
     """Names of the loads: the column's, or by the hung mass, or "load" where a wrench acts."""
     if mapping.load is not None:
         none = {name.lower() for name in (*mapping.load.none, "")}
@@ -374,19 +428,18 @@ def _as_commanded(table: Table, q: Floats, arm: Arm) -> None:
         table.number[name] = q[rows, k]
 
 
-def _poses(grid: Grid, mapping: Mapping, q: Floats) -> list[str]:
+def _poses(grid: Grid, of: PoseName | None, q: Floats | None) -> list[str]:
     """Names of the poses: the column's, or the row where these joints were first commanded."""
-    if mapping.pose is not None and mapping.pose.column is None:
-        return [f"row {row}" for row in grid.rows.tolist()]
-    if mapping.pose is not None and mapping.pose.column is not None:
-        names = grid.text(mapping.pose.column)
+    if of is not None and of.column is not None:
+        names = grid.text(of.column)
         if "" in names:
-            i = names.index("")
             raise InputError(
-                f"{grid.at(i, mapping.pose.column)}: the pose has no name; without "
+                f"{grid.at(names.index(''), of.column)}: the pose has no name; without "
                 f"[pose], rows of the same joints are one pose"
             )
         return names
+    if of is not None or q is None:
+        return [f"row {row}" for row in grid.rows.tolist()]
     keys = np.rint(q / (10 * SAME_POSE)).astype(np.int64)
     first: dict[tuple[int, ...], int] = {}
     out = []

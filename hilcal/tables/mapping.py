@@ -4,7 +4,7 @@ TOML with the sections of `Mapping`; docs/how-to/import-a-table.md explains it.
 """
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import AfterValidator, Field, Strict, model_validator
 
@@ -42,6 +42,8 @@ UNLOADED = tuple(_UNLOADED.split("|"))
 _COLUMN = "the name of a column, or its number from 1"
 _LENGTH = 'a unit of length: "m", "mm", "um" or "in"'
 _ANGLE = 'a unit of angles: "rad", "mrad", "deg" or "arcsec"'
+_POSITION = 'a section [position] with columns = ["x", "y", "z"] and unit = "mm" or so'
+_JOINTS = 'a section [joints] with columns, one per joint, and unit = "deg" or "rad"'
 _OPTIONAL = "true where some files lack it, else false"
 _UNIT_T = '"degC", "degF" or "K"'
 
@@ -356,18 +358,14 @@ class CovarianceColumns(Section):
     angle_unit: Angle = Field("rad", description=_ANGLE)
 
 
-class Mapping(Section):
-    """The whole of a mapping file."""
+class PointMapping(Section):
+    """A mapping file for points to go to: they have joint values, positions, or both."""
 
     file: FileFormat = Field(default_factory=FileFormat, description="a section [file]")
     second_file: SecondFile | None = Field(None, description="a section [second_file]")
-    position: Position = Field(
-        description='a section [position] with columns = ["x", "y", "z"] and unit = "mm" or so'
-    )
+    position: Position | None = Field(None, description=_POSITION)
     orientation: Orientation | None = Field(None, description="a section [orientation]")
-    joints: CommandedJoints = Field(
-        description='a section [joints] with columns, one per joint, and unit = "deg" or "rad"'
-    )
+    joints: CommandedJoints | None = Field(None, description=_JOINTS)
     actual_joints: Joints | None = Field(None, description="a section [actual_joints]")
     pose: PoseName | None = Field(None, description="a section [pose] with column")
     load: LoadName | None = Field(None, description="a section [load] with column")
@@ -389,29 +387,45 @@ class Mapping(Section):
     covariance: CovarianceColumns | None = Field(None, description="a section [covariance]")
 
     @model_validator(mode="after")
-    def _consistent(self) -> "Mapping":
+    def _consistent(self) -> Self:
+        if self.position is None and self.joints is None:
+            raise ValueError("neither [joints] nor [position]: one of them says where a point is")
+        if self.position is None and self.orientation is not None:
+            raise ValueError("[orientation] needs [position]")
         if self.wrench and self.hung_mass:
             raise ValueError("[wrench] together with [hung_mass]; give one of them")
         if self.covariance and (self.std or self.correlation):
             raise ValueError("[covariance] together with [std] or [correlation]; give one of them")
         if self.correlation and (self.std is None or len(self.std.columns) == 1):
             raise ValueError("[correlation] needs [std] with three or six columns")
-        wide = 3 * len(self.position.targets)
+        targets = () if self.position is None else self.position.targets
+        wide = 3 * len(targets)
         figures = 0 if self.std is None else len(self.std.columns or self.std.values)
         six = (figures == 6 and wide != 6) or (
             self.covariance is not None and len(self.covariance.columns) > 9
         )
         if six and self.orientation is None:
             raise ValueError("uncertainties of six elements need [orientation]")
-        if self.joints.reported and (self.pose is None or self.actual_joints is not None):
+        reported = self.joints is not None and self.joints.reported
+        if reported and (self.pose is None or self.actual_joints is not None):
             raise ValueError("[joints] reported = true needs [pose], and no [actual_joints]")
-        if self.position.targets and self.target:
+        if targets and self.target:
             raise ValueError("[target] together with targets in [position]; give one of them")
-        if self.std and len(self.std.columns or self.std.values) > 6 and not self.position.targets:
+        if self.std and len(self.std.columns or self.std.values) > 6 and not targets:
             raise ValueError("[std] has more than 6 figures; it must be 1, 3 or 6")
         if self.load_time and self.load_time.unit not in SECONDS:
             raise ValueError('[load_time] unit must be "s", "ms", "min" or "h"')
         return self
+
+
+class Mapping(PointMapping):
+    """The whole of a mapping file for readings."""
+
+    position: Position = Field(description=_POSITION)
+    joints: CommandedJoints = Field(description=_JOINTS)
+
+
+M = TypeVar("M", bound=PointMapping)
 
 
 def mapping_names() -> tuple[str, ...]:
@@ -419,30 +433,34 @@ def mapping_names() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in (configs_dir() / "mappings").glob("*.toml")))
 
 
-def find_mapping(name: str | Path) -> Mapping:
+def find_mapping(name: str | Path, kind: type[M]) -> M:
     """Load a mapping by the name of one that comes with the program, or by a file's path.
 
     Raises:
         InputError: no such mapping (lists the valid names), or a bad file.
     """
     if str(name) in mapping_names():
-        return load_mapping(configs_dir() / "mappings" / f"{name}.toml")
+        return load_mapping(configs_dir() / "mappings" / f"{name}.toml", kind)
     if Path(name).suffix.lower() != ".toml":
         raise InputError(
             f"format '{name}' is unknown{suggest(str(name), mapping_names())}; valid: "
             f"{', '.join(mapping_names())}, or the path of a mapping file (.toml)"
         )
-    return load_mapping(Path(name))
+    return load_mapping(Path(name), kind)
 
 
-def load_mapping(path: Path) -> Mapping:
+def load_mapping(path: Path, kind: type[M]) -> M:
     """Read a mapping file.
+
+    Args:
+        path: the file.
+        kind: `Mapping` for readings, `PointMapping` for points.
 
     Raises:
         InputError: unreadable file, syntax error (names the line), unknown key (lists the valid
             ones of its section), missing key or bad value.
     """
-    mapping = load_section(path, Mapping)
+    mapping = load_section(path, kind)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping
     second = second.model_copy(update={"path": str(_beside(path, str(second.path)))})

@@ -21,7 +21,7 @@ from hilcal.robot.dh import arm_from_dh
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import load_plan
 from hilcal.tables.importing import import_readings
-from hilcal.tables.mapping import load_mapping
+from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import stored
 from tests.fuzz.bench import CELL, Bench
 from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, toml_damaged, words_damaged
@@ -255,7 +255,7 @@ def parsers() -> list[Parser]:
         _table(bench),
         _points(bench),
         *packed(bench),
-        _toml(bench, "mapping", "mappings", load_mapping),
+        _toml(bench, "mapping", "mappings", lambda p: load_mapping(p, Mapping)),
         _toml(bench, "cell", "cells", hc.Cell.load),
         _toml(bench, "arm", "robots", arm_from_dh),
         _document(

@@ -10,7 +10,7 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.tables.grid import Grid
 from hilcal.tables.guessing.column_names import parse
-from hilcal.tables.mapping import Mapping
+from hilcal.tables.mapping import M
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
@@ -66,13 +66,13 @@ class Proposal:
     open_convention: bool = False
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
 
-    def mapping(self) -> Mapping:
-        """Return the mapping.
+    def mapping(self, kind: type[M]) -> M:
+        """Return the mapping, `Mapping` for readings, `PointMapping` for points.
 
         Raises:
             InputError: it is not complete.
         """
-        return check_section(self.sections, Mapping, "the proposed mapping")
+        return check_section(self.sections, kind, "the proposed mapping")
 
     def to_toml(self, source: str) -> str:
         """Return the mapping file, with what is unsure as comments."""

@@ -1,8 +1,10 @@
 """Points of tables and of UR programs, and the branch that poses are put on."""
 
+import re
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from hilcal.calibration.points import on_branch, read_points
@@ -11,7 +13,8 @@ from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.tables.mapping import find_mapping
+from hilcal.tables.guessing.propose import propose
+from hilcal.tables.mapping import Mapping, PointMapping, find_mapping
 
 ARM = load_arm("ur10e")
 LOADS = {"10kg": np.array([0.0, 0.0, -98.0665, 0.0, 0.0, 0.0])}
@@ -100,13 +103,14 @@ def test_tables_as_import_takes_them(tmp_path: Path) -> None:
         + ";10kg\n"
         for k in range(2)
     )
-    mapped = read_points(written(tmp_path, table, "k.csv"), ARM, LOADS, find_mapping(mapping))
+    of_file = find_mapping(mapping, PointMapping)
+    mapped = read_points(written(tmp_path, table, "k.csv"), ARM, LOADS, of_file)
     np.testing.assert_allclose(on_branch(mapped, ARM, TOOL, None), q, atol=1e-8)
     assert mapped.wrench is not None
     np.testing.assert_array_equal(mapped.wrench[:, 2], [-98.0665, -98.0665])
     lost = written(tmp_path, table.replace("10kg", "9kg"), "l.csv")
     with pytest.raises(InputError, match=r"unknown load '9kg'; valid: none, .*10kg"):
-        read_points(lost, ARM, LOADS, find_mapping(mapping))
+        read_points(lost, ARM, LOADS, of_file)
 
 
 def other_names(header: str) -> str:
@@ -128,11 +132,57 @@ def test_other_names_are_taken_where_nothing_is_unsure(tmp_path: Path) -> None:
     for part in ("joints = J1 [deg], J2 [deg]", "position = X [mm], Y [mm]", "load = Load"):
         assert part in found.taken
     vague = other_names(",".join("abcdefghi"))
-    with pytest.raises(InputError, match=r"unknown column 'a'; .*cannot be told .*--preview"):
+    with pytest.raises(InputError, match=r"cannot be told: .*hilcal import .* --preview -o"):
         read_points(written(tmp_path, vague), ARM, LOADS)
     typed = f"{JOINTS},lod\n0,0,0,0,0,0,10kg\n"  # one of ours that is not
     with pytest.raises(InputError, match="unknown column 'lod'; valid"):
         read_points(written(tmp_path, typed), ARM, LOADS)
+
+
+@pytest.mark.parametrize("far", [False, True])
+def test_a_unit_is_taken_where_the_arm_tells_it(tmp_path: Path, far: bool) -> None:
+    """In m, or in mm of points as near as 50 mm, these would be nowhere that the arm is."""
+    names, points = "X,Y,Z,J1 [deg],J2 [deg],J3 [deg],J4 [deg],J5 [deg],J6 [deg]", poses(Q)
+    rows = np.hstack([1e3 * points[:, :3, 3], np.degrees(Q)])
+    rows[:, :3] *= 10.0 if far else 1.0
+    path = written(tmp_path, f"{names}\n" + "".join(",".join(map(str, r)) + "\n" for r in rows))
+    if far:
+        with pytest.raises(InputError, match="position: no unit stated"):
+            read_points(path, ARM, LOADS)
+        return
+    found = read_points(path, ARM, LOADS)
+    np.testing.assert_allclose(found.wanted[:, :3, 3], points[:, :3, 3], atol=1e-9)
+
+
+def test_joint_values_alone_under_other_names(tmp_path: Path) -> None:
+    rows = "".join(";".join(f"{v:.9f}" for v in np.degrees(q)) + "\n" for q in Q)
+    path = written(tmp_path, "A1;A2;A3;A4;A5;A6\n" + rows.replace(".", ","))
+    found = read_points(path, ARM, LOADS)
+    np.testing.assert_allclose(found.q, Q, atol=1e-9)
+    assert found.wanted is None
+    assert found.wrench is None
+
+
+@pytest.mark.parametrize("kind", ["csv", "xlsx", "parquet"])
+def test_poses_without_joint_values_by_a_mapping(tmp_path: Path, kind: str) -> None:
+    """As the message on the missing convention says: --preview writes the mapping to correct."""
+    goal = poses(Q)
+    data = np.hstack([1e3 * goal[:, :3, 3], np.degrees(se3.rotation_vector(goal[:, :3, :3]))])
+    table = pd.DataFrame(data, columns=["X [mm]", "Y [mm]", "Z [mm]", "RX [°]", "RY [°]", "RZ [°]"])
+    path = tmp_path / f"points.{kind}"
+    {"csv": table.to_csv, "xlsx": table.to_excel, "parquet": table.to_parquet}[kind](
+        path, index=False
+    )
+    with pytest.raises(InputError, match="orientation: no convention stated"):
+        read_points(path, ARM, LOADS)
+    proposed = propose(path).proposal.to_toml(path.name)
+    convention = re.compile('convention = ".*"')
+    assert convention.search(proposed)
+    told = written(tmp_path, convention.sub('convention = "rotation-vector"', proposed), "m.toml")
+    found = read_points(path, ARM, LOADS, find_mapping(told, PointMapping))
+    np.testing.assert_allclose(on_branch(found, ARM, TOOL, Q[0] + 0.1), Q, atol=1e-8)
+    with pytest.raises(InputError, match="joints"):  # which readings need
+        find_mapping(told, Mapping)
 
 
 def test_an_unknown_column_names_all_that_are_valid(tmp_path: Path) -> None:

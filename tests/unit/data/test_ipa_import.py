@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 from hilcal.errors import InputError
 from hilcal.readings.covariance import tracker_covariance
 from hilcal.tables.mapped import import_mapped
-from hilcal.tables.mapping import find_mapping
+from hilcal.tables.mapping import Mapping, find_mapping
 from hilcal.tables.table import ImportResult
 from tests.support.readings_cases import make_arm
 
 ARM = make_arm()
-MAPPING = find_mapping("ipa-ur10")
+MAPPING = find_mapping("ipa-ur10", Mapping)
 assert MAPPING.instrument is not None
 assert MAPPING.std is not None
 assert MAPPING.orientation is not None

@@ -286,7 +286,7 @@ def test_angles_that_the_encoders_reported(tmp_path: Path) -> None:
     np.testing.assert_allclose(states.q, q[np.arange(12) // 2 * 2], atol=1e-9)
     assert states.q_actual is not None
     np.testing.assert_allclose(states.q_actual, q, atol=1e-9)
-    assert propose(path).proposal.mapping() == check_section(mapping, Mapping, "m.toml")
+    assert propose(path).proposal.mapping(Mapping) == check_section(mapping, Mapping, "m.toml")
 
 
 @settings(

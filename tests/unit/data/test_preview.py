@@ -219,9 +219,9 @@ def test_the_guess_is_the_mapping(case: str, tmp_path: Path) -> None:
     if case == "german":
         wanted["file"]["encoding"] = "latin-1"
         expected = check_section(wanted, Mapping, "wanted")
-    assert found.mapping().model_dump() == expected.model_dump()
+    assert found.mapping(Mapping).model_dump() == expected.model_dump()
     (tmp_path / "m.toml").write_text(found.to_toml("t.csv"))
-    assert load_mapping(tmp_path / "m.toml") == found.mapping()
+    assert load_mapping(tmp_path / "m.toml", Mapping) == found.mapping(Mapping)
 
 
 def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path: Path) -> None:
@@ -232,7 +232,7 @@ def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path: Path) -> None
     shuffled = lines(["Name", *names], [points[k] for k in order], DEG[order], comma=True)
     write(tmp_path / "robot.csv", shuffled + "P999;0;0;0;0;0;0\n")
     found = propose(tmp_path / "tracker.csv", tmp_path / "robot.csv")
-    second = found.proposal.mapping().second_file
+    second = found.proposal.mapping(Mapping).second_file
     assert second is not None
     assert (second.match, second.separator, second.decimal) == (("Point", "Name"), ";", ",")
     np.testing.assert_allclose(found.grid.numbers("A3"), DEG[:, 2], atol=1e-6)
@@ -248,7 +248,7 @@ def test_a_missing_point(tmp_path: Path) -> None:
     names = [f"A{k}" for k in range(1, 7)]
     write(tmp_path / "t.csv", lines(["X", "Y", "Z", *names], p, DEG))
     found = propose(tmp_path / "t.csv").proposal
-    assert found.mapping().file.missing == (-9999.0,)
+    assert found.mapping(Mapping).file.missing == (-9999.0,)
     assert ("file", "-9999 stands for a missing point") in found.unsure
 
 
@@ -256,7 +256,7 @@ def test_lines_that_are_no_readings(tmp_path: Path) -> None:
     names = [f"A{k}" for k in range(1, 7)]
     text = "Tracker report\n\n" + lines([*names, "X", "Y", "Z"], DEG, MM) + "end;of;file\n\n\n"
     found = propose(write(tmp_path / "t.csv", text))
-    assert found.proposal.mapping().file.header_row == 3
+    assert found.proposal.mapping(Mapping).file.header_row == 3
     assert len(found.grid.rows) == N
     assert any("are left out" in words for _, words in found.proposal.unsure)
 

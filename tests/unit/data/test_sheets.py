@@ -76,7 +76,7 @@ def book(path: Path) -> None:
 def test_a_spreadsheet(tmp_path: Path, arm: Arm) -> None:
     path = tmp_path / "t.xlsx"
     book(path)
-    found = propose(path).proposal.mapping()
+    found = propose(path).proposal.mapping(Mapping)
     assert (found.file.sheet, found.file.header_row) == ("Data", 3)
     x = read(path, found, arm)
     np.testing.assert_allclose(x.states.q, C.q, atol=1e-12)
@@ -133,7 +133,7 @@ def test_parquet(tmp_path: Path, arm: Arm) -> None:
     columns["pose"] = [f"P{k}" for k in range(12)]
     columns["raw"] = [[1.0, 2.0]] * 12
     parquet.write_table(pyarrow.table(columns), path)
-    found = propose(path).proposal.mapping()
+    found = propose(path).proposal.mapping(Mapping)
     assert found == section(pose={"column": "pose"})
     np.testing.assert_allclose(read(path, found, arm).value, C.position)
 

@@ -14,7 +14,7 @@ from hilcal.identification import parameters_document, posterior_document
 from hilcal.identification.rigid_frames import inverse_roots
 from hilcal.readings.covariance import is_covariance
 from hilcal.store.plan import read_plan
-from hilcal.tables.mapping import load_mapping
+from hilcal.tables.mapping import Mapping, load_mapping
 from tests.fuzz import files, harness, stored, wire
 
 FEW = {
@@ -76,7 +76,7 @@ def test_a_toml_file_nested_too_deeply(tmp_path: Path) -> None:
     path = tmp_path / "m.toml"
     path.write_text("a = " + "[" * 5000)
     with pytest.raises(InputError, match="nested too deeply"):
-        load_mapping(path)
+        load_mapping(path, Mapping)
 
 
 def test_a_prior_whose_number_of_columns_is_infinite(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from hilcal.cli import main
 from hilcal.errors import InputError
 from hilcal.store.rows import text_crc
 from hilcal.tables.files import open_grid
-from hilcal.tables.mapping import FileFormat, load_mapping
+from hilcal.tables.mapping import FileFormat, Mapping, load_mapping
 from tests.support.unguarded import unguarded
 from tests.unit.data.test_file_versions import HASHED, unpacked
 
@@ -141,9 +141,9 @@ def test_a_mapping_names_no_file_outside_its_folder(how: str, tmp_path: Path) ->
     position = "[position]\nunit = 'm'\ncolumns = ['x', 'y', 'z']\n"
     path.write_text(f"{position}{joints}[second_file]\npath = {name!r}\n")
     with pytest.raises(InputError, match="leaves the folder of the mapping"):
-        load_mapping(path)
+        load_mapping(path, Mapping)
     path.write_text(f"{position}{joints}[second_file]\npath = 'beside.csv'\n")
-    assert load_mapping(path).second_file is not None
+    assert load_mapping(path, Mapping).second_file is not None
 
 
 @pytest.mark.parametrize("command", ["info", "compare", "diagnose", "identify", "refine"])
