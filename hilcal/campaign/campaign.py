@@ -37,7 +37,7 @@ from hilcal.identification.full_covariance import (
     full_readings,
     with_noise_of,
 )
-from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
+from hilcal.identification.noise_estimate import NOISE, NoiseEstimate, with_noise_factors
 from hilcal.identification.posterior import Posterior, Source
 from hilcal.identification.predictive import Predictive
 from hilcal.model.model import Model
@@ -54,7 +54,7 @@ from hilcal.store.purpose import refuse_fitting
 from hilcal.store.records import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
 from hilcal.store.robot_file import ROBOT_FILE, check_robot
-from hilcal.store.run_log import PLAN
+from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table
 from hilcal.types import Floats
 
@@ -77,6 +77,8 @@ class Campaign:
         catalogue: the effects that a model of it can have.
         changes: what is different in the cell from what it was told to be when the readings were
             taken, see `with_cell`.
+        noise: as it was estimated from the readings; None where the table or the cell states it, or
+            the samples of measured readings show it.
     """
 
     file: CampaignFile
@@ -85,6 +87,7 @@ class Campaign:
     readings: Readings
     catalogue: Catalogue
     changes: Changes
+    noise: NoiseEstimate | None
 
     @classmethod
     def open(
@@ -127,12 +130,13 @@ class Campaign:
             raise InputError(f"{file.path}: a revision is damaged ({error})") from None
         check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
         cell = cell_from_config(config, None, file.about(ROBOT_FILE))
-        readings, covers, noise = file.readings(), file.about(COVERS), file.about(NOISE)
-        if _restates(file, changes):
-            readings, covers, noise = with_noise_of(config.tracker, readings), INSTRUMENT, None
+        readings, covers = file.readings(), file.about(COVERS)
+        noise = None if _restates(file, changes) else estimated_noise(file)
+        readings = _with_instrument(readings, file, config, changes, noise)
+        covers = INSTRUMENT if _restates(file, changes) else covers
         readings = full_readings(readings, covers, cell, config)
         readings = replace(readings, noise_stated=noise is None)
-        return cls(file, config, cell, readings, catalogue, changes)
+        return cls(file, config, cell, readings, catalogue, changes, noise)
 
     def at(self, changes: Changes) -> Self:
         """Return the campaign with what a revision changed in the cell, on the same open file.
@@ -197,13 +201,6 @@ class Campaign:
         return covariance_parts(self._stated_covers, self.config)
 
     @property
-    def noise(self) -> NoiseEstimate | None:
-        """The noise as it was estimated at import; None where the table or the cell states it."""
-        if _restates(self.file, self.changes):
-            return None
-        return NoiseEstimate.from_json(self.file.about(NOISE))
-
-    @property
     def _stated_covers(self) -> str | None:
         return INSTRUMENT if _restates(self.file, self.changes) else self.file.about(COVERS)
 
@@ -246,8 +243,7 @@ class Campaign:
         if as_stored:
             readings, covers = self.file.readings(), self.stored_covers
             about["readings_sha256"] = content_hash(readings)
-            if _restates(self.file, self.changes):
-                readings = with_noise_of(self.config.tracker, readings)
+            readings = _with_instrument(readings, self.file, self.config, self.changes, self.noise)
         write_table(readings, path, with_what_rounding_does(covers, readings), about)
 
     def close(self) -> None:
@@ -569,6 +565,33 @@ class Campaign:
                 judged = diagnose(found, self.history(record.number), say)
             out.append(Chapter(record.number, record.added, found, judged, record.removed))
         return out
+
+
+def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
+    """Return the noise as it was estimated at import, or after measuring; None where it is stated.
+
+    Raises:
+        InputError: it is damaged.
+    """
+    if file.about(PLAN) is None:
+        return NoiseEstimate.from_json(file.about(NOISE))
+    told = RunLog(file).last(NOISE)
+    return None if told is None else NoiseEstimate.of(told)
+
+
+def _with_instrument(
+    readings: Readings,
+    file: CampaignFile,
+    config: CellConfig,
+    changes: Changes,
+    noise: NoiseEstimate | None,
+) -> Readings:
+    """Return stored readings with the instrument's covariance as it is stated or estimated now."""
+    if _restates(file, changes):
+        return with_noise_of(config.tracker, readings)
+    if noise is not None and noise.factors is not None:
+        return with_noise_factors(readings, config.tracker, noise.factors)
+    return readings
 
 
 def _restates(file: CampaignFile, changes: Changes) -> bool:

@@ -4,11 +4,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+from hilcal.campaign.campaign import estimated_noise
 from hilcal.cli.options import Json, Record, Run, Scheduler, Workers, argument, option
 from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
-from hilcal.identification.noise_estimate import NOISE, NoiseEstimate
 from hilcal.names import quoted
 from hilcal.present.campaign import info_report
 from hilcal.present.fit import model_name
@@ -28,7 +28,7 @@ def info(run: Run, as_json: Json = False) -> None:
     with CampaignFile.open(run, read_only=True) as file:
         found = overview(file)
         parts = covariance_parts(file.about(COVERS), found.config)
-        noise = NoiseEstimate.from_json(file.about(NOISE))
+        noise = estimated_noise(file)
     t.show(info_report(found, run.name, covariance_words(parts, noise)))
     t.document(to_json(found, str(run), parts))
 

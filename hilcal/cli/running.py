@@ -5,7 +5,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -270,13 +270,26 @@ def measure(
         clock = Clock(config.simulation.clock)
         live = LiveModel(cell, config)
         run_plan(rig, cell, config, log.plan, log, clock, watcher, live, goal=goal, epoch=epoch)
+    estimate_noise(t, config, cell, campaign)
     return campaign.n_readings
+
+
+def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: CampaignFile) -> None:
+    """Store and say the noise of measured readings, where nothing states it and they tell."""
+    from hilcal.identification.noise_estimate import NOISE, measured_noise
+    from hilcal.numbers import sentence
+    from hilcal.present.registration import covariance_words
+
+    found = measured_noise(campaign.readings(), cell, config)
+    if found is not None:
+        RunLog(campaign).event(NOISE, asdict(found))
+        t.notice(sentence(covariance_words("instrument", found)))
 
 
 def _is_home(log: RunLog) -> bool:
     """Whether the last session came to its end: the arm is home and nothing hangs."""
-    events = log.events()
-    return bool(events) and events[-1]["kind"] == "finished"
+    kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
+    return kinds[-1:] == ["finished"]
 
 
 def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:

@@ -14,21 +14,28 @@ counts as noise, nor noise as an effect. Gross errors are left out.
 Where the readings show several effects at once, as those of most real arms do, few of them tell
 noise from effects: the default stays then, and a fit of all effects estimates the noise with them
 (see `identification.background`).
+
+The covariance of a measured reading is that of the mean of its samples, of which the default is the
+prior. What the instrument errs by from pose to pose does not show in them, and where another
+instrument measures, few samples say little of it. Where the readings of a campaign contradict them,
+f_a, f_c and f_o are stored with it (`measured_noise`), and the default's covariance times these
+takes their place when it is opened (`with_noise_factors`); the arm's scatter is left to diagnosis.
 """
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
+from hilcal.config import CellConfig, Tracker
 from hilcal.effects.protocol import FRAME_ROLES
-from hilcal.errors import HilcalError
+from hilcal.errors import HilcalError, InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.full_covariance import with_joint_scatter, with_noise_of
 from hilcal.identification.mixed_fit import (
     SCATTER,
     SCATTER_RAD,
@@ -64,7 +71,13 @@ SEVERAL = 0.05
 SEED = 20251125
 """Of the poses that are chosen, and of simulated likelihood ratios."""
 NOISE = "noise"
-"""Key among the texts about a campaign: the estimate, as JSON; absent where the noise is stated."""
+"""Key among the texts about an imported campaign, and kind of event of a measured one: the
+estimate; absent where the noise is stated, or as the samples show it."""
+CONTRADICTED = 3.0
+"""Standard errors of a factor's log from which on readings contradict their covariances."""
+WORTH = 1.3
+"""Factor from which on the noise of measured readings is another one than of their samples; a
+choice."""
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 
@@ -78,6 +91,8 @@ class NoiseEstimate:
         orientation_rad: of a rotation about any axis; None where positions were read.
         distance_m: length of the beam.
         joint_std_rad: the arm's scatter, of each joint; None where the cell states it.
+        factors: f of measured readings by component; None for an import, the covariances of which
+            are stored as estimated.
     """
 
     along_m: float
@@ -85,6 +100,7 @@ class NoiseEstimate:
     orientation_rad: float | None
     distance_m: float
     joint_std_rad: float | None
+    factors: Mapping[str, float] | None = None
 
     def to_json(self) -> str:
         """Return it as a text of a campaign."""
@@ -93,7 +109,13 @@ class NoiseEstimate:
     @classmethod
     def from_json(cls, text: str | None) -> "NoiseEstimate | None":
         """Return what `to_json` wrote; None where there is none."""
-        return None if text is None else cls(**json.loads(text))
+        return None if text is None else cls.of(json.loads(text))
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> "NoiseEstimate":
+        """Return what `asdict` made, which may have more keys beside it."""
+        values: dict[str, Any] = {f.name: content.get(f.name) for f in fields(cls)}
+        return cls(**values)
 
 
 def with_estimated_noise(
@@ -115,35 +137,109 @@ def with_estimated_noise(
         are described.
     """
     readings, station = found.readings, config.tracker.station_m
-    if found.noise_stated or len(np.unique(readings.pose)) < FEWEST_POSES:
+    told = None if found.noise_stated else _told(readings, cell, config)
+    if told is None:
         return found, None
-    stated = config.repeatability.per_joint(cell.arm.n)
-    try:
-        model = baseline(cell, _some(readings), usual_mode(readings))
-        factors = _factors(model, _some(readings), station, stated)
-    except HilcalError:  # what cannot be fitted is said where it is fitted
-        return found, None
-    if factors is None:
-        return found, None
-    size = {
-        p.name: factors[p.name]
-        * float(np.sqrt(np.median(np.trace(p.covariance, axis1=1, axis2=2))))
-        for p in _instrument(readings, station)
-    }
-    estimate = NoiseEstimate(
-        along_m=size[ALONG],
-        across_m=size[ACROSS] / float(np.sqrt(2.0)),
-        orientation_rad=size[ORIENTATION] / float(np.sqrt(3.0)) if ORIENTATION in size else None,
-        distance_m=float(np.median(np.linalg.norm(_beam(readings, station), axis=1))),
-        joint_std_rad=SCATTER_RAD * factors[SCATTER] if SCATTER in factors else None,
-    )
+    factors, estimate = told.factors, told.estimate(readings, station)
     together = SCATTER in factors and readings.states.target is None
-    if not together:
-        factors.pop(SCATTER, None)
-    whole = _with(readings, station, model, factors)
+    used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
+    whole = _with(readings, station, told.model, used)
     covers = WHOLE if together else INSTRUMENT
     notes = tuple(n for n in found.notes if not n.startswith(FROM_TRACKER))
     return replace(found, readings=whole, covers=covers, notes=notes), estimate
+
+
+def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
+    """Return the noise of measured readings that contradict their samples.
+
+    Args:
+        readings: with the covariances of their means.
+        cell: the cell.
+        config: its configuration.
+
+    Returns:
+        The estimate with its factors; None where the cell states the noise, where the samples show
+        it, or see `with_estimated_noise`.
+    """
+    if config.tracker.states_noise:
+        return None
+    station = config.tracker.station_m
+    try:
+        default = with_noise_of(config.tracker, readings)
+    except InputError:  # a reading at the station
+        return None
+    told = _told(default, cell, config)
+    if told is None:
+        return None
+    factors = {k: f for k, f in told.factors.items() if k != SCATTER}
+    sampled, of = _sizes(readings, station), _sizes(default, station)
+    off = (
+        abs(np.log(f * of[k] / sampled[k])) > max(np.log(WORTH), CONTRADICTED * told.log_errors[k])
+        for k, f in factors.items()
+    )
+    if not any(off):
+        return None
+    return replace(told.estimate(default, station), joint_std_rad=None, factors=factors)
+
+
+def with_noise_factors(
+    readings: Readings, tracker: Tracker, factors: Mapping[str, float]
+) -> Readings:
+    """Return readings with the default noise of [tracker], its components times their factors."""
+    default = with_noise_of(tracker, readings)
+    parts = _instrument(default, tracker.station_m)
+    total = sum((factors[p.name] ** 2 * p.covariance for p in parts), np.zeros(()))
+    return replace(readings, covariance=total)
+
+
+def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, float]:
+    """Standard deviations of the components, m and rad: of all their axes, the median reading's."""
+    return {
+        p.name: float(np.sqrt(np.median(np.trace(p.covariance, axis1=1, axis2=2))))
+        for p in _instrument(readings, station)
+    }
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """What readings tell of their noise.
+
+    Attributes:
+        model: frames, at which the arm's scatter is evaluated.
+        factors: standard deviations of the components, in those of the default and of
+            `SCATTER_RAD`.
+        log_errors: standard errors of their logs.
+    """
+
+    model: Model
+    factors: Mapping[str, float]
+    log_errors: Mapping[str, float]
+
+    def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
+        """Return it in figures."""
+        size = {k: self.factors[k] * s for k, s in _sizes(readings, station).items()}
+        turn = size.get(ORIENTATION)
+        scatter = self.factors.get(SCATTER)
+        return NoiseEstimate(
+            along_m=size[ALONG],
+            across_m=size[ACROSS] / float(np.sqrt(2.0)),
+            orientation_rad=None if turn is None else turn / float(np.sqrt(3.0)),
+            distance_m=float(np.median(np.linalg.norm(_beam(readings, station), axis=1))),
+            joint_std_rad=None if scatter is None else SCATTER_RAD * scatter,
+        )
+
+
+def _told(readings: Readings, cell: Cell, config: CellConfig) -> _Told | None:
+    """Return what readings tell of their noise; None see `with_estimated_noise`."""
+    if len(np.unique(readings.pose)) < FEWEST_POSES:
+        return None
+    stated = config.repeatability.per_joint(cell.arm.n)
+    try:
+        model = baseline(cell, _some(readings), usual_mode(readings))
+        found = _factors(model, _some(readings), config.tracker.station_m, stated)
+    except HilcalError:  # what cannot be fitted is said where it is fitted
+        return None
+    return None if found is None else _Told(model, *found)
 
 
 def _some(readings: Readings) -> Readings:
@@ -158,8 +254,8 @@ def _some(readings: Readings) -> Readings:
 
 def _factors(
     model: Model, readings: Readings, station: Sequence[float] | None, joint_std: Floats
-) -> dict[str, float] | None:
-    """Standard deviations of the components, in those of the default and of `SCATTER_RAD`.
+) -> tuple[dict[str, float], dict[str, float]] | None:
+    """Factors and their logs' errors, see `_Told`.
 
     None where the readings show effects beside the largest.
     """
@@ -178,9 +274,10 @@ def _factors(
         found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
         if _shows_several(found):
             return None
-        std = np.exp(found.log_std[-len(instrument) - 1 :])
+        own = slice(-len(instrument) - 1, None)
         names = (*(p.name for p in instrument), arm.name)
-        factors = dict(zip(names, std.tolist(), strict=True))
+        factors = dict(zip(names, np.exp(found.log_std[own]).tolist(), strict=True))
+        errors = np.sqrt(np.diagonal(found.covariance)[own])
         scale = np.exp(found.log_std)
         random = np.full(whole.size, np.inf)
         for f, s in zip(found.equations.problem.families.random, scale, strict=False):
@@ -193,7 +290,7 @@ def _factors(
         if np.array_equal(now, used):
             break
         used = now
-    return factors
+    return factors, dict(zip(names, errors.tolist(), strict=True))
 
 
 def _shows_several(found: Variances) -> bool:

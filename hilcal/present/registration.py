@@ -190,8 +190,13 @@ def _estimated(n: NoiseEstimate) -> str:
     arm = ""
     if n.joint_std_rad is not None:
         arm = f"; each joint scatters by {1e6 * n.joint_std_rad:.2g} µrad from arrival to arrival"
+    why = "neither the table nor [tracker] states the noise"
+    if n.factors is not None:
+        why = (
+            "[tracker] does not state the noise, and the samples of each pose do not show all of it"
+        )
     return (
-        f"neither the table nor [tracker] states the noise; it was estimated from the readings, "
-        f"together with all effects: {numbers.length(n.along_m)} along the beam, "
+        f"{why}; it was estimated from the readings, together with all effects: "
+        f"{numbers.length(n.along_m)} along the beam, "
         f"{numbers.length(n.across_m)} across it at {n.distance_m:.2g} m{turn}{arm}"
     )

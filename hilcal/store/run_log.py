@@ -237,8 +237,19 @@ class RunLog:
         Raises:
             InputError: it is damaged.
         """
+        return self._events("SELECT * FROM events ORDER BY id")
+
+    def last(self, kind: str) -> dict[str, Any] | None:
+        """Return the last event of a kind, see `events`; None where there is none."""
+        of_kind = f'{{"kind": "{kind}", %'
+        found = self._events(
+            "SELECT * FROM events WHERE content LIKE ? ORDER BY id DESC LIMIT 1", of_kind
+        )
+        return found[0] if found else None
+
+    def _events(self, statement: str, *values: str) -> list[dict[str, Any]]:
         out = []
-        for number, text, crc in self._select("SELECT * FROM events ORDER BY id"):
+        for number, text, crc in self._select(statement, *values):
             if rows.text_crc(str(number), text) != crc:
                 raise InputError(
                     f"{self._campaign.path}: the campaign is damaged at event {number}"
@@ -256,10 +267,10 @@ class RunLog:
             raise InputError(f"{self._campaign.path}: the campaign is damaged (step {key})")
         return found[0], found[1], found[2]
 
-    def _select(self, statement: str) -> list[Any]:
+    def _select(self, statement: str, *values: str) -> list[Any]:
         path = self._campaign.path
         with schema.sqlite_errors(path), limits.memory(str(path)):
-            return self._campaign.connection.execute(statement).fetchall()
+            return self._campaign.connection.execute(statement, values).fetchall()
 
 
 def _key(step: Step, reading: Readings, row: int) -> str:

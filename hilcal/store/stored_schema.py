@@ -149,6 +149,15 @@ class _Finished(_Happened):
     readings: Count
 
 
+class _Noise(_Happened):
+    along_m: Number
+    across_m: Number
+    orientation_rad: Number | None
+    distance_m: Number
+    joint_std_rad: Number | None
+    factors: dict[Text, Number] | None
+
+
 _EVENTS: Mapping[str, type[_Happened]] = {
     "devices": _Devices,
     "tare": _Tare,
@@ -159,6 +168,7 @@ _EVENTS: Mapping[str, type[_Happened]] = {
     "doubted": _Doubted,
     "start": _Start,
     "finished": _Finished,
+    "noise": _Noise,
 }
 
 

@@ -205,7 +205,7 @@ def test_what_is_no_campaign_or_no_table_is_refused(capsys, fitted, tmp_path) ->
     assert "no such campaign" in refused(capsys, 2, "compensate", tmp_path / "a.hilcal", points)
     (tmp_path / "a.json").write_text("{}")
     assert "no calibration" in refused(capsys, 2, "compensate", tmp_path / "a.json", points)
-    assert "valid: a table .csv" in refused(capsys, 2, "compensate", fitted, CELL)
+    assert "row 7 has 1 cells" in refused(capsys, 2, "compensate", fitted, CELL)
     existing = tmp_path / "o.csv"
     existing.write_text("mine")
     assert "--force" in refused(capsys, 2, "compensate", fitted, points, "-o", existing)

@@ -1,0 +1,95 @@
+"""Measured readings whose instrument nobody states, and that is another one than the default."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hilcal as hc
+from hilcal.cli.running import estimate_noise
+from hilcal.cli.terminal import terminal
+from hilcal.config import Tracker
+from hilcal.errors import DeviceError
+from hilcal.measuring.devices import TrackerSample
+from hilcal.measuring.measure import average
+from hilcal.readings.covariance import tracker_covariance, tracker_noise
+from hilcal.readings.readings import Readings
+from hilcal.store.plan import Plan, Step
+from hilcal.store.run_log import create_run
+from hilcal.types import Floats
+from tests.support.cli_cases import ok
+from tests.unit.identification.test_noise_estimate import OFF, judged, size
+from tests.unit.identification.test_other_arm import measured
+
+SAMPLES = 5
+STATED = "range_std_m = 5e-6\ntransverse_std_m = 7.5e-6\n"
+
+
+def sampled(seed: int, sigma: float | None, between: float) -> Readings:
+    """Readings of an ordinary arm, each the mean of samples with the default's covariance.
+
+    Args:
+        seed: of arm, poses and noise.
+        sigma: of a sample, each axis; the default's noise where None.
+        between: of what the instrument errs by from pose to pose.
+    """
+    r, rng = measured("ur5", seed, OFF, 60, 1e-9), np.random.default_rng(seed)
+    means = []
+    for x, v in zip(r.value, tracker_covariance(r.value, tracker_noise(Tracker())), strict=True):
+        root = np.linalg.cholesky(v) if sigma is None else sigma * np.eye(3)
+        means.append(of_samples(x + between * rng.standard_normal(3), v, root, rng))
+    value, covariance = (np.array(part) for part in zip(*means, strict=True))
+    return replace(r, value=value, covariance=covariance)
+
+
+def of_samples(
+    x: Floats, v: Floats, root: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
+    """The mean of samples and its covariance; samples that scatter too much are taken again."""
+    while True:
+        drawn = x + rng.standard_normal((SAMPLES, 3)) @ root.T
+        try:
+            mean = average([TrackerSample(k, value, v) for k, value in enumerate(drawn)])
+        except DeviceError:
+            continue
+        return mean.value, mean.covariance
+
+
+def run_of(readings: Readings, path: Path, tracker: str = "") -> Path:
+    """A campaign as `run` leaves it, before its noise is looked at."""
+    text = f'[robot]\nmodel = "ur5"\n[tracker]\n{tracker}'
+    (path / "CELL.toml").write_text(text)
+    config = hc.Cell.load(path / "CELL.toml").configured()
+    names = readings.pose_names
+    plan = Plan(names, readings.states.q, tuple(Step(name, "none") for name in names))
+    with create_run(path / "r.hilcal", config, path, plan) as file:
+        file.append_readings(readings)
+        estimate_noise(terminal(False), config, hc.Cell.load(path / "CELL.toml"), file)
+    return path / "r.hilcal"
+
+
+@pytest.mark.parametrize(
+    ("sigma", "between"), [(2e-5, 0.0), (2e-4, 0.0), (5e-6, 2e-5), (5e-6, 1e-4)]
+)
+def test_another_instrument_is_noise(tmp_path: Path, capsys, sigma: float, between: float) -> None:
+    readings = sampled(3, sigma, between)
+    path = run_of(readings, tmp_path)
+    assert "[tracker] does not state the noise" in " ".join(capsys.readouterr().err.split())
+    with hc.Campaign.open(path) as run:
+        assert not run.readings.noise_stated
+        truth = np.sqrt(sigma**2 / SAMPLES + between**2)
+        assert size(run.readings) == pytest.approx(truth, rel=0.3)
+        assert judged(run.cell, run.readings).verdict == "adequate"
+    assert "[tracker] does not state the noise" in " ".join(ok(capsys, "info", path).out.split())
+
+
+@pytest.mark.parametrize("tracker", ["", STATED])
+def test_what_the_samples_show_or_the_cell_states_stays(tmp_path: Path, tracker: str) -> None:
+    """The default's own noise; or a stated one that the readings contradict."""
+    readings = sampled(3, 5e-6, 2e-5) if tracker else sampled(3, None, 0.0)
+    with hc.Campaign.open(run_of(readings, tmp_path, tracker)) as run:
+        assert run.readings.noise_stated
+        np.testing.assert_array_equal(run.readings.covariance, readings.covariance)
+        if not tracker:
+            assert judged(run.cell, run.readings).verdict == "adequate"
