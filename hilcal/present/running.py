@@ -55,9 +55,12 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
             out.add("", "", "", f"{what}: {value}")
         for problem in a.problems:
             out.add("", "", "!", problem)
-    yield from ("", out, "")
+    if answers:
+        yield from ("", out, "")
     count = sum(len(a.problems) for a in answers)
-    if count:
+    if not answers:
+        yield "The cell does not name all its devices: none was asked. Nothing was moved."
+    elif count:
         yield f"{count} problem{'s' if count > 1 else ''}. Nothing was moved."
     else:
         yield "All devices are ready. Nothing was moved."

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, Self
 
 from hilcal.errors import InputError
+from hilcal.names import quoted
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
@@ -143,10 +144,7 @@ def next_step(run: Path) -> Step:
     with CampaignFile.open(run, read_only=True) as campaign:
         log = ProcedureLog(campaign)
         if log.last(BEGUN) is None:
-            raise InputError(
-                f"{run}: a campaign, but not one of hilcal calibrate; choose another name, or go "
-                "on with its own commands (hilcal info)"
-            )
+            raise _another(run)
         decided = log.last(DECIDED)
         if decided is not None and not files.validation.exists() and _asked_anew(log):
             return Step("decide", run)
@@ -210,8 +208,16 @@ def settings_of(campaign: CampaignFile) -> Settings:
     """
     begun = ProcedureLog(campaign).last(BEGUN)
     if begun is None:
-        raise InputError(f"{campaign.path}: not a campaign of hilcal calibrate")
+        raise _another(campaign.path)
     return Settings.from_json(begun["settings"])
+
+
+def _another(run: Path) -> InputError:
+    """Return the error of a campaign that was not made by `calibrate`."""
+    return InputError(
+        f"{run}: not a campaign of hilcal calibrate; choose another name, or go on with its own "
+        f"commands: hilcal info {quoted(run)}"
+    )
 
 
 def duration_of(plan: Plan) -> float:

@@ -7,6 +7,7 @@ says so, and what fits refuses it, until somebody releases it; that is recorded 
 import json
 
 from hilcal.errors import InputError
+from hilcal.names import quoted
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.revision import utc_now
@@ -64,5 +65,5 @@ def refuse_fitting(campaign: CampaignFile) -> None:
     raise InputError(
         f"{campaign.path}: {what}{f' of {of}' if of else ''}, never to be fitted: it tests the "
         "model; to fit it all the same, which its file then says for good: hilcal identify "
-        f"{campaign.path} --fit-validation"
+        f"{quoted(campaign.path)} --fit-validation"
     )

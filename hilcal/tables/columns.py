@@ -16,6 +16,7 @@ ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TEXT = ("pose", "load")
 TARGET = "target"
+PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 COVERS = "covers"
 OWN_PREFIX = "x_"
 AGREES = 2e-3
@@ -101,7 +102,9 @@ def check_header(
     missing = [c for c in required_columns(n) if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
-            raise InputError(f"{path}: unknown column '{name}'{_advice(name, known, header, n)}")
+            form = f"; for a table of another form: {PREVIEW}" if missing else ""
+            advice = _advice(name, known, header, n)
+            raise InputError(f"{path}: unknown column '{name}'{advice}{form}")
     if missing:
         raise InputError(
             f"{path}: column '{missing[0]}' is missing{_hint(missing, header, n, arm)}"
@@ -121,9 +124,9 @@ def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> s
     if len(parts) == 3 and parts[0] == "cov" and f"cov_{parts[2]}_{parts[1]}" in known:
         return f"; give the upper triangle only: 'cov_{parts[2]}_{parts[1]}'"
     close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
-    meant = f"; did you mean '{close}'?" if close else ""
-    joints = f" (the arm has {n} joints)" if close and any(ch.isdigit() for ch in close) else ""
-    return f"{meant}{joints} Columns of your own must start with '{OWN_PREFIX}'"
+    own = f"columns of your own start with '{OWN_PREFIX}'"
+    joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
+    return f"; did you mean '{close}'{joints}? Else: {own}" if close else f"; {own}"
 
 
 def _hint(missing: Sequence[str], header: Sequence[str], n: int, arm: str) -> str:

@@ -25,7 +25,6 @@ FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
-PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 FORM = FileFormat(encoding="utf-8")
 
 
@@ -155,13 +154,14 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
     if len(header) == 1 and (";" in header[0] or "\t" in header[0]):
         raise InputError(
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
-            f"table: {PREVIEW}"
+            f"table: {columns.PREVIEW}"
         )
     known = columns.known_columns(arm.n)
     if not any(name in known for name in header):
         raise InputError(
             f"{path}: not an exchange table: row 1 has none of its columns "
-            f"({', '.join(columns.required_columns(arm.n))}); for any other table: {PREVIEW}"
+            f"({', '.join(columns.required_columns(arm.n))}); for any other table: "
+            f"{columns.PREVIEW}"
         )
     columns.check_header(path, header, arm.n, arm.name, following_columns(arm))
     columns.covariance_size(path, header)
