@@ -190,7 +190,8 @@ def _figures(of: Fit) -> Iterator[_Figure]:
     """Yield the figures that these readings depend on."""
     loaded = np.any(of.readings.states.wrench != 0, axis=1)
     loads = np.unique(of.readings.load[loaded])
-    if len(loads) > 1:  # that of one load is a compliance
+    # Of deflections under one load it is a common factor of all compliances.
+    if len(loads) > 1 or of.mode == "absolute":
         yield from (_Figure("load", int(k)) for k in loads)
     if of.mode == "absolute" and of.model.cell.tool_mass > 0.0:
         yield _Figure("tool_mass")

@@ -52,6 +52,22 @@ def test_a_load_at_twice_its_weight_is_named(
     assert not d.suspects
 
 
+@pytest.mark.parametrize("load", ["5kg", "pull x"])
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_single_load_is_told_by_the_weight_of_the_arm(load: str, factor: float) -> None:
+    """Not of deflections: there it is a common factor of all compliances."""
+    c = campaign("backlash", "absolute", 1, poses=20)
+    number = c.readings.load_names.index(load)
+    readings = c.readings[np.isin(c.readings.load, [0, number])]
+    wrench = readings.states.wrench.copy()
+    wrench[readings.load == number] *= factor
+    wrong = replace(readings, states=replace(readings.states, wrench=wrench))
+    (figure,) = judged(c.cell, wrong, "absolute").wrong_figures
+    assert np.divide(figure.stated, figure.found) == pytest.approx(factor, rel=0.2)
+    assert not judged(c.cell, readings, "absolute").wrong_figures
+    assert not judged(c.cell, wrong, "deflection").wrong_figures
+
+
 def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A trial that does not settle ends no diagnosis."""
     c = campaign(NOTHING, "absolute", 1, poses=20)
