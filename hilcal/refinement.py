@@ -19,7 +19,7 @@ from hilcal.diagnosis.residual_regression import Regressions
 from hilcal.diagnosis.serial_noise import serial_noise, with_serial_noise
 from hilcal.diagnosis.stepwise import Refits, add, exchange, predicts_better, remove
 from hilcal.diagnosis.stepwise_alternatives import Alternative
-from hilcal.diagnosis.verdict import NOTHING, before_named, judge
+from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.proposal import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
 from hilcal.identification.background import allows_background, with_background
@@ -336,19 +336,18 @@ class Path:
         """Append a fit with a background, and those that name its effects that are proved."""
         tested = background_evidence(found)
         names = proved(tested)[: MOST_REVISIONS - len(self.steps) - 1]
-        fits, left = [found], [tested]
+        fits = [found]
         for name in names:
             model = fits[-1].model
             model = replace(model, background=model.background - {name})
             fits.append(replace(fits[-1], model=model))
-            left.append(tuple(b for b in left[-1] if b.effect != name))
-        self._evidence = Evidence(
-            fits[-1], self._refits.add, self._say, self._regressions, left[-1]
+        judged, self._evidence = judge_naming(
+            fits,
+            tested,
+            self._history,
+            lambda left: Evidence(fits[-1], self._refits.add, self._say, self._regressions, left),
         )
-        judged = judge(self._evidence, self._history(fits[-1]))
-        for one, of, name in zip(fits, left, (BACKGROUND, *names), strict=True):
-            last = one is fits[-1]
-            d = judged if last else before_named(judged, one, self._history(one), of)
+        for one, d, name in zip(fits, judged, (BACKGROUND, *names), strict=True):
             self.steps.append(Step(one, d, name))
             self._seen(self.steps[-1])
 

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import typer
 
 from hilcal.cli import application, execute
+from studies.all_effects_command import all_effects
 from studies.carried_bands_command import carried_bands
 from studies.carry_command import carry
 from studies.carry_picture import carry_picture
@@ -39,6 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)
     app.command("few-poses")(few_poses)
+    app.command("all-effects")(all_effects)
     app.command("scaling")(scaling)
     app.command("serial-noise")(serial_noise)
     app.command("real")(real)

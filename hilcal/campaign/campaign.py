@@ -6,6 +6,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+import numpy as np
+
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.revisions import (
     chain,
@@ -23,10 +25,12 @@ from hilcal.campaign.revisions import (
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
+from hilcal.diagnosis.background_evidence import background_evidence
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.document import to_json
+from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.serial_noise import with_serial_noise
-from hilcal.diagnosis.verdict import diagnose
+from hilcal.diagnosis.verdict import diagnose, judge_naming
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -550,21 +554,50 @@ class Campaign:
             InputError: no such revision, or its readings or effects are not at hand as they were
                 when it was stored.
         """
-        out = []
         last = self.in_use(revision)
         if last is None:
             _, found = self.fit_in_use(say)
             say("diagnosing it")
             return [Chapter(1, None, found, diagnose(found, say=say))]
-        for record in chain_in_cell(self.file.revisions(), last.number):
+        records = chain_in_cell(self.file.revisions(), last.number)
+        fits = []
+        for record in records:
             say(f"restoring revision {record.number}")
-            found = self.restore(record)
-            judged = None
-            if found.scaling == "gc":
-                say(f"diagnosing revision {record.number}")
-                judged = diagnose(found, self.history(record.number), say)
-            out.append(Chapter(record.number, record.added, found, judged, record.removed))
-        return out
+            fits.append(self.restore(record))
+        numbers = {id(f): r.number for f, r in zip(fits, records, strict=True)}
+        judged: list[Diagnosis | None] = []
+        while len(judged) < len(fits):
+            same = _named_from(fits[len(judged) :])
+            say(f"diagnosing revision {numbers[id(same[-1])]}")
+            judged += self._judged(same, lambda f: self.history(numbers[id(f)]), say)
+        return [
+            Chapter(r.number, r.added, f, d, r.removed)
+            for r, f, d in zip(records, fits, judged, strict=True)
+        ]
+
+    def _judged(
+        self, fits: Sequence[Fit], history: Callable[[Fit], History], say: Say
+    ) -> Sequence[Diagnosis | None]:
+        """Judge one fit, or one with a background of which more and more is named."""
+        if fits[0].scaling != "gc":
+            return [None]
+        if len(fits) == 1:
+            return [diagnose(fits[0], history(fits[0]), say)]
+        tested = background_evidence(fits[0])
+        return judge_naming(
+            fits, tested, history, lambda left: Evidence(fits[-1], say=say, background=left)
+        )[0]
+
+
+def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
+    """Return the first of some fits, and those after it that only name more of its background."""
+    first, count = fits[0], 1
+    for f in fits[1:]:
+        before = fits[count - 1].model.background
+        if not f.model.background < before or not np.array_equal(f.theta, first.theta):
+            break
+        count += 1
+    return fits[:count]
 
 
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:

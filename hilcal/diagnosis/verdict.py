@@ -51,7 +51,7 @@ same rules, but that it may be smaller than its noise: the scatter is never nega
 instrument whose noise is stated too large, in some of its elements, shows only then. That is said.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -106,10 +106,38 @@ def diagnose(
     return judge(Evidence(fit, say=say), history)
 
 
-def before_named(
+def judge_naming(
+    fits: Sequence[Fit],
+    tested: Sequence[BackgroundEffect],
+    history: Callable[[Fit], History],
+    evidence: Callable[[tuple[BackgroundEffect, ...]], Evidence],
+) -> tuple[tuple[Diagnosis, ...], Evidence]:
+    """Judge one fit with a background and the same fit with more and more of it named.
+
+    What is predicted is the same, so that the last is judged, and the others follow from it.
+
+    Args:
+        fits: of models that differ in what they name.
+        tested: the effects of the first one's background, see `background_evidence`.
+        history: of each of them.
+        evidence: of the last one, from the effects of its background.
+
+    Returns:
+        A diagnosis of each, and the evidence for the last.
+    """
+    left = [tuple(b for b in tested if b.effect in f.model.background) for f in fits]
+    e = evidence(left[-1])
+    last = judge(e, history(fits[-1]))
+    before = (
+        _before_named(last, f, history(f), own) for f, own in zip(fits[:-1], left, strict=False)
+    )
+    return (*before, last), e
+
+
+def _before_named(
     d: Diagnosis, fit: Fit, history: History, background: tuple[BackgroundEffect, ...]
 ) -> Diagnosis:
-    """Return the judgement before effects of a background are named: what is predicted is the same.
+    """Return the judgement before effects of a background are named.
 
     Args:
         d: of the model that names them.

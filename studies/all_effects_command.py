@@ -1,0 +1,222 @@
+"""`python -m studies all-effects`: arms that have every effect at once, and the best predictor.
+
+As real arms: all families of the catalogue that unloaded readings allow, u ~ N(0, (k s)² D), s
+their ordinary sizes and k one factor for the arm, 1 unless `--sizes` spreads it. A few random poses
+are refined as `hilcal refine` does; 300 others are predicted. The best linear predictor knows all
+standard deviations and the noise, and is linearised at the truth: nothing predicts better on
+average.
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import product
+from typing import Annotated
+
+import numpy as np
+import typer
+from scipy.stats import chi2
+
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
+from hilcal.cli.terminal import terminal
+from hilcal.config import CellConfig
+from hilcal.engine.engine import open_engine
+from hilcal.identification.arm_scatter import with_arm_scatter
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit
+from hilcal.identification.full_covariance import joint_factors
+from hilcal.identification.mixed_fit import (
+    SCATTER_RAD,
+    linearised_problem,
+    with_all_effects,
+)
+from hilcal.identification.predictive import predictive
+from hilcal.mixed.equations import equations
+from hilcal.mixed.families import families_of
+from hilcal.model.model import Model
+from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import whitening
+from hilcal.refinement import refine
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+from studies.random_descriptions import readings_of
+from studies.records import Figure, Keep, keep
+
+ROBOTS = ("ur3e", "ur5", "ur10e")
+TEST = 300
+INSTRUMENT_M, SCATTER = 1e-5, 1e-5
+"""Standard deviations of a coordinate, m, and of a joint's arrival, rad."""
+TURN = 2.5
+"""Joints lie within ± so much, rad."""
+MOST_RATIO = 1.1
+BAND = (0.93, 0.97)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Some poses of a simulated arm.
+
+    Attributes:
+        poses: how many are fitted.
+        seed: of arm, poses and noise.
+        factor: k, of all sizes.
+    """
+
+    poses: int
+    seed: int
+    factor: float
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What came of a case.
+
+    Attributes:
+        poses: how many were fitted.
+        factor: k.
+        rms_m: rms error of positions at other poses.
+        best_m: that of the best linear predictor.
+        inside: share of the others within their 95 % band.
+        named: effects that the last model names.
+        verdict: of it.
+    """
+
+    poses: int
+    factor: float
+    rms_m: float
+    best_m: float
+    inside: float
+    named: tuple[str, ...]
+    verdict: str
+
+
+def all_effects(
+    poses: Annotated[str, typer.Option("--poses", help="Numbers that are fitted.")] = "20,30,60",
+    seeds: Annotated[int, typer.Option("--seeds", help="Arms of each number.")] = 20,
+    sizes: Annotated[
+        float, typer.Option("--sizes", help="Factor of all sizes at most, either way.")
+    ] = 1.0,
+    first_seed: Annotated[int, typer.Option("--first-seed", help="Of the arms.")] = 0,
+    jobs: OneJob = None,
+    scheduler: Scheduler = None,
+    keep_file: Keep = None,
+    as_json: Json = False,
+) -> None:
+    """Refine few poses of simulated arms that have all effects at once."""
+    t = terminal(as_json)
+    counts = [int(n) for n in poses.split(",")]
+    cases = [
+        Case(n, s, float(sizes ** np.random.default_rng([s, 1]).uniform(-1, 1)))
+        for n, s in product(counts, range(first_seed, first_seed + seeds))
+    ]
+    with (
+        open_engine(*one_by_default(jobs, scheduler)) as engine,
+        counting(t.progress, "arms", len(cases)) as advance,
+    ):
+        done: Sequence[Found] = engine.map(refined, cases, advance=advance)
+    figures = [f for n in counts for f in _figures(n, [d for d in done if d.poses == n])]
+    for f in figures:
+        t.show(f"{f.what}: {f.measured}")
+    keep(keep_file, f"All effects at once, sizes 1/{sizes:g} to {sizes:g} times ordinary", figures)
+    t.document({"cases": [asdict(d) for d in done]})
+
+
+def refined(case: Case) -> Found:
+    """Refine the poses of a case, and predict the others."""
+    rng = np.random.default_rng(case.seed)
+    cell = cell_from_config(
+        CellConfig.model_validate(
+            {
+                "robot": {"model": ROBOTS[case.seed % len(ROBOTS)]},
+                "tool": {"target_m": [0.05, 0.02, 0.1], "mass_kg": 1.0, "com_m": [0.0, 0.0, 0.04]},
+            }
+        )
+    )
+    q = rng.uniform(-TURN, TURN, (case.poses + TEST, cell.arm.n))
+    every, model, theta, log_std = _measured(cell, q, case.factor, rng)
+    some, test = every[np.arange(case.poses)], every[np.arange(case.poses, len(every))]
+    last = refine(baseline(cell, some, "absolute"), some, "absolute")
+    off = test.value - last.fit.model.predict(test.states, last.fit.theta).observation.position
+    inside = _inside(last.fit, test, off)
+    problem = linearised_problem(model, some, "absolute", theta)
+    noise = [0.0, float(np.log(SCATTER / SCATTER_RAD))][: len(problem.noise)]
+    best = equations(problem, np.concatenate([log_std, noise]))
+    known = problem.parameters(best.coordinates, model.size)
+    ideal = test.value - model.predict(test.states, known).observation.position
+    names = last.fit.model.named
+    return Found(
+        case.poses,
+        case.factor,
+        _rms(off),
+        _rms(ideal),
+        inside,
+        tuple(n for n in names if n not in ("base_frame", "target_offset")),
+        last.verdict,
+    )
+
+
+def _measured(
+    cell: Cell, q: Floats, factor: float, rng: np.random.Generator
+) -> tuple[Readings, Model, Floats, Floats]:
+    """Readings at q (N, n), the true model, its parameters (P,), and log s (F,)."""
+    chain = evaluate(cell.arm, q)
+    at = chain.point(np.array([0.05, 0.02, 0.1]))
+    plain = readings_of(q, at, np.full(3, INSTRUMENT_M))
+    model = with_all_effects(baseline(cell, plain, "absolute"), plain.states)
+    families = families_of(model).random
+    log_std = np.array([f.prior.mean + (0.0 if f.known else np.log(factor)) for f in families])
+    theta = np.zeros(model.size)
+    for f, size in zip(families, np.exp(log_std), strict=True):
+        theta[f.parameters] = size * f.magnitude * rng.standard_normal(len(f.parameters))
+    value = model.predict(plain.states, theta).observation.position
+    moved = joint_factors(cell, plain, np.full(cell.arm.n, SCATTER))
+    value = value + INSTRUMENT_M * rng.standard_normal(value.shape)
+    value += np.einsum("nij,nj->ni", moved, rng.standard_normal((len(q), moved.shape[2])))
+    found = readings_of(q, value, np.full(3, INSTRUMENT_M))
+    return replace(found, scatter_stated=False), model, theta, log_std
+
+
+def _inside(of: Fit, test: Readings, off: Floats) -> float:
+    """Share of others within the 95 % band of a fit, their errors (N, 3) being known."""
+    known = predictive(
+        of.model, of.theta, of.solution.prior, of.readings[~of.outlier], "absolute",
+        of.holdout.rms_sigma,
+    )  # fmt: skip
+    prediction = of.model.predict(test.states, of.theta)
+    if of.readings.arm_scatter is not None:
+        test = with_arm_scatter(of.model.cell, test, of.readings.arm_scatter)
+    total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
+    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
+    return float(np.mean(square < chi2.ppf(0.95, 3)))
+
+
+def _rms(off: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
+
+
+def _figures(poses: int, found: list[Found]) -> list[Figure]:
+    """Figures of the arms of one number of poses."""
+    ratio = np.array([f.rms_m / f.best_m for f in found])
+    inside = float(np.mean([f.inside for f in found]))
+    verdicts = [f.verdict for f in found]
+    each = ", ".join(f"{verdicts.count(v)} {v}" for v in dict.fromkeys(verdicts))
+    middle = float(np.exp(np.mean(np.log(ratio))))
+    best = 1e6 * float(np.median([f.best_m for f in found]))
+    least = min(f.inside for f in found)
+    return [
+        Figure(
+            f"{poses} positions: error at {TEST} others by that of the best linear predictor, "
+            f"geometric mean of {len(found)} arms (largest)",
+            f"{middle:.2f} ({ratio.max():.2f}); the best leaves {best:.0f} µm (median)",
+            f"at most {MOST_RATIO}",
+            middle <= MOST_RATIO,
+        ),
+        Figure(
+            f"{poses} positions: of them within their 95 % band (least arm)",
+            f"{inside:.0%} ({least:.0%})",
+            f"{BAND[0]:.0%} to {BAND[1]:.0%}",
+            BAND[0] <= inside <= BAND[1],
+        ),
+        Figure(f"{poses} positions: verdicts", each),
+    ]
