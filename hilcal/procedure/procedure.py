@@ -235,8 +235,7 @@ class Procedure(ValidationSteps):
             )
             content = found.to_json()
             if found.measures and found.plan is not None:
-                plan = run.with_new_names(found.plan)
-                say("checking every motion in a dry run")
+                plan = run.with_new_names(found.plan)  # `run` checks every motion of it
                 log.append(DECIDED, {"action": MEASURE, **content}, plan=plan)
             else:
                 log.append(DECIDED, {"action": STOP, **content})
