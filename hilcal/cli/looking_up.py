@@ -32,6 +32,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
+from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.document import Table, note, table
 from hilcal.present.preparing import (
@@ -68,10 +69,12 @@ def effects(
         needs = f"; needs {', '.join(e.needs)}" if e.needs else ""
         count = len(e.parameters)
         facts = f"{count} parameter{'s' if count != 1 else ''}, {units}{needs}"
-        out.add(e.name, f"{e.summary}\n{facts}")
+        out.add(e.name, f"{e.summary}\n{facts}{_expected(e)}")
     t.show(out)
     notes = [
-        f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have.",
+        f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have; "
+        "expected: the standard deviation before anything is measured, which [ordinary] changes, a "
+        "factor of 7 either way.",
         *(
             f"from {file.path}: {', '.join(e.name for e in file.effects)}"
             for file in catalogue.files
@@ -81,6 +84,15 @@ def effects(
     t.show(["", _options_table(made, defaults)])
     t.show(note(OPTIONS_NOTE))
     t.document({"effects": [_document(e, defaults[e.name], catalogue) for e in made]})
+
+
+def _expected(e: Effect) -> str:
+    """Say how large the families of an effect are expected to be; the largest of each unit."""
+    largest: dict[str, float] = {}
+    for _, std, unit in expected_sizes(e):
+        largest[unit] = max(largest.get(unit, 0.0), std)
+    sizes = ", ".join(f"{std:.2g} {unit}" for unit, std in largest.items())
+    return f"; expected {sizes}" if sizes else ""
 
 
 def _options_table(made: list[Effect], defaults: dict[str, dict[str, object]]) -> Table:
@@ -110,6 +122,9 @@ def _document(e: Effect, defaults: dict[str, object], catalogue: Catalogue) -> d
         "plausible": None
         if not np.isfinite(e.most())
         else {q.unit: e.most() * q.scale for q in e.parameters},
+        "expected": [
+            {"family": name, "std": std, "unit": unit} for name, std, unit in expected_sizes(e)
+        ],
         "source": _source(type(e), catalogue),
     }
 

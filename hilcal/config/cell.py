@@ -321,6 +321,12 @@ class CellConfig(Section):
     )
     sight: Sight = Field(default_factory=Sight, description="a section [sight]")
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
+    ordinary: dict[str, Positive] = Field(
+        default_factory=dict,
+        description="a section [ordinary]: how many times as large as on other arms an effect is "
+        "expected, by its name, e.g. transmission_error = 0.1 of precise gears",
+        examples=[{"transmission_error": 0.1}],
+    )
     plausible: dict[str, Positive] = Field(
         default_factory=dict,
         description="a section [plausible]: how many times as large as stated an effect may be, "

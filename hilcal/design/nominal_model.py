@@ -247,9 +247,9 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
     """Refuse effects of a configuration that cannot be planned with, before anything is done.
 
     Raises:
-        InputError: an unknown effect in `[planning] model` or `against` or in `[plausible]` (lists
-            the valid ones), options that cannot be read, or an effect that needs what a plan does
-            not fix.
+        InputError: an unknown effect in `[planning] model` or `against`, in `[plausible]` or
+            `[ordinary]` (lists the valid ones), options that cannot be read, or an effect that
+            needs what a plan does not fix.
     """
     try:
         model = nominal_model(cell, config, catalogue=catalogue).model
@@ -258,11 +258,12 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
         known = words.startswith("[planning]")
         raise InputError(words if known else f"[planning] model: {words}") from None
     potential_names(config, model)
-    for name in config.plausible:
-        try:
-            catalogue[name]
-        except InputError as error:
-            raise InputError(f"[plausible]: {error}") from None
+    for section in ("plausible", "ordinary"):
+        for name in getattr(config, section):
+            try:
+                catalogue[name]
+            except InputError as error:
+                raise InputError(f"[{section}]: {error}") from None
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:

@@ -162,14 +162,17 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
     """Effects that are not in the model, or are finer than one of it, and can be computed.
 
     Raises:
-        InputError: `[plausible]` of the cell names an effect that the catalogue does not hold.
+        InputError: `[plausible]` or `[ordinary]` of the cell names an effect that the catalogue
+            does not hold.
     """
     states = fit.readings[~fit.outlier].states
     model, out = fit.model, []
-    for name in model.cell.config.plausible if model.cell.config else ():
-        if name not in model.catalogue.names:
-            valid = ", ".join(model.catalogue.names)
-            raise InputError(f"[plausible] {name}: no such effect; valid: {valid}")
+    config = model.cell.config
+    for section in ("plausible", "ordinary") if config else ():
+        for name in getattr(config, section):
+            if name not in model.catalogue.names:
+                valid = ", ".join(model.catalogue.names)
+                raise InputError(f"[{section}] {name}: no such effect; valid: {valid}")
     for kind in model.catalogue.effects:
         if kind.name not in model.names and kind.computable(states):
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)

@@ -342,6 +342,13 @@ class Effect(ABC):
         """
         return -0.7, OWN_SPREAD
 
+    def expected_log_std(self, pool: int) -> tuple[float, float]:
+        """`log_std_prior` times the factor that `[ordinary]` of the cell has for the effect."""
+        mean, spread = self.log_std_prior(pool)
+        config = self.cell.config
+        factor = 1.0 if config is None else config.ordinary.get(type(self).name, 1.0)
+        return mean + float(np.log(factor)), spread
+
     def prior_std(self) -> Floats | None:
         """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
         return None

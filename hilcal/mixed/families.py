@@ -86,6 +86,17 @@ def families_of(model: Model) -> Families:
     return Families(np.concatenate([np.zeros(0, dtype=np.int64), *frames]), tuple(random))
 
 
+def expected_sizes(effect: Effect) -> tuple[tuple[str, float, str], ...]:
+    """Return what is expected of the families of an effect: name, standard deviation (SI), unit."""
+    if effect.role in FRAME_ROLES:
+        return ()
+    units, index = [p.unit for p in effect.parameters], np.arange(len(effect.parameters))
+    return tuple(
+        (f.name, float(np.exp(f.prior.mean) * np.median(f.magnitude)), units[f.parameters[0]])
+        for f in _of_effect(effect, index)
+    )
+
+
 def _of_effect(effect: Effect, index: Ints) -> list[Family]:
     units = [p.unit for p in effect.parameters]
     pools = effect.pools()
@@ -97,7 +108,7 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
         unit, pool = key
         parts = [unit] * several_units + [str(pool)] * several_pools
         name = f"{effect.name}[{', '.join(parts)}]" if parts else effect.name
-        prior = effect.log_std_prior(pool)
+        prior = effect.expected_log_std(pool)
         out.append(
             Family(name, effect.name, index[own], effect.magnitudes[own], LogStdPrior(*prior))
         )

@@ -29,6 +29,10 @@ Capsys = pytest.CaptureFixture[str]
             "[plausible]\nlink_geometri = 4.0",
             "[plausible]: unknown effect 'link_geometri' (did you mean \"link_geometry\"?)",
         ),
+        (
+            "[ordinary]\ncrep = 0.1",
+            "[ordinary]: unknown effect 'crep' (did you mean \"creep\"?)",
+        ),
     ],
 )
 def test_an_unknown_effect_is_one_line(

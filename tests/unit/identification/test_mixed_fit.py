@@ -1,5 +1,7 @@
 """All effects at once, fitted to simulated campaigns."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,20 @@ def test_a_hidden_effect_is_predicted_at_fresh_poses_and_has_the_evidence() -> N
     k = found.problem.families.names.index(HIDDEN)
     rng, log_std = np.random.default_rng(0), found.variances.log_std
     assert evidence(found.problem, k, rng, log_std).p_value < 0.01
+
+
+def test_a_cell_says_how_large_an_effect_is_expected_to_be() -> None:
+    """It moves where a size begins, and what the readings do not tell stays there."""
+    sizes = {}
+    for factor in (1.0, 0.1):
+        config = CONFIG.model_copy(update={"ordinary": {"tracker_scale": factor}})
+        case = study_case(config, "ur10e", "absolute", (HIDDEN,), 3.0, 1, n_poses=8)
+        cell = replace(case.cell, config=config)
+        found = mixed_fit(baseline(cell, case.readings, "absolute"), case.readings, "absolute")
+        (f,) = (f for f in found.problem.families.random if f.effect == "tracker_scale")
+        assert f.prior.mean == pytest.approx(np.log(0.5 * factor), abs=0.01)
+        sizes[factor] = found.std("tracker_scale")
+    assert sizes[0.1] < 0.3 * sizes[1.0]
 
 
 def test_a_hidden_effect_of_deflections_has_the_evidence() -> None:
