@@ -21,6 +21,7 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.engine.engine import open_engine
+from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit
@@ -61,11 +62,13 @@ class Case:
         poses: how many are fitted.
         seed: of arm, poses and noise.
         factor: k, of all sizes.
+        without: whether it is refined without a background, too.
     """
 
     poses: int
     seed: int
     factor: float
+    without: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +83,7 @@ class Found:
         inside: share of the others within their 95 % band.
         named: effects that the last model names.
         verdict: of it.
+        without_m: rms error without a background; None where that was not asked for.
     """
 
     poses: int
@@ -89,6 +93,7 @@ class Found:
     inside: float
     named: tuple[str, ...]
     verdict: str
+    without_m: float | None
 
 
 def all_effects(
@@ -97,6 +102,9 @@ def all_effects(
     sizes: Annotated[
         float, typer.Option("--sizes", help="Factor of all sizes at most, either way.")
     ] = 1.0,
+    without: Annotated[
+        bool, typer.Option("--without", help="Also refine without a background.")
+    ] = False,
     first_seed: Annotated[int, typer.Option("--first-seed", help="Of the arms.")] = 0,
     jobs: OneJob = None,
     scheduler: Scheduler = None,
@@ -107,23 +115,26 @@ def all_effects(
     t = terminal(as_json)
     counts = [int(n) for n in poses.split(",")]
     cases = [
-        Case(n, s, float(sizes ** np.random.default_rng([s, 1]).uniform(-1, 1)))
+        Case(n, s, float(sizes ** np.random.default_rng([s, 1]).uniform(-1, 1)), without)
         for n, s in product(counts, range(first_seed, first_seed + seeds))
     ]
     with (
         open_engine(*one_by_default(jobs, scheduler)) as engine,
         counting(t.progress, "arms", len(cases)) as advance,
     ):
-        done: Sequence[Found] = engine.map(refined, cases, advance=advance)
-    figures = [f for n in counts for f in _figures(n, [d for d in done if d.poses == n])]
+        done: Sequence[Found | None] = engine.map(refined, cases, advance=advance)
+    known = [d for d in done if d is not None]
+    figures = [f for n in counts for f in _figures(n, [d for d in known if d.poses == n])]
+    if refused := len(done) - len(known):
+        figures.append(Figure("campaigns refused: the arm is not as described", f"{refused}"))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
     keep(keep_file, f"All effects at once, sizes 1/{sizes:g} to {sizes:g} times ordinary", figures)
-    t.document({"cases": [asdict(d) for d in done]})
+    t.document({"cases": [asdict(d) for d in known]})
 
 
-def refined(case: Case) -> Found:
-    """Refine the poses of a case, and predict the others."""
+def refined(case: Case) -> Found | None:
+    """Refine the poses of a case, and predict the others; None where the program refuses them."""
     rng = np.random.default_rng(case.seed)
     cell = cell_from_config(
         CellConfig.model_validate(
@@ -136,7 +147,11 @@ def refined(case: Case) -> Found:
     q = rng.uniform(-TURN, TURN, (case.poses + TEST, cell.arm.n))
     every, model, theta, log_std = _measured(cell, q, case.factor, rng)
     some, test = every[np.arange(case.poses)], every[np.arange(case.poses, len(every))]
-    last = refine(baseline(cell, some, "absolute"), some, "absolute")
+    try:
+        start = baseline(cell, some, "absolute")
+    except InputError:
+        return None
+    last = refine(start, some, "absolute")
     off = test.value - last.fit.model.predict(test.states, last.fit.theta).observation.position
     inside = _inside(last.fit, test, off)
     problem = linearised_problem(model, some, "absolute", theta)
@@ -145,6 +160,11 @@ def refined(case: Case) -> Found:
     known = problem.parameters(best.coordinates, model.size)
     ideal = test.value - model.predict(test.states, known).observation.position
     names = last.fit.model.named
+    without = None
+    if case.without:
+        plain = refine(start, some, "absolute", background=False).fit
+        position = plain.model.predict(test.states, plain.theta).observation.position
+        without = _rms(test.value - position)
     return Found(
         case.poses,
         case.factor,
@@ -153,6 +173,7 @@ def refined(case: Case) -> Found:
         inside,
         tuple(n for n in names if n not in ("base_frame", "target_offset")),
         last.verdict,
+        without,
     )
 
 
@@ -204,7 +225,15 @@ def _figures(poses: int, found: list[Found]) -> list[Figure]:
     middle = float(np.exp(np.mean(np.log(ratio))))
     best = 1e6 * float(np.median([f.best_m for f in found]))
     least = min(f.inside for f in found)
+    beside = np.array([f.rms_m / f.without_m for f in found if f.without_m])
+    more = []
+    if len(beside):
+        mean = float(np.exp(np.mean(np.log(beside))))
+        what = "error by that of refine without a background, geometric mean (largest)"
+        words = f"{mean:.2f} ({beside.max():.2f})"
+        more.append(Figure(f"{poses} positions: {what}", words, "at most 1", mean <= 1.0))
     return [
+        *more,
         Figure(
             f"{poses} positions: error at {TEST} others by that of the best linear predictor, "
             f"geometric mean of {len(found)} arms (largest)",

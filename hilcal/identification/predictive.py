@@ -18,9 +18,13 @@ W is the stated covariance V, with more for positions or attitudes where their r
 (`excess`): a misfit has not the shape of an instrument's noise. W, C and the residual that
 parameters with this W and Λ leave belong together; they are found by turns.
 Where the model has a background its standard deviations are in units of the instrument's noise,
-σ is the factor of that as the mixed model estimates it, also where the arm's scatter is stated, and
-κ at least what the uncertainty of the variances makes of it (see `variance_spread`). Else σ² is
-from the residual, at least 1.
+and σ is the factor of that as the mixed model estimates it, also where the arm's scatter is stated.
+The uncertainty of the variances makes C larger by how far it moves the parameters (see
+`mixed.prediction`), and κ is at least what it makes of predictions on the whole (see
+`variance_spread`). Both hold that motion, once where it acts and once as a mean: with 20, 30 and 60
+poses of 30 simulated arms that have all effects, 95, 92 and 95 % of other poses are then in their
+95 % band, and 93, 89 and 93 % with κ alone. Without a background σ² is from the residual, at
+least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
 that was found there: what repeats itself in new poses. The variance is that of the folds as they
@@ -126,7 +130,7 @@ def predictive(
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
-    known, least = None, 1.0
+    known, least, of_sizes = None, 1.0, np.zeros((model.size, model.size))
     if model.background:
         variances = mixed_fit_at(model, fitted.as_stated(), mode, theta)
         arm = fitted.arm_scatter  # whose factor the standard deviations are in units of
@@ -135,6 +139,9 @@ def predictive(
         least = variance_spread(
             variances, stated.rows_of(random_folds(distinct_poses(fitted)[stated.reading]))
         )
+        e = variances.equations
+        by = e.problem.parameters(e.sensitivity, model.size)
+        of_sizes = by @ variances.covariance @ by.T
     of = coordinates_of(model)
     chosen = of.prior(prior)
     std = of.prior(open_prior(model, theta, prior))
@@ -181,7 +188,8 @@ def predictive(
     root = of.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
-        model, theta, root @ root.T, open_prior(model, theta, prior), more, noise, factor, least,
+        model, theta, root @ root.T + of_sizes, open_prior(model, theta, prior), more, noise,
+        factor, least,
         leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
     )  # fmt: skip
 
