@@ -18,6 +18,7 @@ from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
 from studies.discover_real_command import discover_real
 from studies.few_poses_command import few_poses
+from studies.few_poses_picture import few_poses_picture
 from studies.gross_errors_command import gross_errors
 from studies.plans_command import plans
 from studies.real_command import real
@@ -40,6 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)
     app.command("few-poses")(few_poses)
+    app.command("few-poses-picture")(few_poses_picture)
     app.command("all-effects")(all_effects)
     app.command("scaling")(scaling)
     app.command("serial-noise")(serial_noise)

@@ -1,0 +1,110 @@
+"""`python -m studies few-poses-picture`: two pictures of the page on naming and predicting.
+
+The mean error at other poses against their number, of what `python -m studies few-poses` kept; and
+what an arm is made of, of a campaign that `hilcal refine` gave a background.
+"""
+
+import json
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import plotly.graph_objects as go
+import typer
+
+from hilcal.campaign.campaign import Campaign
+from hilcal.errors import InputError
+from hilcal.identification.family_sizes import family_sizes
+from hilcal.present.charts.made_of import made_of
+from hilcal.present.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
+from hilcal.whole_file import replace_file
+from studies.carry_picture import HEIGHT, WIDTH, svg
+from studies.few_poses_command import SKETCH_MM
+
+MEAN = re.compile(r"(\S+), (\d+) positions: mean error at .*")
+SERIES = {
+    "Series_B": ("UR10, series B", MEASURED, "circle"),
+    "Series_C": ("UR10, series C", HOLDOUT, "diamond"),
+    "jacobi_ur5": ("UR5", "#2a9d8f", "square"),
+}
+RIDGE_MM = {
+    "Series_B": {20: 0.474, 30: 0.443, 60: 0.414, 120: 0.412},
+    "Series_C": {20: 0.532, 30: 0.504, 60: 0.458, 120: 0.447},
+}
+FRAMES_MM = {
+    "Series_B": {20: 1.05, 30: 1.05, 60: 1.05, 120: 1.05},
+    "Series_C": {20: 0.94, 30: 0.92, 60: 0.91, 120: 0.90},
+}
+"""Mean error of the frames alone, and of the geometry with a ridge of 0.5 mm and 0.5 mrad, one draw
+of the same positions each."""
+
+
+def few_poses_picture(
+    kept: Annotated[list[Path], typer.Argument(metavar="F.json...", help="What was kept.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="F.svg", help="The picture.")],
+    of: Annotated[
+        Path | None,
+        typer.Option("--of", metavar="RUN.hilcal", help="Draw what its arm is made of."),
+    ] = None,
+    made: Annotated[
+        Path | None, typer.Option("--made-of", metavar="F.svg", help="The picture of it.")
+    ] = None,
+) -> None:
+    """Draw the error against the number of poses."""
+    errors: dict[str, dict[int, float]] = {}
+    for path in kept:
+        try:
+            figures = json.loads(path.read_text(encoding="utf-8"))["figures"]
+        except (OSError, KeyError, ValueError) as error:
+            raise InputError(f"{path}: not kept by studies few-poses ({error})") from None
+        for f in figures:
+            if found := MEAN.fullmatch(f["what"]):
+                mean = float(f["measured"].split()[0])
+                errors.setdefault(found[1], {})[int(found[2])] = mean
+    replace_file(output, svg(chart(errors)))
+    if of is not None and made is not None:
+        with Campaign.open(of, read_only=True) as run:
+            drawn = made_of(family_sizes(run.fit()))
+        drawn.update_layout(paper_bgcolor=LIGHT, width=WIDTH)
+        replace_file(made, svg(drawn))
+
+
+def chart(errors: dict[str, dict[int, float]]) -> go.Figure:
+    """Return the figure of mean errors, mm, by series and number of poses."""
+    traces: list[go.Scatter] = []
+    for series, (name, colour, symbol) in SERIES.items():
+        for words, found, dash, ink in (
+            ("hilcal", errors.get(series, {}), "solid", colour),
+            ("sketch", SKETCH_MM.get(series, {}), "dot", colour),
+            ("geometry, ridge", RIDGE_MM.get(series, {}), "dash", GREY),
+            ("frames alone", FRAMES_MM.get(series, {}), "longdash", GREY),
+        ):
+            if found:
+                traces.append(_line(f"{name}: {words}", found, dash, ink, symbol))
+    ticks: Sequence[int] = sorted({n for found in errors.values() for n in found})
+    out = figure(
+        "All effects at once, from few poses.",
+        "random positions fitted",
+        "mean error at 500 others, mm",
+        HEIGHT,
+        traces,
+        width=WIDTH,
+        paper_bgcolor=LIGHT,
+        legend={"orientation": "v", "x": 1.02, "xanchor": "left", "y": 1.0, "yanchor": "top"},
+    )
+    out.update_xaxes(type="log", tickvals=list(ticks))
+    out.update_yaxes(type="log", tickvals=[0.05, 0.1, 0.2, 0.5, 1.0])
+    return out
+
+
+def _line(name: str, found: dict[int, float], dash: str, colour: str, symbol: str) -> go.Scatter:
+    at = sorted(found)
+    return go.Scatter(
+        x=at,
+        y=[found[n] for n in at],
+        mode="lines+markers",
+        name=name,
+        line={"color": colour, "dash": dash},
+        marker={"symbol": symbol, "size": 7},
+    )
