@@ -5,17 +5,19 @@ A reading is hz, v (from the zenith) and slope distance d, turned into
     x = d sin(v) sin(hz)    y = d sin(v) cos(hz)    z = d cos(v)
 
 Source: Leica Geosystems, GeoCOM Reference Manual.
+
+What a GeoCOM instrument answers to a measurement, checked.
 """
 
 import time
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NoReturn
 
 import numpy as np
 from pydantic import Field
 
 from drivers import geocom_codes as geo
-from drivers.geocom_line import ANSWER_S, DEVICE, Link
-from drivers.geocom_reading import PolarReading, numbers, plausible, usable
+from drivers.geocom_line import ANSWER_S, DEVICE, Link, Reply
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.errors import DeviceError, InputError
@@ -34,6 +36,37 @@ SEARCHING_S = 20.0
 _LEAST_S = 1.0
 _DISTANCE, _CORRECTED, _DISTANCE_PROGRAM = 1, 1, 2  # TMC_DEF_DIST, TMC_AUTO_INC, BAP_DEF_DIST
 _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
+TURN = 2.0 * np.pi + 1e-6
+"""Of a full circle, rad, with what rounding adds."""
+LARGEST_STD = 0.01
+"""rad; a choice, a thousand times what the poorest total station states (2 mgon)."""
+LARGEST_TILT = 0.5 * np.pi
+"""rad; no station measures upside down."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolarReading:
+    """One measurement as the instrument gives it.
+
+    Attributes:
+        host_ns: `time.monotonic_ns` right after it came.
+        hz: horizontal angle, rad.
+        v: angle from the zenith, rad.
+        distance: slope distance, m; 0 is none.
+        angle_std: what it states of both angles, rad; 0 where it does not tell.
+        tilt: inclination across and along, rad.
+        measured_ms: when the distance was measured, ms of its own clock; 0 is unknown.
+        warning: what it remarks.
+    """
+
+    host_ns: int
+    hz: float
+    v: float
+    distance: float
+    angle_std: float = 0.0
+    tilt: tuple[float, float] | None = None
+    measured_ms: float = 0.0
+    warning: str = ""
 
 
 class Options(Section):
@@ -319,3 +352,51 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
 def _text(value: str) -> str:
     """Text without its quotation marks."""
     return value.strip('"')
+
+
+def usable(answer: Reply) -> str:
+    """Return the remark of a usable measurement, empty for none.
+
+    Raises:
+        TargetLostError: it has no distance.
+        DeviceError: it is none.
+    """
+    if answer.code == geo.OK:
+        return ""
+    if answer.code in geo.WARNINGS:
+        return geo.WARNINGS[answer.code]
+    raise geo.failure("measuring", answer.code)
+
+
+def numbers(answer: Reply, count: int) -> Floats:
+    """Return the (count,) numbers of a measurement.
+
+    Raises:
+        DeviceError: there are more or fewer, or one is not finite.
+    """
+    numbers = np.array(answer.values, dtype=np.float64)
+    if numbers.shape != (count,):
+        _strange(f"{len(answer.values)} values instead of {count}")
+    if not np.all(np.isfinite(numbers)):
+        _strange("values that are no numbers")
+    return numbers
+
+
+def plausible(polar: PolarReading) -> PolarReading:
+    """Return a measurement whose angles are some that an instrument can have.
+
+    Raises:
+        DeviceError: an angle beyond a full turn (`TURN`), or a standard deviation or inclination
+            of angles beyond `LARGEST_STD`, `LARGEST_TILT`.
+    """
+    if not (abs(polar.hz) <= TURN and 0.0 <= polar.v <= TURN):
+        _strange(f"angles of {polar.hz:.6g} and {polar.v:.6g} rad")
+    if not 0.0 <= polar.angle_std <= LARGEST_STD:
+        _strange(f"a standard deviation of its angles of {polar.angle_std:.3g} rad")
+    if polar.tilt is not None and max(map(abs, polar.tilt)) > LARGEST_TILT:
+        _strange(f"an inclination of {max(map(abs, polar.tilt)):.3g} rad")
+    return polar
+
+
+def _strange(what: str) -> NoReturn:
+    raise DeviceError(f"{DEVICE}: measuring: the instrument gives {what}; is it a GeoCOM station?")

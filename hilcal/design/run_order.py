@@ -1,7 +1,13 @@
-"""The order in which chosen readings are taken: short, and little correlated with drift."""
+"""The order in which chosen readings are taken: short, and little correlated with drift.
 
-from collections.abc import Mapping, Sequence
+Which straight motions between the poses of a plan are clear, and what they take.
+
+Load blocks of a plan: loops from the reference under one load, and their sequence.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import permutations
 from typing import Literal
 
 import numpy as np
@@ -10,16 +16,76 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.confounding import Confounding, confounding
-from hilcal.design.load_blocks import Block, Stop, assembled, load_order
-from hilcal.design.passages import Passable, Ways, ways
 from hilcal.design.timing import Duration, Pace, pace, timeline
+from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.store.plan import REFERENCE, UNLOADED, Plan
-from hilcal.types import Floats
+from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
+from hilcal.types import Bools, Floats, Ints
 
 _SHRINK = 0.75  # of the time given to the walks, where a draw became too long; a choice
 _TRIES = 10  # draws of one order that may become too long; a choice
 _MOVES = 30  # steps of a random walk per stop; a choice: each stop is moved many times
+Passable = Callable[[Floats, Floats, str], Bools]
+"""passable(start (n,), ends (M, n), load) -> (M,): which straight motions in joint space are
+clear under a load."""
+NEAR = 24
+"""Neighbours of a pose to which motions are tested; to others the arm goes by the reference.
+A choice."""
+_ALL = 6  # loads up to which every order is tried
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """A reading at a pose under the load of its block.
+
+    Attributes:
+        pose: index from 1; 0 is the reference.
+        cycle: its cycle.
+    """
+
+    pose: int
+    cycle: int
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """What is measured while one load hangs.
+
+    Attributes:
+        load: its name.
+        loops: stops of each loop from the reference.
+        seconds: what the loops take, s.
+    """
+
+    load: str
+    loops: tuple[tuple[Stop, ...], ...]
+    seconds: float
+
+    @property
+    def count(self) -> int:
+        """Number of stops."""
+        return sum(len(loop) for loop in self.loops)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ways:
+    """Ways under one load between the reference, index 0, and P poses.
+
+    Attributes:
+        direct: (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear.
+        seconds: the same, or by the reference with a reading there where that is needed.
+    """
+
+    direct: Floats
+    seconds: Floats
+
+    def among(self, which: Ints) -> "Ways":
+        """Return the ways between the reference and some stops, poses (m,) from 1.
+
+        Between two stops at the same pose the arm goes by the reference: it is to arrive anew.
+        """
+        grid = np.ix_(*[np.concatenate([[0], which])] * 2)
+        return Ways(self.direct[grid], self.seconds[grid])
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,3 +423,97 @@ class OrderDraws:
         time, times = timeline(plan, self.cell.arm, margin, self.pace)
         how = self.how
         return time, confounding(plan, times, self.wrenches, how.drift, how.reading_std)
+
+
+def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR) -> Ways:
+    """Return the ways between poses under a load.
+
+    Args:
+        q: (P + 1, n) joint angles, rad; the reference first.
+        load: name of the load that hangs.
+        passable: which motions are clear.
+        pace: seconds of motions and readings.
+        near: neighbours to which motions are tested; the nearest in time.
+    """
+    legs = pace.legs(q, q)
+    count = len(q)
+    close = np.argsort(legs, axis=1, kind="stable")[:, : near + 1]
+    tested = np.zeros((count, count), dtype=np.bool_)
+    tested[np.arange(count)[:, None], close] = True
+    tested |= tested.T
+    tested[0] = tested[:, 0] = True
+    np.fill_diagonal(tested, False)
+    direct = np.full((count, count), NEVER)
+    for k in range(count):
+        ends = np.flatnonzero(tested[k])
+        if len(ends):
+            clear = ends[passable(q[k], q[ends], load)]
+            direct[k, clear] = legs[k, clear]
+    around = direct[:, :1] + pace.reading_s + direct[:1]
+    return Ways(direct, np.minimum(np.minimum(direct, around), NEVER))
+
+
+def load_order(
+    before: Block, loaded: Sequence[Block], after: Block, wrenches: Mapping[str, Floats], at: Pace
+) -> list[int]:
+    """Return the order of the loads whose wrenches are least correlated with their lags.
+
+    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and
+    n_l readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|),
+    the lengths weighted by n as well. Of equal orders the first one in the order given.
+    """
+    count = len(loaded)
+    if count < 2:
+        return list(range(count))
+    span = np.array([at.change_s + block.seconds for block in loaded])
+    n = np.array([float(block.count) for block in loaded])
+    w = np.array([wrenches[block.load] for block in loaded])
+    w = w[:, np.any(w != 0, axis=0)]
+    if count <= _ALL:
+        tries = np.array(list(permutations(range(count))))
+    else:
+        draws = np.random.default_rng(0)
+        tries = np.array([np.arange(count), *(draws.permutation(count) for _ in range(2000))])
+    end = before.seconds + np.cumsum(span[tries], axis=1)
+    middle = end - span[tries] / 2
+    free = before.count * before.seconds / 2
+    free += after.count * (before.seconds + span.sum() + at.change_s + after.seconds / 2)
+    lag = middle - free / max(before.count + after.count, 1)
+    top = np.abs(np.einsum("tl,tlk->tk", n[tries] * lag, w[tries]))
+    size = np.sqrt(np.einsum("tl,tl->t", n[tries], lag**2))[:, None]
+    size = size * np.sqrt(np.einsum("l,lk->k", n, w**2))
+    worst = (top / size).max(axis=1)
+    return [int(k) for k in tries[int(np.argmin(np.round(worst, 9)))]]
+
+
+def assembled(
+    names: Sequence[str], before: Block, loaded: Sequence[Block], after: Block
+) -> tuple[Step, ...]:
+    """Return the steps of the blocks; the reference is read before and after every loop.
+
+    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles, spread
+    over all of them, so that each has its unloaded one.
+    """
+    free = (*before.loops, *after.loops)
+    passes = max([len(block.loops) + 1 for block in loaded], default=0)
+    natural = 1 + len(free) + (1 if loaded else 0)
+    returns = max(passes, natural)
+    at = iter(range(returns))
+    steps = [Step(REFERENCE, UNLOADED, next(at))]
+    for loop in before.loops:
+        steps += [Step(names[s.pose - 1], UNLOADED, s.cycle) for s in loop]
+        steps.append(Step(REFERENCE, UNLOADED, next(at)))
+    for block in loaded:
+        share = np.round(np.linspace(0, returns - 1, len(block.loops) + 1)).astype(int).tolist()
+        cycles = iter(share)
+        steps.append(Step(REFERENCE, block.load, next(cycles)))
+        for loop in block.loops:
+            steps += [Step(names[s.pose - 1], block.load, s.cycle) for s in loop]
+            steps.append(Step(REFERENCE, block.load, next(cycles)))
+    if loaded:
+        steps.append(Step(REFERENCE, UNLOADED, next(at)))
+    for loop in after.loops:
+        steps += [Step(names[s.pose - 1], UNLOADED, s.cycle) for s in loop]
+        steps.append(Step(REFERENCE, UNLOADED, next(at)))
+    steps += [Step(REFERENCE, UNLOADED, k) for k in at]
+    return tuple(steps)

@@ -1,6 +1,8 @@
 """The summary of a plan: predicted precision, criterion comparison, sample-size curve, cost.
 
 One value, computed once; terminal, JSON and viewer read it directly, the plan's file holds `about`.
+
+Minimum detectable strength of the effects that a plan's model does not have.
 """
 
 from collections.abc import Iterator
@@ -10,10 +12,10 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import relax
+from hilcal.design.candidates import reading_derivatives
 from hilcal.design.choice import choose, choose_poses, only, unknown
 from hilcal.design.compound_criteria import compound_objective
 from hilcal.design.confounding import Confounding
-from hilcal.design.detectable import DetectableEffect, detectable_effects
 from hilcal.design.information import Problem
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import Predicted, predicted
@@ -21,6 +23,7 @@ from hilcal.design.timing import Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import schur_complement
+from hilcal.regression.spectrum import VISIBLE
 from hilcal.store.plan import REFERENCE
 from hilcal.types import Floats
 
@@ -36,6 +39,23 @@ _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
 }
+DRAWS = 5
+"""Random directions of an effect whose median is its minimum detectable strength. A choice."""
+_SEED = 20240611
+
+
+@dataclass(frozen=True, slots=True)
+class DetectableEffect:
+    """Minimum detectable strength of an effect outside of the model.
+
+    Attributes:
+        effect: its name.
+        least_m: rms displacement of the target, m, whose whitened residual after fitting the
+            model is one sigma; None where the model absorbs the effect.
+    """
+
+    effect: str
+    least_m: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -377,3 +397,40 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         position = _finite(predicted(of, information=whole, work=planned.work).position)
         if position is not None:
             yield CurvePoint(poses, position)
+
+
+def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
+    """Yield the minimum detectable strength of each effect outside of the model.
+
+    Of some directions of the effect's parameters the median: rms of the displacement, over the
+    plan's poses and loads, divided by the root of the non-centrality beyond the model.
+    """
+    of, size = planned.problem, planned.problem.model_size
+    taken = np.flatnonzero(planned.counts)
+    information = of.measured + of.units.information(planned.counts[taken], taken)
+    model = of.prior[:size, :size] - of.measured[:size, :size]
+    information[:size, :size] += model
+    poses = sorted({of.what[k][0] for k in taken})
+    chosen = type(of.candidates)(
+        of.candidates.q[poses],
+        of.candidates.loads,
+        of.candidates.wrench,
+        of.candidates.allowed[poses],
+    )
+    moves = [
+        part.jacobian[:, 1:] - part.jacobian[:, :1] if of.mode == "deflection" else part.jacobian
+        for part in reading_derivatives(of.nominal, config, chosen, of.families, of.scale)
+    ]
+    moved = np.concatenate([block[..., :3, :].reshape(-1, len(of.terms)) for block in moves])
+    rng = np.random.default_rng(_SEED)
+    for effect in of.families:
+        where = of.of_effect(effect.name)
+        left = schur_complement(information, where, np.arange(size))
+        least = []
+        for _ in range(DRAWS):
+            beta = rng.standard_normal(len(where))
+            apart = float(beta @ left @ beta)
+            size_m = float(np.sqrt(3.0 * np.mean((moved[:, where] @ beta) ** 2)))
+            least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
+        smallest = float(np.median(least))
+        yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)

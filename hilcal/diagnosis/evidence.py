@@ -1,7 +1,16 @@
-"""What the readings say of a fit, each part computed when it is first needed, and once."""
+"""What the readings say of a fit, each part computed when it is first needed, and once.
 
-from collections.abc import Callable, Collection
+One step of backward elimination: effects without which the readings are explained as well.
+
+An effect that was added early, in place of another that was found later, is often redundant in
+the end. It is scored like a suspect of the model without it, at the same linearisation; it is
+redundant where its F-test is not significant.
+"""
+
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 
 from scipy.stats import chi2
 
@@ -12,11 +21,11 @@ from hilcal.diagnosis.background_evidence import (
     background_evidence,
     p_value_of_others,
 )
-from hilcal.diagnosis.backward_elimination import backward_elimination, spoken_against
 from hilcal.diagnosis.catalogue_sufficiency import Insufficiency, insufficiency
 from hilcal.diagnosis.effect_ranking import (
     FALSE_ALARM,
     LEAST_SHARE,
+    SAME_EVIDENCE,
     Suspect,
     candidates,
     rank_suspects,
@@ -32,10 +41,19 @@ from hilcal.diagnosis.wrong_figures import WrongFigure, wrong_figures
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import estimate_arm_scatter, with_arm_scatter
+from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.linearisation import Linearisation, linearise
+from hilcal.identification.linearisation import (
+    Linearisation,
+    eliminate_effect,
+    linearise,
+    model_columns,
+)
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.regression.evidence import FamilyScore
+
+CHANCE = 0.01
+"""An effect with a smaller p-value is kept."""
 
 
 class Evidence:
@@ -183,3 +201,57 @@ class Evidence:
             self._known |= {key: algebra.of(key[0], excluded) for key in keys}
             self._eliminated |= algebra.eliminated
         return tuple(self._known[key] for key in keys)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Redundant:
+    """An effect that can be removed.
+
+    Attributes:
+        effect: canonical name.
+        score: of its columns, against the model without it.
+    """
+
+    effect: str
+    score: FamilyScore
+
+
+def backward_elimination(
+    fit: Fit, known: Mapping[str, FamilyScore] = MappingProxyType({})
+) -> tuple[Redundant, ...]:
+    """Return the redundant effects of a fit, the least significant first.
+
+    Those with a carried prior are judged by `spoken_against`: other readings speak for them; random
+    ones by `background_evidence`.
+
+    Args:
+        fit: the fit.
+        known: scores of its effects against the model without them, as far as they were made.
+    """
+    carried = fit.solution.space.carried(fit.model.size)
+    judged = [
+        e.name
+        for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
+        if e.role == "effect" and e.name not in fit.model.random and not carried[mine].any()
+    ]
+    if not judged:
+        return ()
+    scores = {name: known[name] for name in judged if name in known}
+    if len(scores) < len(judged):
+        x = model_columns(fit)
+        scores = {n: scores.get(n) or eliminate_effect(fit, x, n).score() for n in judged}
+    found = [Redundant(n, scores[n]) for n in judged if scores[n].p_value > CHANCE]
+    return tuple(sorted(found, key=lambda n: -n.score.p_value))
+
+
+def spoken_against(fit: Fit) -> tuple[str, ...]:
+    """Return effects of a carried prior that the new readings speak against, the most so first.
+
+    As after a repair: at odds of 20 : 1 they are likelier without the effect than with what the
+    earlier readings said of it.
+    """
+    names = carried_effects(fit.model) if fit.scaling == "gc" else ()
+    if not names:
+        return ()
+    of = evidence_of_carried(fit.model, fit.solution, fit.whitening, names)
+    return tuple(n for n in sorted(of, key=lambda n: of[n]) if of[n] < -SAME_EVIDENCE)

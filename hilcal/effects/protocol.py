@@ -338,7 +338,7 @@ class Effect(ABC):
 
         What arms are like before anything is measured: half of what is ordinary, and a factor of 2
         either way, beside what the pools of an effect and the effects of an arm share (see
-        `hilcal.mixed.priors`): a factor of 7 in all.
+        `hilcal.mixed.families`): a factor of 7 in all.
         """
         return -0.7, OWN_SPREAD
 

@@ -6,6 +6,11 @@ effects. Then readings join or leave by their distance t² from the fit to the
 others, which is χ²_m of a good reading (`reading_model`), until none does.
 
 Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
+
+Smooth nuisance columns, so that data snooping does not take a misfit for gross errors.
+
+Joint displacements by smooth functions of the joint's angle, torque and side of approach; link
+twists, constant and by the moments that the link carries; a drift of the target with time.
 """
 
 from dataclasses import dataclass, replace
@@ -28,8 +33,8 @@ from hilcal.identification.least_trimmed_squares import (
 )
 from hilcal.identification.priors import scales_of
 from hilcal.identification.reading_model import ReadingModel
-from hilcal.identification.smooth_nuisance import smooth_nuisance_columns
 from hilcal.model.model import Model, Prediction
+from hilcal.model.observe import motion
 from hilcal.readings.reading_groups import deflection_groups
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, inverse_root
@@ -57,6 +62,8 @@ WHITENED = 4096
 EXACT = 1e-6
 """Share of a group's mean covariance that each of its readings has at least; a choice: an unloaded
 reading that is stated to be exact is so all the same."""
+MOST_SHARE = 0.35
+"""Most columns, as a share of the whitened rows; a choice, no study set it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -347,3 +354,28 @@ def _tested(of: ReadingModel, used: Bools) -> tuple[Floats, Bools]:
         return of.distances(used), np.zeros_like(used)
     _, centre = of.near(of.fitted(used)[0])
     return of.distances(of.with_lone_centres(used, centre)), centre
+
+
+def smooth_nuisance_columns(
+    model: Model, prediction: Prediction, readings: Readings, rank: int
+) -> Floats:
+    """Columns (N, m, P); only the simplest ones where the `rank` of the readings is small."""
+    situation, s = prediction.situation, readings.states
+    moves = motion(
+        model.cell, prediction.observation, situation.chain, prediction.deviation, readings.m
+    )
+    one = np.ones_like(situation.angle)
+    functions = [one, situation.torque]
+    if s.approach is not None:
+        functions.append(s.approach)
+    functions += [np.cos(situation.angle), np.sin(situation.angle)]
+    joints = [moves.drives * f[:, None, :] for f in functions]
+    links, loads = [], []
+    for slot in range(situation.wrench.shape[1]):
+        moved = moves.by_slot(slot)
+        links.append(moved)
+        loads.append(moved[:, :, 3:5] * situation.wrench[:, slot, None, 3:5])
+    drift = [] if s.time is None else [moves.by_station() * (s.time - s.time.mean())[:, None, None]]
+    harmonics = [moves.drives * f(2 * situation.angle)[:, None, :] for f in (np.cos, np.sin)]
+    most = int(MOST_SHARE * rank)
+    return np.concatenate([*joints, *drift, *loads, *harmonics, *links], axis=2)[:, :, :most]

@@ -31,6 +31,14 @@ that was found there: what repeats itself in new poses. The variance is that of 
 are left out, F of rows Y, with X the same whitened by W and multiplied by the root of C: the mean
 of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few poses a fold may be all that tells of a direction; its variance is
 that of the prior then.
+
+How much wider predictions are since the variances of a background are estimated themselves.
+
+At given variances rows that are predicted without their fold are off by e with the variance v (see
+`mixed.prediction.left_out`). With x = (log s, η) drawn from its posterior, by weights from the
+normal approximation at its maximum x̂, the mean square is E[Σ v] + E|e − E e|². The factor is its
+ratio to Σ v at x̂. Source: Kackar and Harville, *Approximations for standard errors of estimators of
+fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
 """
 
 from collections.abc import Sequence
@@ -45,7 +53,9 @@ from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.identification.holdout import ordinary
 from hilcal.identification.mixed_fit import INSTRUMENT, mixed_fit_at
 from hilcal.identification.residual import residual
-from hilcal.identification.variance_spread import variance_spread
+from hilcal.mixed.equations import equations
+from hilcal.mixed.prediction import left_out
+from hilcal.mixed.variances import Variances, log_posterior
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, Whitening, whitening
@@ -61,6 +71,16 @@ ROUNDING = 1e-9
 """Least share of a direction's information that is not of one fold, for rounding."""
 CHUNK = 4096
 """Measurements that are taken at once, for memory."""
+MOST_ROWS = 600
+"""Elements of readings beyond which the variances are taken for known: of 200 poses of a real UR10
+the factor is 1.00 to 1.06, and a draw costs the cube of the rows. A choice."""
+DRAWS = 30
+"""Of the posterior; a choice: of 20 poses of a real UR10 the factor is 1.19 to 1.43 by the seed."""
+HEAVIEST = 2.0
+"""log of the largest weight of a draw over the median: the normal approximation is not exact in its
+tails. A choice."""
+SEED = 0
+"""Of the draws, so that equal fits give equal factors."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,3 +312,34 @@ def position_factor(p: Predictive, left_out_m: float) -> float:
         left_out_m: rms of the 3-D position errors on poses left out.
     """
     return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
+
+
+def variance_spread(found: Variances, fold: Ints) -> float:
+    """Return the factor, at least 1, of the variance of predictions.
+
+    Args:
+        found: the variances, at the fit.
+        fold: (R,) fold of each row.
+    """
+    if len(fold) > MOST_ROWS:
+        return 1.0
+    _, at = left_out(found.equations, fold)
+    rng, root = np.random.default_rng(SEED), np.linalg.cholesky(found.covariance)
+    variance, off, weight = [], [], []
+    for _ in range(DRAWS):
+        z = rng.standard_normal(len(root))
+        try:
+            e = equations(found.equations.problem, found.log_std + root @ z)
+            residual, one = left_out(e, fold)
+        except np.linalg.LinAlgError:
+            continue
+        variance.append(float(one.sum()))
+        off.append(residual)
+        weight.append(log_posterior(e) + 0.5 * float(z @ z))
+    if not weight:
+        return 1.0
+    share = np.exp(np.minimum(np.array(weight) - np.median(weight), HEAVIEST))
+    share /= share.sum()
+    away = np.array(off) - share @ np.array(off)
+    mean = share @ (np.array(variance) + np.sum(away**2, axis=1))
+    return max(1.0, float(mean / at.sum()))

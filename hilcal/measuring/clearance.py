@@ -1,4 +1,7 @@
-"""What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables."""
+"""What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables.
+
+Distances of segments and boxes in space, batched.
+"""
 
 from dataclasses import dataclass, field
 
@@ -10,7 +13,6 @@ from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.body import Capsule, flange_capsule
 from hilcal.robot.scene import Scene, Segment, on_flange
-from hilcal.robot.segments import segment_distance
 from hilcal.types import Bools, Floats
 
 TOOL_RADIUS = 0.03
@@ -19,6 +21,7 @@ CABLE_RADIUS = 0.01
 """Radius that is kept for a cable, m."""
 _NEAR = 0.02  # m, beyond touching
 _AT_TARGET, _AT_LOAD = "tool at the target", "tool at the load point"
+_TINY = 1e-18  # m², below which a segment is a point
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -224,3 +227,27 @@ def _holds(thing: Obstacle, point: Floats, margin: float) -> bool:
     off = point - np.array(thing.bottom_m)
     upright = -margin <= off[2] <= thing.height_m + margin
     return bool(upright and np.hypot(off[0], off[1]) <= thing.radius_m + margin)
+
+
+def segment_distance(a: Floats, b: Floats, c: Floats, d: Floats) -> Floats:
+    """Return (N,) least distances of the segments ab and cd, points (N, 3) or (3,), m.
+
+    |a + s u − c − t v| is least at the stationary s, kept within [0, 1], with the t that is
+    best for it, kept within [0, 1], and then the s that is best for that t (Ericson 2005,
+    Real-Time Collision Detection, section 5.1.9).
+    """
+    u, v, r = b - a, d - c, a - c
+    uu, vv, uv = _dot(u, u), _dot(v, v), _dot(u, v)
+    ur, vr = _dot(u, r), _dot(v, r)
+    det = uu * vv - uv * uv
+    far = det > 1e-12 * uu * vv  # not parallel
+    s = np.where(far, (uv * vr - ur * vv) / np.where(far, det, 1.0), 0.0)
+    s = np.clip(s, 0.0, 1.0)
+    t = np.clip((uv * s + vr) / np.where(vv > _TINY, vv, 1.0), 0.0, 1.0)
+    s = np.clip((uv * t - ur) / np.where(uu > _TINY, uu, 1.0), 0.0, 1.0)
+    gap = r + s[..., None] * u - t[..., None] * v
+    return np.asarray(np.linalg.norm(gap, axis=-1))
+
+
+def _dot(a: Floats, b: Floats) -> Floats:
+    return np.asarray(np.sum(a * b, axis=-1))

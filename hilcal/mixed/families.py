@@ -1,5 +1,17 @@
-"""Families: the parameters of a model that share one standard deviation."""
+"""Families: the parameters of a model that share one standard deviation.
 
+What arms are like before anything is measured: log standard deviations, normal and correlated.
+
+    log s_f = mean_f + a + b_effect(f) + c_f
+    a ~ N(0, ARM²),  b ~ N(0, EFFECT²),  c_f ~ N(0, spread_f²)
+
+An arm is precise or not in most of its parts (a), and the families of one effect, as the octaves of
+a gear's error, are large or small together (b). With few poses this keeps one octave from taking
+what others explain; independent priors of the same spread predicted 4 % worse with 20 poses of the
+real UR10 and of a real UR5. Components of the noise have their own spread alone.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +22,11 @@ from hilcal.types import Floats, Ints
 
 KNOWN = 1e-3
 """Spread of the logarithm of a standard deviation that is known."""
+ARM = 1.5
+"""Of an arm as a whole: a factor of 4.5 either way, so that one whose errors are a tenth or ten
+times the ordinary ones is no surprise; a choice."""
+EFFECT = 1.0
+"""Of an effect beside its arm: a factor of 2.7; a choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +35,7 @@ class LogStdPrior:
 
     Attributes:
         mean: of log s, s in ordinary magnitudes.
-        spread: standard deviation of what is its own; see `mixed.priors` for what families share.
+        spread: standard deviation of what is its own; see `mixed.families` for what families share.
     """
 
     mean: float
@@ -113,3 +130,20 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
             Family(name, effect.name, index[own], effect.magnitudes[own], LogStdPrior(*prior))
         )
     return out
+
+
+def log_std_prior(
+    priors: Sequence[LogStdPrior], families: Sequence[Family]
+) -> tuple[Floats, Floats]:
+    """Mean (F + N,) and precision (F + N, F + N) of log s and η.
+
+    Args:
+        priors: of each of them by itself.
+        families: the first F of them.
+    """
+    covariance = np.diag([p.spread**2 for p in priors])
+    effect = np.array([f.effect for f in families])
+    unknown = np.array([not f.known for f in families], dtype=float)
+    shared = (ARM**2 + EFFECT**2 * (effect[:, None] == effect)) * np.outer(unknown, unknown)
+    covariance[: len(effect), : len(effect)] += shared
+    return np.array([p.mean for p in priors]), np.linalg.inv(covariance)

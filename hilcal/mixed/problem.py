@@ -14,8 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.mixed.families import Families, LogStdPrior
-from hilcal.mixed.priors import log_std_prior
+from hilcal.mixed.families import Families, LogStdPrior, log_std_prior
 from hilcal.types import Bools, Floats, Ints
 
 FRAMES_TOLERANCE = 1e-9

@@ -1,6 +1,6 @@
 """Variances by restricted maximum likelihood, under priors on log standard deviations.
 
-    maximise  ℓ(x) − ½ (x − mean)ᵀ Λ (x − mean),    x = (log s, η), Λ of `mixed.priors`
+    maximise  ℓ(x) − ½ (x − mean)ᵀ Λ (x − mean),    x = (log s, η), Λ of `mixed.families`
 
 by Newton's method with the average information, and what logarithms add to the curvature of a
 falling likelihood: without that the steps for families that are not there are several times too

@@ -1,9 +1,14 @@
-"""RUN.hilcal: one SQLite file with immutable readings and appended model revisions."""
+"""RUN.hilcal: one SQLite file with immutable readings and appended model revisions.
+
+Whether an open file still is the one of its name; where not, its content is found or rescued.
+"""
 
 import json
+import os
 import sqlite3
+import tempfile
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -17,12 +22,12 @@ from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
-from hilcal.store.in_place import identity, moved_to, rescued
 from hilcal.store.new_campaign import new_campaign
 from hilcal.store.records import Layout, content_hash, layout_of, read_layout
 from hilcal.store.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
 from hilcal.store.robot_file import robot_file_of
 from hilcal.store.stored_priors import join, split
+from hilcal.whole_file import replacing
 
 _TARGETS = "targets"
 ACCEPTED = "accepted {}"
@@ -35,6 +40,8 @@ _OTHER_READINGS = (
     "the readings were changed after revision {} had been fitted to them (their SHA-256 is another)"
 )
 _META = ("config", "base_dir", "source", "created", "program_version")
+Identity = tuple[int, int]
+_OPEN = Path("/proc/self/fd")
 
 
 class CampaignFile:
@@ -449,3 +456,39 @@ class CampaignFile:
 
 def _mend(path: Path) -> str:
     return f"valid: an untouched copy; or set the revision aside: hilcal repair {quoted(path)}"
+
+
+def identity(path: Path | str) -> Identity | None:
+    """Device and number of a file, by which it is the same under every name; None for none."""
+    with suppress(OSError):
+        found = os.stat(path)
+        return found.st_dev, found.st_ino
+    return None
+
+
+def moved_to(known: Identity | None) -> Path | None:
+    """Return where a file that this process has open is now; None for a deleted one."""
+    with suppress(OSError):
+        for descriptor in _OPEN.iterdir():
+            if identity(descriptor) == known:
+                with suppress(OSError):
+                    now = descriptor.readlink()
+                    if identity(now) == known:
+                        return now
+    return None
+
+
+def rescued(connection: sqlite3.Connection, path: Path) -> Path:
+    """Write a copy of an open file that has no name any more, beside where it was.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    home = path.absolute().parent
+    folder = home if home.is_dir() else Path(tempfile.gettempdir())
+    place, k = folder / f"{path.stem}.rescued{path.suffix}", 2
+    while place.exists():
+        place, k = folder / f"{path.stem}.rescued-{k}{path.suffix}", k + 1
+    with replacing(place, must_be_new=True) as new, closing(sqlite3.connect(new)) as copy:
+        connection.backup(copy)
+    return place

@@ -129,7 +129,7 @@ class Soak:
     def do(self, way: Callable[[], str]) -> None:
         """Do it; a failed check is kept, and the next thing is done on another cell."""
         self.counts[way.__name__] += 1
-        self._met = ""
+        before, self._met = self._met, ""
         try:
             way()
         except Exception as error:
@@ -143,7 +143,7 @@ class Soak:
             if STARVED.search(words):
                 self.starved += 1
             else:
-                where = f"{way.__name__} {self._met}: {at.name}:{at.lineno}"
+                where = f"{way.__name__} {self._met} (after {before}): {at.name}:{at.lineno}"
                 self.findings.append(f"{where}: {words[:200]} … {words[-1500:]}")
             self.close()
 
@@ -176,8 +176,7 @@ class Soak:
             first.undo(self.site)
             self._ends(again, (first, second), exact=False)
         finally:
-            first.undo(self.site)
-            second.undo(self.site)
+            self._undo((first, second))
         self._sound()
         return f"{first.name}, {second.name}"
 
@@ -397,8 +396,7 @@ class Soak:
                 assert ended or run.process.returncode == 0, f"{fault.name}: not noticed"
         finally:
             if undo:
-                for fault in faults:
-                    fault.undo(self.site)
+                self._undo(faults)
         if undo:
             if run.process.poll() is None:
                 run.interrupt()
@@ -407,6 +405,11 @@ class Soak:
         self._sound()
         self.site.slider(1.0)
         return ", ".join(fault.name for fault in faults)
+
+    def _undo(self, faults: tuple[Fault, ...]) -> None:
+        """Mend everything; twice, since a protective stop is not unlocked in local mode."""
+        for fault in (*faults, *faults):
+            fault.undo(self.site)
 
     def _stands(self, fault: Fault, since: float) -> None:
         """Wait until an arm that was in motion stands, and keep how long that took."""

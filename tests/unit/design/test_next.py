@@ -11,11 +11,11 @@ from hilcal.cell import cell_from_config
 from hilcal.design.discriminated_pairs import (
     LEVEL,
     discriminated_pairs,
+    estimate,
     not_separable_message,
     power,
     supported_parameters,
 )
-from hilcal.design.effect_estimate import estimate
 from hilcal.design.information import Problem, problem
 from hilcal.design.next import DRAWS, measure_next
 from hilcal.design.nominal_model import after

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.design.discriminated_pairs import LEVEL, discriminated_pairs, pair_of, power
-from hilcal.design.effect_estimate import estimate
+from hilcal.design.discriminated_pairs import LEVEL, discriminated_pairs, estimate, pair_of, power
 from hilcal.design.information import Problem, problem
 from hilcal.design.nominal_model import after
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects

@@ -4,8 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
-from hilcal.diagnosis.gravity import beyond_geometry, geometry_columns, through_load, unloaded
+from hilcal.diagnosis.effect_ranking import (
+    beyond_geometry,
+    candidates,
+    geometry_columns,
+    rank_suspects,
+    through_load,
+    unloaded,
+)
 from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit

@@ -5,8 +5,8 @@ import pytest
 
 from hilcal.diagnosis import effect_ranking
 from hilcal.diagnosis import residual_regression as regression
-from hilcal.diagnosis.backward_elimination import backward_elimination
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.evidence import backward_elimination
 from hilcal.diagnosis.plausible_size import most, unloaded_readings
 from hilcal.diagnosis.residual_regression import Regressions, residual_regression
 from hilcal.diagnosis.stepwise import add

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from hilcal.diagnosis.backward_elimination import spoken_against
+from hilcal.diagnosis.evidence import spoken_against
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.carried_evidence import carried_effects, evidence_of_carried

@@ -8,9 +8,9 @@ from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
 from drivers.simulated.injected_effects import hide
-from hilcal.diagnosis.backward_elimination import CHANCE, backward_elimination
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.diagnosis.evidence import CHANCE, backward_elimination
 from hilcal.diagnosis.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove
 from hilcal.diagnosis.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives

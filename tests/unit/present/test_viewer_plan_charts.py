@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.design.detectable import DetectableEffect
-from hilcal.design.summary import PredictedParameter
+from hilcal.design.summary import DetectableEffect, PredictedParameter
 from hilcal.errors import InputError
 from hilcal.present.viewer import plan, plan_scene, style
 from hilcal.present.viewer.plan import record_plan

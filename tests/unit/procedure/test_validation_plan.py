@@ -6,7 +6,7 @@ import pytest
 from drivers.simulated.rehearsal import planned_states
 from hilcal.cell import cell_from_config
 from hilcal.design.feasible import Space
-from hilcal.design.load_blocks import Block, Stop, assembled
+from hilcal.design.run_order import Block, Stop, assembled
 from hilcal.procedure.validation_plan import fewer_returns
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

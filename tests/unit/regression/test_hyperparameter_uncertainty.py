@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.regression.hyperparameter_uncertainty import (
+from hilcal.identification.uncertainty import (
     HIDDEN,
     dropped_group_factors,
     hyperparameter_factors,

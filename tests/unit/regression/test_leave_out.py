@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from hilcal.identification.linearisation import eliminate_columns
 from hilcal.regression import leave_out
-from hilcal.regression.backward_elimination import eliminate_columns
 from hilcal.regression.leave_out import (
     FamilyFolds,
     Fold,

@@ -8,11 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.config import Obstacle
+from hilcal.measuring.clearance import segment_distance
 from hilcal.robot.body import capsules, is_known
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.scene import Scene, Segment
-from hilcal.robot.segments import segment_distance
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.fake_bench import POSES
 from tests.support.space_cases import frames, gap, gap_to, placed, self_gap
