@@ -5,8 +5,6 @@ A reading is hz, v (from the zenith) and slope distance d, turned into
     x = d sin(v) sin(hz)    y = d sin(v) cos(hz)    z = d cos(v)
 
 Source: Leica Geosystems, GeoCOM Reference Manual.
-
-What a GeoCOM instrument answers to a measurement, checked.
 """
 
 import time

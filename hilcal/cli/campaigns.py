@@ -121,8 +121,8 @@ def fleet(
     from hilcal.engine.engine import open_engine
     from hilcal.identification.posterior_document import write
     from hilcal.present.fleet import fleet_report
-    from hilcal.transfer.document import to_json
     from hilcal.transfer.fleet import fleet as pool_fleet
+    from hilcal.transfer.fleet import to_json
     from hilcal.transfer.members import entries
     from hilcal.write_report import write_fleet_report
 

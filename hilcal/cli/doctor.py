@@ -10,11 +10,9 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, argument, option
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.doctor.computer import computer
+from hilcal.doctor.computer import computer, program
 from hilcal.doctor.finding import Finding
-from hilcal.doctor.network import reachable
-from hilcal.doctor.ports import adapters, serial_ports
-from hilcal.doctor.program import program
+from hilcal.doctor.ports import adapters, reachable, serial_ports
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.present.preparing import doctor_report, doctor_summary
 from hilcal.present.progress import working

@@ -1,8 +1,7 @@
 """The order in which chosen readings are taken: short, and little correlated with drift.
 
-Which straight motions between the poses of a plan are clear, and what they take.
-
-Load blocks of a plan: loops from the reference under one load, and their sequence.
+The poses under one load are a block of loops from the reference, along straight motions that are
+clear; the blocks follow each other in random order.
 """
 
 from collections.abc import Callable, Mapping, Sequence

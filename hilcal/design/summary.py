@@ -1,8 +1,6 @@
 """The summary of a plan: predicted precision, criterion comparison, sample-size curve, cost.
 
 One value, computed once; terminal, JSON and viewer read it directly, the plan's file holds `about`.
-
-Minimum detectable strength of the effects that a plan's model does not have.
 """
 
 from collections.abc import Iterator

@@ -4,8 +4,6 @@ Numbers in the functions of a law, as an exponent or a saturation, are taken fro
 the search. They are refined where the sum of squares that the law leaves is least, its coefficients
 and the model's projected out. A refined number is kept where it gains more evidence than a number
 costs, else the one of the grid, which is simpler.
-
-The numbers in a law's functions that a refinement may change: exponents, levels, weights.
 """
 
 from collections.abc import Sequence

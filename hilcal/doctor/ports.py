@@ -1,9 +1,12 @@
-"""Serial adapters: which there are, who may use them, and how late their answers come."""
+"""Serial adapters and the network: what there is, who may use it, and how late it answers.
+"""
 
 import grp
 import os
 import re
+import socket
 import stat
+import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +24,11 @@ MEDDLERS = {
     "brltty": "it takes adapters for Braille displays",
 }
 """Services that open adapters of others."""
+NETWORK = "network"
+SECONDS = 1.0
+"""How long an answer may take, s. A choice: on a cell's own network it takes a millisecond."""
+SLOW = 0.02
+"""Time of connecting that a controller in the same room never needs, s. A choice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,3 +166,39 @@ def _program(proc: Path, number: int) -> str:
         return (proc / str(number) / "comm").read_text(encoding="utf-8").strip()
     except OSError:
         return "a program"
+
+
+def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) -> list[Finding]:
+    """Return whether each service of a host accepts a connection; nothing is sent.
+
+    Args:
+        host: name or address.
+        services: what is reached there, by TCP port.
+        seconds: how long each may take.
+    """
+    try:
+        address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0]
+    except (OSError, UnicodeError) as error:
+        mend = "check the address in the cell, or name the host in /etc/hosts"
+        said = f"its name is not known ({getattr(error, 'strerror', None) or error})"
+        return [Finding(NETWORK, host, "problem", said, mend)]
+    out = []
+    for port, what in services.items():
+        name, begun = f"{what}, {host} port {port}", time.monotonic()
+        try:
+            with socket.create_connection((str(address), port), seconds):
+                took = time.monotonic() - begun
+        except TimeoutError:
+            mend = "check cable, address and network of the cell; is the controller switched on?"
+            out.append(Finding(NETWORK, name, "problem", f"no answer in {seconds:g} s", mend))
+        except OSError as error:
+            mend = "check the address, and that the service is enabled on the controller"
+            out.append(Finding(NETWORK, name, "problem", f"{error.strerror or error}", mend))
+        else:
+            said = f"answers in {1e3 * took:.1f} ms"
+            if took > SLOW:
+                mend = "connect by cable, without other networks between"
+                out.append(Finding(NETWORK, name, "warning", said, mend))
+            else:
+                out.append(Finding(NETWORK, name, "ok", said))
+    return out

@@ -7,9 +7,6 @@ jackknives, with groups of consecutive readings and with groups close in joint s
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
-For shrunk families the uncertainty of their prior variance adds; see
-`identification.uncertainty`.
-
 Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
 
 Uncertainty of the parameters of a shrunk family due to that of its prior variance.

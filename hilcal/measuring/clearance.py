@@ -1,6 +1,4 @@
 """What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables.
-
-Distances of segments and boxes in space, batched.
 """
 
 from dataclasses import dataclass, field

@@ -1,6 +1,4 @@
 """The run at corrected joint targets: its plan, and its readings beside those of the validation.
-
-The states in which the readings of a plan will be taken, as far as that is known before.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """RUN.hilcal: one SQLite file with immutable readings and appended model revisions.
 
-Whether an open file still is the one of its name; where not, its content is found or rescued.
+A file that is not the one of its name any more while it is open is found again, or rescued.
 """
 
 import json

@@ -1,8 +1,9 @@
-"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm."""
+"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm.
+"""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -132,3 +133,41 @@ def _type(
             else:
                 members[k] = replace(result, added=members[k].added)
     return pooled(members, seen), members, lost
+
+
+def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
+    """Return a fleet as JSON, SI.
+
+    Args:
+        fleet: the fleet.
+        priors: file of the prior by type.
+    """
+    return {
+        "types": [{**_type_json(t), "prior": priors.get(t.type)} for t in fleet.types],
+        "campaigns": [
+            {
+                "name": m.name,
+                "arm": m.arm,
+                "arm_known_by": m.known,
+                "type": m.type,
+                "date": m.date,
+                "verdict": m.verdict,
+                "added": list(m.added),
+                "holdout_rms_m": m.rms_m,
+            }
+            for m in fleet.members
+        ],
+        "failed": [asdict(f) for f in fleet.failures],
+    }
+
+
+def _type_json(t: Pooled) -> dict[str, object]:
+    return {
+        "type": t.type,
+        "arms": list(t.arms),
+        "n_campaigns": len(t.campaigns),
+        "parameters": [asdict(p) for p in t.parameters],
+        "unlike": [asdict(o) for o in t.odd],
+        "effects_added": [asdict(s) for s in t.seen],
+        "wear": list(t.wear),
+    }

@@ -11,11 +11,9 @@ from pathlib import Path
 import pytest
 
 from hilcal.doctor import computer as machine
-from hilcal.doctor.computer import clock, disk, load
+from hilcal.doctor.computer import NATIVE, clock, disk, load, packages
 from hilcal.doctor.finding import Finding
-from hilcal.doctor.network import reachable
-from hilcal.doctor.ports import System, serial_ports
-from hilcal.doctor.program import NATIVE, packages
+from hilcal.doctor.ports import System, reachable, serial_ports
 
 
 def states(findings: tuple[Finding, ...] | list[Finding]) -> list[str]:
