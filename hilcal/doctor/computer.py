@@ -1,5 +1,4 @@
-"""This computer: clock, disk, memory, load, interpreter, packages and installed drivers.
-"""
+"""This computer: clock, disk, memory, load, interpreter, packages and installed drivers."""
 
 import ctypes
 import importlib

@@ -1,5 +1,4 @@
-"""Serial adapters and the network: what there is, who may use it, and how late it answers.
-"""
+"""Serial adapters and the network: what there is, who may use it, and how late it answers."""
 
 import grp
 import os

@@ -1,5 +1,4 @@
-"""What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables.
-"""
+"""What must not touch, nor stand in the beam: arm, tool, obstacles, hanging loads and cables."""
 
 from dataclasses import dataclass, field
 

@@ -1,5 +1,4 @@
-"""The run at corrected joint targets: its plan, and its readings beside those of the validation.
-"""
+"""The run at corrected joint targets: its plan, and its readings beside those of validation."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace

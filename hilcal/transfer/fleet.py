@@ -1,5 +1,4 @@
-"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm.
-"""
+"""A fleet: its campaigns fitted and diagnosed on the engine, and pooled by type of arm."""
 
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
