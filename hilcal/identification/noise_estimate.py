@@ -171,7 +171,7 @@ def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseE
     told = _told(default, cell, config)
     if told is None:
         return None
-    factors = {k: f for k, f in told.factors.items() if k != SCATTER}
+    factors = {k: f for k, f in told.factors.items() if k not in (SCATTER, STATED)}
     sampled, of = _sizes(readings, station), _sizes(default, station)
     off = (
         abs(np.log(f * of[k] / sampled[k])) > max(np.log(WORTH), CONTRADICTED * told.log_errors[k])
@@ -237,7 +237,7 @@ def _told(readings: Readings, cell: Cell, config: CellConfig) -> _Told | None:
     try:
         model = baseline(cell, _some(readings), usual_mode(readings))
         found = _factors(model, _some(readings), config.tracker.station_m, stated)
-    except HilcalError:  # what cannot be fitted is said where it is fitted
+    except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
         return None
     return None if found is None else _Told(model, *found)
 

@@ -22,6 +22,7 @@ from tests.support.cli_cases import ok
 from tests.unit.identification.test_noise_estimate import OFF, judged, size
 from tests.unit.identification.test_other_arm import measured
 
+Capsys = pytest.CaptureFixture[str]
 SAMPLES = 5
 STATED = "range_std_m = 5e-6\ntransverse_std_m = 7.5e-6\n"
 
@@ -56,9 +57,9 @@ def of_samples(
         return mean.value, mean.covariance
 
 
-def run_of(readings: Readings, path: Path, tracker: str = "") -> Path:
-    """A campaign as `run` leaves it, before its noise is looked at."""
-    text = f'[robot]\nmodel = "ur5"\n[tracker]\n{tracker}'
+def run_of(readings: Readings, path: Path, tracker: str = "", arm: str = "") -> Path:
+    """A campaign as `run` leaves it."""
+    text = f'[robot]\nmodel = "ur5"\n[tracker]\n{tracker}{arm}'
     (path / "CELL.toml").write_text(text)
     config = hc.Cell.load(path / "CELL.toml").configured()
     names = readings.pose_names
@@ -70,11 +71,20 @@ def run_of(readings: Readings, path: Path, tracker: str = "") -> Path:
 
 
 @pytest.mark.parametrize(
-    ("sigma", "between"), [(2e-5, 0.0), (2e-4, 0.0), (5e-6, 2e-5), (5e-6, 1e-4)]
+    ("sigma", "between", "arm"),
+    [
+        (2e-5, 0.0, ""),
+        (2e-4, 0.0, ""),
+        (5e-6, 2e-5, ""),
+        (5e-6, 1e-4, ""),
+        (5e-6, 1e-4, "[repeatability]\njoint_std_rad = 1e-7\n"),
+    ],
 )
-def test_another_instrument_is_noise(tmp_path: Path, capsys, sigma: float, between: float) -> None:
+def test_another_instrument_is_noise(
+    tmp_path: Path, capsys: Capsys, sigma: float, between: float, arm: str
+) -> None:
     readings = sampled(3, sigma, between)
-    path = run_of(readings, tmp_path)
+    path = run_of(readings, tmp_path, arm=arm)
     assert "[tracker] does not state the noise" in " ".join(capsys.readouterr().err.split())
     with hc.Campaign.open(path) as run:
         assert not run.readings.noise_stated
