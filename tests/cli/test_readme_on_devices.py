@@ -62,6 +62,9 @@ def test_every_command_on_devices(
             given = [str(there) if w == "CELL.toml" else w for w in words]
             if words[0] == "compensate":
                 points(Path(words[1]), Path(words[2]))
+            if words == ["compare", "run.hilcal", "later.hilcal"]:
+                later = ["--plan", "plan.json", "-o", "later.hilcal"]
+                assert measured(capsys, ["run", str(there), *later]).code == 0
             if words[0] == "validate":
                 plan = ["--plan", "plan.json", "-o", "other.hilcal"]
                 assert measured(capsys, ["run", str(there), *plan]).code == 0

@@ -135,7 +135,7 @@ def test_from_nothing_to_a_calibrated_arm(columns: int, tmp_path: Path) -> None:
 
     assert "Written: CELL.toml" in stranger.types("init", person=answers)
     plan = ("plan", "CELL.toml", "-o", "plan.json")
-    assert "certified lower bound" in stranger.types(*plan, "--poses", "8", "--quick")
+    assert "certified lower bound" in stranger.types(*plan, "--poses", "8")
     rehearsal = ("--plan", "plan.json", "--person", "--clock", "20", "--hide", HIDDEN)
     with stranger.sits("simulate", "CELL.toml", "-o", "DIR", *rehearsal) as devices:
         devices.sees("Ctrl-C ends them.")
