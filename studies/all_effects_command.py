@@ -14,7 +14,6 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from scipy.stats import chi2
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
@@ -22,25 +21,22 @@ from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
-from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.mixed_fit import (
     SCATTER_RAD,
     linearised_problem,
     with_all_effects,
 )
-from hilcal.identification.predictive import predictive
 from hilcal.mixed.equations import equations
 from hilcal.mixed.families import families_of
 from hilcal.model.model import Model
 from hilcal.present.progress import counting
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import whitening
 from hilcal.refinement import refine
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
+from studies.few_poses_command import share_in_band
 from studies.random_descriptions import readings_of
 from studies.records import Figure, Keep, keep
 
@@ -153,7 +149,7 @@ def refined(case: Case) -> Found | None:
         return None
     last = refine(start, some, "absolute")
     off = test.value - last.fit.model.predict(test.states, last.fit.theta).observation.position
-    inside = _inside(last.fit, test, off)
+    inside = share_in_band(last.fit, test, off)
     problem = linearised_problem(model, some, "absolute", theta)
     noise = [0.0, float(np.log(SCATTER / SCATTER_RAD))][: len(problem.noise)]
     best = equations(problem, np.concatenate([log_std, noise]))
@@ -196,20 +192,6 @@ def _measured(
     value += np.einsum("nij,nj->ni", moved, rng.standard_normal((len(q), moved.shape[2])))
     found = readings_of(q, value, np.full(3, INSTRUMENT_M))
     return replace(found, scatter_stated=False), model, theta, log_std
-
-
-def _inside(of: Fit, test: Readings, off: Floats) -> float:
-    """Share of others within the 95 % band of a fit, their errors (N, 3) being known."""
-    known = predictive(
-        of.model, of.theta, of.solution.prior, of.readings[~of.outlier], "absolute",
-        of.holdout.rms_sigma,
-    )  # fmt: skip
-    prediction = of.model.predict(test.states, of.theta)
-    if of.readings.arm_scatter is not None:
-        test = with_arm_scatter(of.model.cell, test, of.readings.arm_scatter)
-    total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
-    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
-    return float(np.mean(square < chi2.ppf(0.95, 3)))
 
 
 def _rms(off: Floats) -> float:

@@ -29,6 +29,7 @@ from hilcal.design.undetermined import without_undetermined
 from hilcal.engine.engine import open_engine
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import predictive
 from hilcal.library import read_table
 from hilcal.present.progress import counting
@@ -36,7 +37,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.types import Ints
+from hilcal.types import Floats, Ints
 from hilcal.whole_file import replace_file
 from studies.records import Figure, Keep, keep
 
@@ -155,26 +156,31 @@ def refined(case: Case) -> Found:
     test, some = readings[tested], readings[rest[chosen] if case.planned else chosen]
     last = refine(baseline(cell, some, "absolute"), some, "absolute")
     f, d = last.fit, last.diagnosis
-    known = predictive(
-        f.model, f.theta, f.solution.prior, f.readings[~f.outlier], "absolute",
-        f.holdout.rms_sigma,
-    )  # fmt: skip
-    prediction = f.model.predict(test.states, f.theta)
-    if f.readings.arm_scatter is not None:
-        test = with_arm_scatter(f.model.cell, test, f.readings.arm_scatter)
-    total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
-    off = test.value[:, :3] - prediction.observation.position
-    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
+    off = test.value[:, :3] - f.model.predict(test.states, f.theta).observation.position
     return Found(
         case.path.parent.name,
         case.poses,
         case.draw,
         float(np.linalg.norm(off, axis=1).mean()),
-        float(np.mean(square < chi2.ppf(0.95, 3))),
+        share_in_band(f, test, off),
         tuple(n for n in f.model.named if n not in ("base_frame", "target_offset")),
         last.verdict,
         (*d.significant, *(b.effect for b in d.background if b.p_value < PROBABLE)),
     )
+
+
+def share_in_band(of: Fit, test: Readings, off: Floats) -> float:
+    """Return the share of others whose errors (N, 3), m, are within the 95 % band of a fit."""
+    known = predictive(
+        of.model, of.theta, of.solution.prior, of.readings[~of.outlier], "absolute",
+        of.holdout.rms_sigma,
+    )  # fmt: skip
+    prediction = of.model.predict(test.states, of.theta)
+    if of.readings.arm_scatter is not None:
+        test = with_arm_scatter(of.model.cell, test, of.readings.arm_scatter)
+    total = known.of_reading(prediction, whitening(test, "absolute", "gc"))[:, :3, :3]
+    square = np.einsum("ni,nij,nj->n", off, np.linalg.inv(total), off)
+    return float(np.mean(square < chi2.ppf(0.95, 3)))
 
 
 def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:

@@ -609,7 +609,7 @@ def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
     if file.about(PLAN) is None:
         return NoiseEstimate.from_json(file.about(NOISE))
     told = RunLog(file).last(NOISE)
-    return None if told is None else NoiseEstimate.of(told)
+    return None if told is None or told["factors"] is None else NoiseEstimate.of(told)
 
 
 def _with_instrument(

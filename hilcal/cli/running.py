@@ -280,10 +280,13 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
     from hilcal.numbers import sentence
     from hilcal.present.registration import covariance_words
 
+    log = RunLog(campaign)
     found = measured_noise(campaign.readings(), cell, config)
     if found is not None:
-        RunLog(campaign).event(NOISE, asdict(found))
+        log.event(NOISE, asdict(found))
         t.notice(sentence(covariance_words("instrument", found)))
+    elif log.last(NOISE) is not None:  # of fewer readings, which these do not bear out
+        log.event(NOISE, {"factors": None})
 
 
 def _is_home(log: RunLog) -> bool:

@@ -150,12 +150,12 @@ class _Finished(_Happened):
 
 
 class _Noise(_Happened):
-    along_m: Number
-    across_m: Number
-    orientation_rad: Number | None
-    distance_m: Number
-    joint_std_rad: Number | None
-    factors: dict[Text, Number] | None
+    factors: dict[Text, Number] | None  # None where the covariances stay as measured
+    along_m: Number = 0.0
+    across_m: Number = 0.0
+    orientation_rad: Number | None = None
+    distance_m: Number = 0.0
+    joint_std_rad: Number | None = None
 
 
 _EVENTS: Mapping[str, type[_Happened]] = {

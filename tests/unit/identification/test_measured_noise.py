@@ -15,6 +15,7 @@ from hilcal.measuring.devices import TrackerSample
 from hilcal.measuring.measure import average
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.readings.readings import Readings
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import create_run
 from hilcal.types import Floats
@@ -103,3 +104,18 @@ def test_what_the_samples_show_or_the_cell_states_stays(tmp_path: Path, tracker:
         np.testing.assert_array_equal(run.readings.covariance, readings.covariance)
         if not tracker:
             assert judged(run.cell, run.readings).verdict == "adequate"
+
+
+def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(
+    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = run_of(sampled(3, 5e-6, 1e-4), tmp_path)
+    cell = hc.Cell.load(tmp_path / "CELL.toml")
+    monkeypatch.setattr("hilcal.identification.noise_estimate.measured_noise", lambda *_: None)
+    with CampaignFile.open(path) as file:
+        estimate_noise(terminal(False), cell.configured(), cell, file)
+        stored = file.readings()
+    with hc.Campaign.open(path) as run:
+        assert run.readings.noise_stated
+        np.testing.assert_array_equal(run.readings.covariance, stored.covariance)
+    assert "does not state the noise" not in ok(capsys, "info", path).out
