@@ -262,18 +262,18 @@ def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
         for u in found.understood
     ]
     # names of loads are compared with those of the campaign, and poses need none
-    passed = ["pose", "load", *["position"] * _certain_unit(of, arm)]
+    certain = ["pose", "load", *["position"] * _certain_unit(of, arm)]
     doubts = [
         f"{about}: {'no convention stated' if words == GUESSED else words}"
         for about, words in found.unsure
-        if about not in passed
+        if about not in certain
     ]
     doubts += [f"{name} is not understood" for name, _ in found.unused]
     if not {"joints", "position"} & found.sections.keys():
         doubts = found.lacking
     if doubts:
         raise InputError(
-            f"{path}: columns other than of a table of points, and what they hold cannot be told: "
+            f"{path}: its columns are not those of a table of points, and cannot be guessed: "
             f"{'; '.join(doubts)}. Write it down: hilcal import {quoted(path)} --preview -o "
             "M.toml, correct M.toml, and give --format M.toml; or use the columns pose, load, "
             f"q1_rad … q{arm.n}_rad or q1_deg …, x_m, y_m, z_m or x_mm …, rx_rad, ry_rad, rz_rad "

@@ -73,8 +73,8 @@ def effects(
     t.show(out)
     notes = [
         f"parameters: of a {ROBOT} with 30 poses; needs: columns that the readings must have; "
-        "expected: the standard deviation before anything is measured, which [ordinary] changes, a "
-        "factor of 7 either way.",
+        "expected: their standard deviation before anything is measured, known to a factor of 7; "
+        "[ordinary] of a cell changes it.",
         *(
             f"from {file.path}: {', '.join(e.name for e in file.effects)}"
             for file in catalogue.files

@@ -275,7 +275,7 @@ def measure(
 
 
 def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: CampaignFile) -> None:
-    """Store and say the noise of measured readings, where nothing states it and they tell."""
+    """Estimate, store and say the noise of measured readings that nothing states."""
     from hilcal.identification.noise_estimate import NOISE, measured_noise
     from hilcal.numbers import sentence
     from hilcal.present.registration import covariance_words

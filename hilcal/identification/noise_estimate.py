@@ -75,9 +75,8 @@ NOISE = "noise"
 estimate; absent where the noise is stated, or as the samples show it."""
 CONTRADICTED = 3.0
 """Standard errors of a factor's log from which on readings contradict their covariances."""
-WORTH = 1.3
-"""Factor from which on the noise of measured readings is another one than of their samples; a
-choice."""
+LEAST_FACTOR = 1.3
+"""Smallest factor by which the noise of readings differs from that of their samples; a choice."""
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 
@@ -137,7 +136,7 @@ def with_estimated_noise(
         are described.
     """
     readings, station = found.readings, config.tracker.station_m
-    told = None if found.noise_stated else _told(readings, cell, config)
+    told = None if found.noise_stated else _components(readings, cell, config)
     if told is None:
         return found, None
     factors, estimate = told.factors, told.estimate(readings, station)
@@ -168,13 +167,14 @@ def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseE
         default = with_noise_of(config.tracker, readings)
     except InputError:  # a reading at the station
         return None
-    told = _told(default, cell, config)
+    told = _components(default, cell, config)
     if told is None:
         return None
     factors = {k: f for k, f in told.factors.items() if k not in (SCATTER, STATED)}
     sampled, of = _sizes(readings, station), _sizes(default, station)
     off = (
-        abs(np.log(f * of[k] / sampled[k])) > max(np.log(WORTH), CONTRADICTED * told.log_errors[k])
+        abs(np.log(f * of[k] / sampled[k]))
+        > max(np.log(LEAST_FACTOR), CONTRADICTED * told.log_errors[k])
         for k, f in factors.items()
     )
     if not any(off):
@@ -201,8 +201,8 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Told:
-    """What readings tell of their noise.
+class _Components:
+    """Components of the noise of readings, as these tell them.
 
     Attributes:
         model: frames, at which the arm's scatter is evaluated.
@@ -229,8 +229,8 @@ class _Told:
         )
 
 
-def _told(readings: Readings, cell: Cell, config: CellConfig) -> _Told | None:
-    """Return what readings tell of their noise; None see `with_estimated_noise`."""
+def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
+    """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES:
         return None
     stated = config.repeatability.per_joint(cell.arm.n)
@@ -239,7 +239,7 @@ def _told(readings: Readings, cell: Cell, config: CellConfig) -> _Told | None:
         found = _factors(model, _some(readings), config.tracker.station_m, stated)
     except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
         return None
-    return None if found is None else _Told(model, *found)
+    return None if found is None else _Components(model, *found)
 
 
 def _some(readings: Readings) -> Readings:
@@ -255,7 +255,7 @@ def _some(readings: Readings) -> Readings:
 def _factors(
     model: Model, readings: Readings, station: Sequence[float] | None, joint_std: Floats
 ) -> tuple[dict[str, float], dict[str, float]] | None:
-    """Factors and their logs' errors, see `_Told`.
+    """Factors and their logs' errors, see `_Components`.
 
     None where the readings show effects beside the largest.
     """

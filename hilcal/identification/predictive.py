@@ -150,7 +150,7 @@ def predictive(
     stated = whitening(fitted, mode, "gc")
     prediction = model.predict(fitted.states, theta)
     raw = residual(fitted, prediction, stated)
-    known, least, of_sizes = None, 1.0, np.zeros((model.size, model.size))
+    known, least, from_variances = None, 1.0, np.zeros((model.size, model.size))
     if model.background:
         variances = mixed_fit_at(model, fitted.as_stated(), mode, theta)
         arm = fitted.arm_scatter  # whose factor the standard deviations are in units of
@@ -161,7 +161,7 @@ def predictive(
         )
         e = variances.equations
         by = e.problem.parameters(e.sensitivity, model.size)
-        of_sizes = by @ variances.covariance @ by.T
+        from_variances = by @ variances.covariance @ by.T
     of = coordinates_of(model)
     chosen = of.prior(prior)
     std = of.prior(open_prior(model, theta, prior))
@@ -208,7 +208,7 @@ def predictive(
     root = of.transform(root * std[:, None])
     factor = max(least, left_out_sigma**2 / (scatter + left_out))
     return Predictive(
-        model, theta, root @ root.T + of_sizes, open_prior(model, theta, prior), more, noise,
+        model, theta, root @ root.T + from_variances, open_prior(model, theta, prior), more, noise,
         factor, least,
         leverage, scatter, left_out, scatter_m2, 3 * left_out_m2,
     )  # fmt: skip

@@ -132,7 +132,7 @@ def test_other_names_are_taken_where_nothing_is_unsure(tmp_path: Path) -> None:
     for part in ("joints = J1 [deg], J2 [deg]", "position = X [mm], Y [mm]", "load = Load"):
         assert part in found.taken
     vague = other_names(",".join("abcdefghi"))
-    with pytest.raises(InputError, match=r"cannot be told: .*hilcal import .* --preview -o"):
+    with pytest.raises(InputError, match=r"cannot be guessed: .*hilcal import .* --preview -o"):
         read_points(written(tmp_path, vague), ARM, LOADS)
     typed = f"{JOINTS},lod\n0,0,0,0,0,0,10kg\n"  # one of ours that is not
     with pytest.raises(InputError, match="unknown column 'lod'; valid"):
