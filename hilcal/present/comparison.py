@@ -61,7 +61,7 @@ def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
     if c.lacked:
         yield (
             f"The model of {earlier} lacks {numbers.names(c.lacked)} by its own readings; added "
-            f"for this comparison alone (hilcal refine {quoted(earlier)} keeps it)."
+            "for this comparison alone (hilcal refine EARLIER keeps it)."
         )
     if c.anew:
         yield (

@@ -89,6 +89,10 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.M
     ):
         assert part in " ".join(words.split())
     assert max(map(len, words.splitlines())) <= 100
+    assert f"Go on with: hilcal view {path}" in " ".join(words.split())
+    ok(capsys, "view", path, "--record", recording.with_name("again.rrd"))
+    assert f"hilcal report {path}" in words
+    ok(capsys, "report", path, "-o", tmp_path / "demo.html")
     with CampaignFile.open(tmp_path / "demo.validation.hilcal") as test:
         assert purpose_of(test) == "validation"
     assert recording.read_bytes()[:4] == b"RRF2"

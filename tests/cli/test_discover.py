@@ -93,6 +93,12 @@ def test_a_law_is_written_as_an_effect_and_told(
     other = tmp_path / "bent_or_1.py"
     assert found.document["alternatives"] == [{"name": "bent_or_1", "written": str(other)}]
     assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
+    files = ("--effects-from", out, "--effects-from", other)
+    plan = ("-o", tmp_path / "plan.json", "--suspects", "bent,bent_or_1", *files, "--quick")
+    absolute = tmp_path / "absolute.hilcal"
+    absolute.write_bytes(campaign.read_bytes())
+    ok(capsys, "identify", absolute, "--readings", "absolute")
+    ok(capsys, "next", absolute, *plan, "--poses", "4")
     (kind,) = read_effects(other).effects
     assert (kind.name, kind.summary) == ("bent_or_1", "dq_3 = a·cos(q_5)·τ_3")
     other.unlink()

@@ -185,7 +185,7 @@ def test_what_was_fitted_is_not_searched_for_ever(run: Path, found: hc.Fit, monk
     assert len(hashed) <= 4
 
 
-def _bad(path: Path, found: hc.Fit, how: str) -> None:
+def spoil(path: Path, found: hc.Fit, how: str) -> None:
     """Make revision 2 of three a bad one."""
     with hc.Campaign.open(path) as o:
         for _ in range(3):
@@ -214,7 +214,7 @@ def test_a_revision_before_the_first_one_is_set_aside(run: Path, found: hc.Fit, 
 def test_a_bad_revision_is_set_aside_and_no_reading(
     run: Path, found: hc.Fit, capsys: Capsys, how: str
 ) -> None:
-    _bad(run, found, how)
+    spoil(run, found, how)
     original = run.read_bytes()
     for command in ("info", "identify", "compare", "export"):
         words = ["--readings", str(run.with_suffix(".csv"))] if command == "export" else []
@@ -251,12 +251,12 @@ def _first(path: Path) -> object:
 
 
 def test_a_second_repair_keeps_both_originals(run: Path, found: hc.Fit, capsys: Capsys) -> None:
-    _bad(run, found, "damage")
+    spoil(run, found, "damage")
     first = Path(ok(capsys, "repair", run, "--json").document["original"])
     kept = first.read_bytes()
     with hc.Campaign.open(run) as o:
         o.append(found)
-    _bad(run, found, "damage")
+    spoil(run, found, "damage")
     second = Path(ok(capsys, "repair", run, "--json").document["original"])
     assert first != second
     assert first.read_bytes() == kept

@@ -127,6 +127,18 @@ def test_the_file_is_planned_without_an_edit(
     assert (tmp_path / "plan.json").is_file()
 
 
+def test_the_steps_that_it_names(tmp_path: Path, capsys: Capsys) -> None:
+    path, plan, out = (tmp_path / n for n in ("CELL.toml", "plan.json", "rehearsal.hilcal"))
+    said = " ".join(ok(capsys, "init", path, "--robot", "ur3").out.split())
+    assert f"hilcal plan {path} -o plan.json" in said
+    ok(capsys, "plan", path, "-o", plan, "--quick", "--poses", "5")
+    assert f"hilcal run {path} --plan plan.json --rehearse -o rehearsal.hilcal" in said
+    ok(capsys, "run", path, "--plan", plan, "--rehearse", "-o", out)
+    assert "once it has [robot] driver and [robot] host and [tracker] driver" in said
+    assert f"[tracker] port: hilcal check {path} --plan plan.json" in said
+    assert "[robot] driver is missing" in run(capsys, "check", path, "--plan", plan).err
+
+
 def test_nothing_is_overwritten_unasked(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")

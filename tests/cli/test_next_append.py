@@ -1,9 +1,12 @@
 """A further plan in a campaign: names, cycles, the file, and `hilcal run --append`."""
 
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +16,7 @@ from hilcal.store.appended import joined, with_new_names
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, load_plan
 from hilcal.store.run_log import RunLog
+from hilcal.workbench.session import Session
 from tests.cli.test_until_goal import Site, site
 from tests.support.cli_cases import ok, refused
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
@@ -169,6 +173,17 @@ def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys
     assert fitted["n_readings"] == len(readings)
     again = ok(capsys, *site.command("--resume", "--json")).document  # nothing is missing
     assert again["readings"] == len(readings)
+
+
+def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
+    """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
+    ok(capsys, *site.command(*site.fresh))
+    site.bench.world.again()
+    path, further = site.directory / "run.hilcal", further_plan(site)
+    planned: Any = SimpleNamespace(path=path, planned=(None, further))
+    line = Session.run_line(planned)
+    named = line.replace("CELL.toml", str(site.directory / "cell.toml"))
+    assert ok(capsys, *shlex.split(named)[1:]).code == 0
 
 
 def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> None:

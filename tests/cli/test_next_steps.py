@@ -9,6 +9,7 @@ import html
 import json
 import re
 import shlex
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.cli.commands import COMMANDS
+from hilcal.diagnosis.comparison import Comparison
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, Outcome, ok, refused, table
 from tests.support.cli_cases import run as command
@@ -215,112 +217,207 @@ def test_a_campaign_that_calibrate_did_not_make(run: Path, capsys: Capsys) -> No
     follow(capsys, said, f"hilcal info '{run}'")
 
 
-HERE = "tests/cli/test_next_steps.py"
-TAKEN = {
-    "calibration/corrected": f"{HERE}::test_deflections_lack_the_unloaded_arm",
-    "calibration/points": "tests/unit/calibration/test_points.py"
-    "::test_poses_without_joint_values_by_a_mapping",
-    "campaign/campaign": f"{HERE}::test_readings_were_appended",
-    "campaign/revisions": f"{HERE}::test_another_scaling_or_parameters_of_another_version",
-    "cli/campaigns": f"{HERE}::test_without_a_revision",
-    "cli/comparing": f"{HERE}::test_without_a_revision",
-    "cli/demo": "tests/cli/test_demo.py::test_the_demo_in_words",
-    "cli/discovering": "tests/cli/test_discover.py"
-    "::test_a_law_is_found_written_added_and_the_model_is_adequate",
-    "cli/doctor": f"{HERE}::test_files_that_are_not_there_yet",
-    "cli/exporting": f"{HERE}::test_without_a_revision",
-    "cli/fits": f"{HERE}::test_nothing_to_carry_over",
-    "cli/fitting": "tests/cli/test_calibrate.py",
-    "cli/init": "tests/cli/test_init.py::test_the_file_is_planned_without_an_edit",
-    "cli/looking_up": f"{HERE}::test_an_effect_of_ones_own",
-    "cli/planning": "tests/cli/test_next_append.py",
-    "cli/running": "tests/cli/test_until_goal.py::test_run_until",
-    "cli/showing": "tests/cli/test_workbench_page.py"
-    "::test_a_table_becomes_a_calibration_at_one_page",
-    "config/template": "tests/cli/test_init.py::test_the_file_is_planned_without_an_edit",
-    "design/checked_plan": f"{HERE}::test_files_that_are_not_there_yet",
-    "discovery/write_effect": "tests/cli/test_discover.py"
-    "::test_a_law_is_found_written_added_and_the_model_is_adequate",
-    "effects/from_file": f"{HERE}::test_an_effect_of_ones_own",
-    "identification/earlier": f"{HERE}::test_another_scaling_or_parameters_of_another_version",
-    "identification/learnt": f"{HERE}::test_nothing_to_carry_over",
-    "identification/weight": "tests/unit/identification/test_weight.py"
-    "::test_without_the_weight_they_are_too_soft_and_that_is_said",
-    "measuring/run": f"{HERE}::test_files_that_are_not_there_yet",
-    "present/campaign": f"{HERE}::test_what_a_report_names",
-    "present/comparison": f"{HERE}::test_what_a_comparison_says",
-    "present/diagnosis": f"{HERE}::test_what_a_diagnosis_says",
-    "present/discovery": f"{HERE}::test_without_a_revision",
-    "present/fit": f"{HERE}::test_what_a_comparison_says",
-    "present/html/certificate": f"{HERE}::test_what_a_report_names",
-    "present/html/first_screen": f"{HERE}::test_another_scaling_or_parameters_of_another_version",
-    "present/html/other_pages": f"{HERE}::test_what_a_comparison_says",
-    "present/html/sections": f"{HERE}::test_what_a_report_names",
-    "present/preparing": f"{HERE}::test_files_that_are_not_there_yet",
-    "present/story": f"{HERE}::test_without_a_revision",
-    "present/verdict": f"{HERE}::test_deflections_lack_the_unloaded_arm",
-    "present/viewer/live_scene": f"{HERE}::test_without_a_revision",
-    "procedure/state": f"{HERE}::test_a_campaign_that_calibrate_did_not_make",
-    "procedure/next_plan": f"{HERE}::test_what_next_says",
-    "store/campaign_file": "tests/cli/test_fit_beside_run.py",
-    "store/plan": f"{HERE}::test_files_that_are_not_there_yet",
-    "store/purpose": "tests/cli/test_calibrate.py",
-    "store/robot_file": "tests/cli/test_robot_file.py::test_a_campaign_reads_no_file_that_it_names",
-    "tables/columns": f"{HERE}::test_files_that_are_not_there_yet",
-    "tables/guessing/proposal": "tests/cli/test_import_tables.py",
-    "tables/parquet_stream": "tests/cli/test_import_tables.py",
-    "transfer/compare": "tests/cli/test_compare.py::test_deflections_need_a_loaded_reading",
-    "workbench/cards": "tests/cli/test_workbench_page.py"
-    "::test_a_table_becomes_a_calibration_at_one_page",
-    "workbench/guard": "tests/cli/test_workbench_page.py"
-    "::test_only_the_browser_with_the_address_is_let_in",
-    "workbench/session": "tests/cli/test_workbench_page.py"
-    "::test_the_next_measurement_is_planned_and_the_arm_is_seen",
-    "write_report": f"{HERE}::test_what_a_report_names",
+def test_another_arm_is_calibrated_by_itself(
+    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = imported(capsys, tmp_path / "later.hilcal", seed=2)
+    ok(capsys, "identify", run)
+    monkeypatch.setattr(Comparison, "another_arm", True)
+    follow(capsys, ok(capsys, "compare", run, later).out, f"hilcal refine {later}")
+
+
+HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_steps.py::test_"
+PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
+DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
+TAKEN: dict[str, dict[str, str]] = {
+    "calibration/corrected": {
+        "hilcal identify RUN --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm"
+    },
+    "calibration/points": {
+        "--preview -o M.toml": "tests/unit/calibration/test_points.py"
+        "::test_poses_without_joint_values_by_a_mapping"
+    },
+    "campaign/campaign": {
+        "is used: hilcal accept {} --release": f"{HERE}readings_were_appended",
+        "use it first: hilcal accept": f"{RARE}a_revision_in_a_cell_that_was_changed",
+        "needs gc: run hilcal identify": f"{HERE}another_scaling_or_parameters_of_another_version",
+        "no revision yet; run hilcal identify or refine": f"{HERE}without_a_revision",
+    },
+    "campaign/revisions": {
+        "before readings were appended": f"{HERE}readings_were_appended",
+        "targets, the cell has": f"{RARE}a_revision_of_other_targets",
+        "other parameters": f"{HERE}another_scaling_or_parameters_of_another_version",
+        "fit again: hilcal identify or refine": f"{HERE}an_effect_of_ones_own",
+    },
+    "cli/campaigns": {
+        "hilcal identify {}": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again",
+        "take it back with: hilcal accept": f"{RARE}what_accept_says",
+        "make one with hilcal identify or refine": f"{HERE}without_a_revision",
+    },
+    "cli/comparing": {"hilcal refine makes a model": f"{HERE}without_a_revision"},
+    "cli/demo": {
+        "hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
+        "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words",
+    },
+    "cli/discovering": {
+        "hilcal add": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
+        "hilcal diagnose": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
+        "hilcal next": f"{DISCOVER}a_law_is_written_as_an_effect_and_told",
+    },
+    "cli/doctor": {"hilcal config explains": f"{HERE}files_that_are_not_there_yet"},
+    "cli/exporting": {
+        "hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
+        "run hilcal identify first": f"{HERE}without_a_revision",
+    },
+    "cli/fits": {"hilcal identify keeps it": f"{HERE}without_a_revision"},
+    "cli/fitting": {
+        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"
+    },
+    "cli/init": {"hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
+    "cli/looking_up": {"hilcal diagnose RUN.hilcal": f"{HERE}an_effect_of_ones_own"},
+    "cli/planning": {
+        "hilcal run {}": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+    },
+    "cli/running": {
+        "Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
+        "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until",
+    },
+    "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
+    "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
+    "design/checked_plan": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
+    "identification/earlier": {
+        "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
+    },
+    "identification/learnt": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
+    "identification/weight": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
+    "measuring/run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "present/campaign": {
+        "hilcal accept RUN N": f"{HERE}what_a_report_names",
+        "None yet: hilcal identify": f"{HERE}without_a_revision",
+    },
+    "present/comparison": {
+        "hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
+        "hilcal refine {} --prior": f"{HERE}what_a_comparison_says",
+        "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks",
+    },
+    "present/diagnosis": {
+        "remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
+        "to remove {}: hilcal remove": f"{HERE}what_a_diagnosis_says",
+        "hilcal effects new NAME": f"{HERE}an_effect_of_ones_own",
+        "its own: hilcal add RUN": f"{RARE}joints_that_differ",
+    },
+    "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
+    "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
+    "present/html/certificate": {"report --limit": f"{RARE}the_page_says_how_to_be_judged"},
+    "present/html/first_screen": {"--scaling gc": f"{RARE}the_page_says_how_to_be_judged"},
+    "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
+    "present/html/sections": {
+        "hilcal report --appendix": f"{HERE}what_a_report_names",
+        "hilcal refine finds": f"{HERE}what_a_report_names",
+    },
+    "present/preparing": {
+        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
+        "hilcal init writes a file.": f"{RARE}sections_of_a_cell",
+    },
+    "present/story": {
+        "run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
+        "run hilcal identify first": f"{RARE}what_a_recording_names",
+    },
+    "present/verdict": {
+        "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
+        "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
+    },
+    "present/viewer/live_scene": {
+        "`hilcal refine` does": f"{RARE}what_a_recording_names",
+        "hilcal refine says what": f"{RARE}what_a_recording_names",
+    },
+    "procedure/state": {"hilcal info": f"{HERE}a_campaign_that_calibrate_did_not_make"},
+    "procedure/next_plan": {
+        "see hilcal diagnose {}, or give": f"{RARE}what_next_says_of_each_verdict",
+        "diagnose again: hilcal add": f"{RARE}joints_that_differ",
+        "is adequate; to sharpen": f"{HERE}what_next_says",
+        "a figure of the cell": f"{RARE}what_next_says_of_each_verdict",
+        "the noise is misjudged": f"{RARE}what_next_says_of_each_verdict",
+        "told apart one by one": f"{RARE}what_next_says_of_each_verdict",
+        "alone is missing": f"{HERE}what_next_says",
+    },
+    "store/campaign_file": {"hilcal repair": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again"},
+    "store/plan": {"hilcal plan": f"{HERE}files_that_are_not_there_yet"},
+    "store/purpose": {"--fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"},
+    "store/robot_file": {
+        "hilcal repair {} --robot": "tests/unit/security/test_received_campaign.py"
+        "::test_the_user_gives_the_robot_of_an_old_campaign"
+    },
+    "tables/columns": {"hilcal import TABLE --preview": f"{HERE}files_that_are_not_there_yet"},
+    "tables/parquet_stream": {"with `hilcal import`": f"{RARE}a_stream_of_several_targets"},
+    "transfer/compare": {
+        "hilcal identify {} --readings": f"{RARE}deflections_are_compared_after_a_fit_of_absolute_"
+        "readings"
+    },
+    "workbench/cards": {
+        "hilcal compensate": f"{PAGE}a_table_becomes_a_calibration_at_one_page",
+    },
+    "workbench/guard": {
+        "hilcal workbench printed": f"{PAGE}only_the_browser_with_the_address_is_let_in",
+        "start hilcal workbench again": f"{PAGE}the_token_is_good_for_one_exchange",
+    },
+    "workbench/session": {
+        "hilcal run CELL.toml": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+    },
+    "write_report": {
+        "hilcal info": f"{HERE}what_a_report_names",
+        "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command",
+    },
 }
-"""The tests that take the steps that messages of a module name."""
+"""By module, what tells each sentence that names a command from the others, and the test that takes
+the step."""
 NO_STEP = {
+    "discovery/write_effect",
     "present/viewer/fleet",
     "present/viewer/plan",
     "procedure/shared",
     "store/run_log",
+    "tables/guessing/proposal",
     "workbench/server",
 }
 """Modules that name commands as where something comes from, or as a title."""
 
 
-def named_in(path: Path) -> bool:
-    """Whether a string of a module, no docstring and no help of an option, names a command."""
+def sentences(path: Path) -> Iterator[str]:
+    """Yield the strings of a module, no docstrings and no helps of options, that name a command."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    bare = {
-        id(s.value) for s in ast.walk(tree) if isinstance(s, ast.Expr)
-    }  # docstrings, and texts after a constant
-    helps = {
-        id(a)
-        for c in ast.walk(tree)
-        if isinstance(c, ast.Call) and getattr(c.func, "id", "") in ("option", "argument")
-        for a in c.args
-    }
-    commands = "|".join(COMMANDS)
-    return any(
-        re.search(rf"\bhilcal ({commands})\b", s.value)
-        for s in ast.walk(tree)
-        if isinstance(s, ast.Constant)
-        and isinstance(s.value, str)
-        and id(s) not in bare
-        and id(s) not in helps
-    )
+    left_out = {id(s.value) for s in ast.walk(tree) if isinstance(s, ast.Expr)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            left_out.update(id(part) for part in node.values)
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "argument"):
+            left_out.update(id(given) for given in node.args)
+    for node in ast.walk(tree):
+        parts = node.values if isinstance(node, ast.JoinedStr) else [node]
+        texts = [str(p.value) if isinstance(p, ast.Constant) else "{}" for p in parts]
+        text = "".join(texts) if isinstance(node, ast.JoinedStr | ast.Constant) else ""
+        if id(node) not in left_out and re.search(rf"\bhilcal ({'|'.join(COMMANDS)})\b", text):
+            yield text
 
 
 def test_every_message_is_taken() -> None:
     package = ROOT / "hilcal"
     found = {
-        str(p.relative_to(package).with_suffix("")) for p in package.rglob("*.py") if named_in(p)
+        name: said
+        for p in package.rglob("*.py")
+        if (name := str(p.relative_to(package).with_suffix(""))) not in NO_STEP
+        and (said := list(sentences(p)))
     }
-    assert found - NO_STEP == TAKEN.keys()
+    assert found.keys() == TAKEN.keys()
+    for name, said in found.items():
+        for text in said:
+            assert [part for part in TAKEN[name] if part in text], f"{name}: no test takes {text!r}"
+        for part in TAKEN[name]:
+            assert any(part in text for text in said), f"{name} has no {part!r}"
 
 
-@pytest.mark.parametrize("test", sorted(set(TAKEN.values())))
+@pytest.mark.parametrize("test", sorted({test for of in TAKEN.values() for test in of.values()}))
 def test_the_tests_that_take_them_are_there(test: str) -> None:
     path, _, name = test.partition("::")
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))

@@ -270,6 +270,7 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     assert (d["goal"]["met"], d["goal"]["text"]) == (True, "j2 std < 2 %")
     assert d["goal"]["std"] <= 2.0
     assert "goal met after " in first.err
+    assert f"Go on with: hilcal refine {path}" in " ".join(first.err.split())
     assert "standard uncertainty of joint_compliance.j2: " in first.err
     assert site.bench.world.load == "none"
     stated = ok(capsys, "identify", path, "--json").document["parameters"]
@@ -295,6 +296,11 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     assert " % of its value, " in line[0]
     assert "times what is asked for" in line[0]
     assert "goal" not in ok(capsys, *site.command("--resume", "--json")).document
+    cell = site.directory / "cell.toml"
+    assert f"plan on with: hilcal plan {cell} -o more.json --after {path}" in line[0]
+    ok(capsys, "identify", path)
+    ok(capsys, "plan", cell, "-o", site.directory / "more.json", "--after", path, "--quick")
+    ok(capsys, "refine", path)
 
 
 def test_a_wrong_goal_is_refused_before_anything_else(

@@ -1,0 +1,246 @@
+"""Next steps that messages name in states that are reached less often; see test_next_steps."""
+
+import html
+import inspect
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.changes import change_cell
+from hilcal.diagnosis.diagnosis import Reason
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.diagnosis.wrong_figures import WrongFigure
+from hilcal.discovery.discovery import Discovery
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.present.diagnosis import addition_lines
+from hilcal.present.discovery import silence
+from hilcal.present.story import build_story
+from hilcal.present.viewer import live_scene
+from hilcal.present.viewer.live_scene import GUIDE
+from hilcal.procedure.next_plan import doubt_to_settle
+from hilcal.readings.covariance import WHOLE
+from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.parquet_stream import open_stream
+from hilcal.tables.table import write_table
+from tests.cli.test_fit_beside_run import spoil
+from tests.cli.test_next_steps import follow, imported, run
+from tests.support.cli_cases import CELL, ok, refused, rehearsal
+
+__all__ = ["run"]
+Capsys = pytest.CaptureFixture[str]
+
+
+def quiet(text: str) -> None:
+    """Take progress."""
+
+
+def test_a_revision_in_a_cell_that_was_changed(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run)
+    with Campaign.open(run) as o:
+        change_cell(o, 1, o.fit(), {"tool": {"mass_kg": 1.4}}, quiet)
+    said = refused(capsys, 2, "diagnose", run, "--revision", "1")
+    follow(capsys, said, f"hilcal accept '{run}' 1")
+    ok(capsys, "diagnose", run, "--revision", "1")
+
+
+def test_what_accept_says(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run)
+    ok(capsys, "identify", run, "--effects", "joint_compliance")
+    follow(capsys, ok(capsys, "accept", run, "1").out, f"hilcal accept '{run}' --release")
+    assert ok(capsys, "info", run, "--json").document["accepted"] is None
+
+
+def test_a_revision_of_other_targets(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run)
+    with CampaignFile.open(run) as file:
+        record = file.revisions()[-1]
+        stored = record.parameters_json
+        twice = {**stored, "targets": [stored["target"], stored["target"]]}
+        file.append_revision(replace(record, parameters_json=twice))
+    assert "2 targets, the cell has 1; run hilcal identify again" in refused(
+        capsys, 2, "diagnose", run
+    )
+    ok(capsys, "identify", run)
+    ok(capsys, "diagnose", run)
+
+
+def test_a_bad_revision_is_set_aside_and_fitted_again(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run)
+    with Campaign.open(run) as o:
+        found = o.fit()
+    spoil(run, found, "damage")
+    said = refused(capsys, 2, "diagnose", run)
+    told = follow(capsys, said, f"hilcal repair '{run}'").out
+    follow(capsys, told, f"hilcal identify '{run}'")
+    ok(capsys, "diagnose", run)
+
+
+def test_what_a_file_for_others_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run, "--effects", "joint_compliance,creep", "--readings", "absolute")
+    told = ok(capsys, "export", run, "--urdf", tmp_path / "arm.urdf").out
+    assert "since not constant" in told
+    assert "hilcal compensate has it" in told
+    (points := tmp_path / "p.csv").write_text(
+        "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,load\n0.1,-1.5,1.2,-1.0,0.7,0.2,5kg\n"
+    )
+    ok(capsys, "compensate", run, points, "--json")
+
+
+def test_masses_that_a_description_lacks(tmp_path: Path, capsys: Capsys) -> None:
+    text = (configs_dir() / "robots" / "ur10e.toml").read_text()
+    arm, cell, path = tmp_path / "arm.toml", tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    arm.write_text(re.sub(r"(?m)^(mass_kg|com_m|weight_kg) = .*\n", "", text))
+    cell.write_text(CELL.read_text().replace('model = "ur10e"', f'model = "{arm}"'))
+    write_table(rehearsal("nothing", 1, 12).readings, csv := tmp_path / "t.csv")
+    ok(capsys, "import", csv, "--config", cell, "-o", path)
+    options = ("--readings", "absolute", "--effects", "base_frame,joint_compliance")
+    said = ok(capsys, "identify", path, *options).out
+    follow(capsys, said, "hilcal add RUN link_mass", RUN=path)
+    assert "hilcal add" not in ok(capsys, "info", path).out
+
+
+def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    later = imported(capsys, tmp_path / "later.hilcal", seed=2)
+    ok(capsys, "identify", run)
+    said = ok(capsys, "compare", run, later).out
+    follow(capsys, said, "hilcal refine EARLIER", EARLIER=run)
+    assert "for this comparison alone" not in ok(capsys, "compare", run, later).out
+
+
+def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "add", run, "hysteresis")
+    with Campaign.open(run) as o:
+        suspect = next(iter(diagnose(o.fit(), o.history()).suspects))
+    said = " ".join(addition_lines(replace(suspect, effect="hysteresis", kept=0.1)))
+    follow(capsys, said, "hilcal remove RUN hysteresis", RUN=run)
+
+
+def test_joints_that_differ(tmp_path: Path, capsys: Capsys) -> None:
+    path = imported(capsys, tmp_path / "run.hilcal", "nothing")
+    common = ("--effects", "base_frame,joint_compliance(joints=common)")
+    ok(capsys, "identify", path, *common)
+    each, plan = "joint_compliance(joints=each)", tmp_path / "n.json"
+    follow(capsys, refused(capsys, 4, "next", path, "-o", plan), f"hilcal add {path} '{each}'")
+    ok(capsys, "identify", path, *common)
+    follow(capsys, ok(capsys, "diagnose", path).out, f'hilcal add RUN "{each}"', RUN=path)
+    assert "Let joints differ" not in ok(capsys, "diagnose", path).out
+
+
+@pytest.mark.parametrize(
+    ("reason", "words", "step"),
+    [
+        ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
+        ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
+        ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
+        ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
+        ("background", "one by one", "hilcal plan CELL.toml -o PLAN.json --after {run}"),
+        ("residual_is_noise", "is adequate", "hilcal plan CELL.toml -o PLAN.json --after {run}"),
+    ],
+)
+def test_what_next_says_of_each_verdict(
+    run: Path, tmp_path: Path, capsys: Capsys, reason: Reason, words: str, step: str
+) -> None:
+    cell = tmp_path / "cell.toml"
+    cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
+    ok(capsys, "identify", run)
+    with Campaign.open(run) as o:
+        d = replace(diagnose(o.fit(), o.history()), reason=reason)
+        wrong = (
+            (WrongFigure("mass", "5kg", (5.0,), (9.8,), "kg", 1e-4, 2e-5),)
+            if "figure" in reason
+            else ()
+        )
+        with pytest.raises(CannotAnswerError, match=words) as said:
+            doubt_to_settle(o, replace(d, wrong_figures=wrong), quiet)
+    places = {"CELL.toml": cell, "PLAN.json": tmp_path / "p.json"}
+    follow(capsys, str(said.value), step.format(run=f"'{run}'"), **places)
+
+
+def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
+    ok(capsys, "identify", run)
+    with Campaign.open(run) as o:
+        said = silence(Discovery(o.fit(), "catalogue", catalogue=("hysteresis",)))
+    assert "hilcal refine adds them" in said
+    assert ok(capsys, "refine", run, "--json").document["revisions"][-1]["added"] == "hysteresis"
+
+
+def test_what_a_recording_names(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    assert "`hilcal refine` does, afterwards" in GUIDE
+    assert "hilcal refine says what" in inspect.getsource(live_scene)
+    with pytest.raises(InputError, match="run hilcal identify first"):
+        build_story([])
+    ok(capsys, "identify", run, "--scaling", "gu")
+    with Campaign.open(run) as o:
+        assert (
+            build_story(o.chapters()).revisions[-1].message == "run hilcal diagnose for a verdict"
+        )
+    ok(capsys, "identify", run)
+    ok(capsys, "diagnose", run)
+    with Campaign.open(run) as o:
+        assert "run hilcal" not in build_story(o.chapters()).revisions[-1].message
+    assert "hysteresis" in ok(capsys, "refine", run).out
+    ok(capsys, "view", run, "--record", tmp_path / "run.rrd")
+
+
+def test_a_stream_of_several_targets(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    frame = pd.read_csv(run.with_suffix(".csv")).assign(target="one")
+    frame.drop(columns=["pose", "load"]).to_parquet(path := tmp_path / "t.parquet")
+    with pytest.raises(InputError, match="import a table of several with `hilcal import`"):
+        open_stream(path, load_arm("ur10e"), None, None)
+    cell = tmp_path / "cell.toml"
+    one = r'targets = [{ name = "one", target_m = \1 }]'
+    cell.write_text(re.sub(r"(?m)^target_m = (.*)$", one, CELL.read_text()))
+    frame.to_parquet(path)
+    ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "t.hilcal")
+
+
+def test_deflections_are_compared_after_a_fit_of_absolute_readings(
+    run: Path, tmp_path: Path, capsys: Capsys
+) -> None:
+    ok(capsys, "identify", run, "--readings", "deflection")
+    readings = rehearsal("hysteresis", 2, 8).readings
+    write_table(readings[readings.unloaded], csv := tmp_path / "bare.csv", WHOLE)
+    ok(capsys, "import", csv, "--config", CELL, "-o", bare := tmp_path / "bare.hilcal")
+    said = refused(capsys, 2, "compare", run, bare)
+    follow(capsys, said, f"hilcal identify '{run}' --readings absolute")
+    ok(capsys, "compare", run, bare)
+
+
+def test_sections_of_a_cell(tmp_path: Path, capsys: Capsys) -> None:
+    said = ok(capsys, "config").out
+    follow(capsys, said, "hilcal config SECTION", SECTION="tracker")
+    assert "hilcal init writes a file" in said
+    ok(capsys, "init", path := tmp_path / "CELL.toml", "--robot", "ur3")
+    assert "hilcal config SECTION explains" in path.read_text()
+
+
+def test_a_page_with_a_validation_names_its_command(
+    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = imported(capsys, tmp_path / "other one.hilcal", seed=2)
+    ok(capsys, "refine", run)
+    page = tmp_path / "page.html"
+    ok(capsys, "report", run, "--validation", other, "--appendix", "-o", page)
+    (step,) = re.findall(r"hilcal validate [^<]*", html.unescape(page.read_text()))
+    monkeypatch.chdir(tmp_path)
+    follow(capsys, step, step)
+
+
+def test_the_page_says_how_to_be_judged(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+    page = tmp_path / "page.html"
+    ok(capsys, "identify", run, "--scaling", "gu")
+    ok(capsys, "report", run, "-o", page)
+    text = " ".join(page.read_text().split())
+    assert "hilcal identify --scaling gc, then hilcal diagnose" in text
+    assert "hilcal report --limit LENGTH" in text
+    ok(capsys, "identify", run, "--scaling", "gc")
+    ok(capsys, "diagnose", run)
+    ok(capsys, "report", run, "-o", page, "--limit", "2 mm")
+    text = " ".join(page.read_text().split())
+    assert "Not judged" not in text
+    assert "No limit was given" not in text
