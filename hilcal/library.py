@@ -320,7 +320,7 @@ def plan(
     Args:
         cell: the cell with its limits, loads and `[planning]`, from `Cell.load`.
         poses: how many, each read unloaded and under every load that it bears.
-        criterion: "D", "A", "E", "K", "I" or "separate"; that of `[planning]` where None.
+        criterion: "D", "A", "E", "K", "I" or "separate"; as `[planning]` has it where None.
         given: a fit of what has been measured already.
         seed: of the random candidates.
         prior: what another campaign taught of this arm; the model is planned for with what it

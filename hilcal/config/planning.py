@@ -38,9 +38,14 @@ class Planning(Section):
         examples=[["creep", "hysteresis"]],
     )
     criterion: Annotated[
-        Literal["D", "A", "E", "K", "I", "separate"],
+        Literal["D", "A", "E", "K", "I", "separate"] | None,
         BeforeValidator(lambda name: "I" if name == "test" else name),  # its name before 1.0
-    ] = Field("D", description='"D", "A", "E", "K", "I" or "separate"', examples=["I"])
+    ] = Field(
+        None,
+        description='"D", "A", "E", "K", "I" or "separate"; if absent "I" for absolute readings, '
+        '"D" for deflections',
+        examples=["I"],
+    )
     work_q_rad: tuple[_Joints, ...] = Field(
         (),
         description="a list of joint vectors in rad where the robot will work",

@@ -59,7 +59,8 @@ class Request:
         poses: just so many, each read once unloaded and under every load that it bears.
         readings: or this many readings, those at the reference and repeats not counted, spread
             over as many poses, and under those loads, as determine most.
-        criterion: of `[planning]` where None.
+        criterion: of `[planning]` where None; that has I for absolute readings and D for
+            deflections unless it states one.
         effort: of the search for whole numbers.
         unloaded: "around" or "first", see `Ordering`.
     """
@@ -144,7 +145,8 @@ def make(
         CannotAnswerError: the cell leaves too few states, its readings determine nothing of the
             model, or they are too few; names the constraint or the parameter.
     """
-    criterion = canonical(request.criterion or config.planning.criterion)
+    usual = "I" if config.planning.readings == "absolute" else "D"
+    criterion = canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
     space = Space(cell, config)
     drawn = draw(space, config.planning.candidates, rng, least=2)

@@ -272,7 +272,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert (planning.readings, planning.against, planning.criterion) == (
         "deflection",
         "catalogue",
-        "D",
+        None,
     )
     assert planning.work_q_rad == ()
     assert planning.work_min_m is planning.work_max_m is planning.reading_s is None
