@@ -305,8 +305,7 @@ class Feasibility:
         pull = self._pull(load)
         wrench = np.broadcast_to(pull, (chain.position.shape[1], 6))
         carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        about_axes = slot_wrenches(arm, chain, carried)[:, : arm.n, 5]
-        torque = np.abs(arm.drive_torques(about_axes))
+        torque = np.abs(arm.drive_torques(arm.along(slot_wrenches(arm, chain, carried))))
         usable = share * np.asarray(arm.torque_max, dtype=float)
 
         def told(k: int, over: float, state: int) -> Finding:
