@@ -89,9 +89,7 @@ class Blackboard:
         }
 
     @classmethod
-    def create(
-        cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6
-    ) -> "Blackboard":
+    def create(cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6) -> "Blackboard":
         """Make the file and start the world's clock.
 
         Args:

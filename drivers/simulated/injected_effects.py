@@ -21,9 +21,9 @@ _GIVE = np.array([2.0e-3, 2.6e-3, 1.35e-3, 1.7e-3, 2.0e-3, 2.2e-3])
 def joint_compliance(arm: Arm, rng: np.random.Generator) -> Floats:
     """Draw the (n,) compliances of the drives, rad/(N·m), ±30 % per joint.
 
-    A drive gives about 2 mrad (a slide 70 µm) at its torque limit, whatever its size: 6 to 40 µrad/(N·m) on
+    A drive gives about 2 mrad at its torque limit, whatever its size: 6 to 40 µrad/(N·m) on
     an arm of the UR10e's size (order of magnitude of harmonic drives, e.g. the stiffnesses
-    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue).
+    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue); a slide 70 µm.
     """
     return typical_compliance(arm) * rng.uniform(0.7, 1.3, arm.n)
 

@@ -80,8 +80,8 @@ class Truth:
         wrench_gain: (6,) error of the gain of its six channels, 1.
         sensor_misalignment: (3,) its axes are turned against the flange, rotation vector, rad.
         guide_error: (g, 19) of the g joints that slide: amplitudes of Legendre's polynomials over
-            the travel, -1 to 1, of the carriage's motion: x and y of orders 2 to 4, z of order 1, m;
-            rx, ry and rz of orders 1 to 4, rad.
+            the travel, -1 to 1, of the carriage's motion: x and y of orders 2 to 4, z of
+            order 1, m; rx, ry and rz of orders 1 to 4, rad.
         tracker_scale: (1,) s: positions read (1 + s) times as long, 1.
     """
 

@@ -366,6 +366,8 @@ def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[
         rng: generator.
         distance: from the base to the station, m.
     """
+    if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
+        distance = max(distance, cell.arm.reach + 1.0)
     side, turn = rng.uniform(0.0, 2.0 * np.pi, 2)
     drawn = np.eye(4)
     cos, sin = np.cos(turn), np.sin(turn)

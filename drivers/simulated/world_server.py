@@ -152,9 +152,7 @@ def _differences(a: Cell, b: Cell) -> list[str]:
 _POLL = 0.0025  # s, real time between two looks at the arm
 
 
-def open_board(
-    directory: Path, scale: float, begun: float = 0.0, joints: int = 6
-) -> Blackboard:
+def open_board(directory: Path, scale: float, begun: float = 0.0, joints: int = 6) -> Blackboard:
     """Return the blackboard of a cell; the first who asks makes it, whole or not at all."""
     path = directory / "world.bin"
     if not path.exists():
@@ -172,9 +170,7 @@ def main() -> int:
     admin.end_with_parent()
     try:
         world, config = read_world(arguments.directory / "world.json")
-        board = open_board(
-            arguments.directory, config.simulation.clock, joints=world.cell.arm.n
-        )
+        board = open_board(arguments.directory, config.simulation.clock, joints=world.cell.arm.n)
         living = WorldState(world, config, board, arguments.seed)
     except HilcalError as error:
         print(error, file=sys.stderr)

@@ -77,7 +77,7 @@ class GuideError(Effect):
         travel = np.asarray(arm.chain_angles(s.values))
         element = np.repeat(np.flatnonzero(arm.slides), count)
         values = np.zeros((len(travel), len(element), 6))
-        for n, j in enumerate(np.flatnonzero(arm.slides)):
+        for n, j in enumerate(np.flatnonzero(arm.slides).tolist()):
             # The limits are those of the controller's value; a coupling leaves the base as it is.
             waves = legvander(self._share(s.values[:, j], j), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):

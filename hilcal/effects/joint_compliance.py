@@ -30,7 +30,7 @@ class JointCompliance(PerJoint):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """One compliance per joint; 3 mrad at the joint's rated torque are ordinary, 0.1 mm of a slide."""
+        """One compliance per joint; 3 mrad (0.1 mm) at its rated torque (force) are ordinary."""
         ordinary = ordinary_give(self.cell) / rated_torques(self.cell)
         return self.group_parameters("rad/(N·m)", ordinary, "compliance of {joint}")
 

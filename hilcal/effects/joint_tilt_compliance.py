@@ -56,7 +56,7 @@ class JointTiltCompliance(PerJoint):
         """Twists (..., n, 6) of the slots by wrenches there, for a compliance of 1."""
         slides = self.cell.arm.slides
         if not slides.any():
-            return w * ACROSS
+            return np.asarray(w * ACROSS)
         turned = w * np.where(slides[:, None], TURNS, ACROSS) + 0.0 * travel[..., None]
         turned[..., 3] += travel * w[..., 1]
         turned[..., 4] -= travel * w[..., 0]

@@ -119,6 +119,11 @@ class Arm:
         """Unit of the value of a joint, counted from 0: "rad", or "m" where it slides."""
         return "m" if self.slides[joint] else "rad"
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(n,) units of the values of the joints."""
+        return tuple(map(self.unit, range(self.n)))
+
     def kind(self, joint: int) -> str:
         """What the value of a joint, counted from 0, is called: "angle" or "travel"."""
         return "travel" if self.slides[joint] else "angle"
@@ -212,7 +217,9 @@ class Arm:
         """
         travel = (self.q_max - self.q_min)[self.slides]
         if not np.all(np.isfinite(travel) & (travel > 0.0)):
-            raise InputError(f"{self.name}: a prismatic joint needs a lower and an upper limit, in m")
+            raise InputError(
+                f"{self.name}: a prismatic joint needs a lower and an upper limit, in m"
+            )
         if self.n > limits.JOINTS:
             raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 
@@ -223,5 +230,13 @@ class Arm:
 
     @property
     def reach(self) -> float:
-        """Sum of the lengths of all link transforms, m."""
-        return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum())
+        """Sum of the lengths of all link transforms, and of how far slides go, m."""
+        return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum() + self.travels.sum())
+
+    @property
+    def travels(self) -> Floats:
+        """(n,) how far slides go from their zeros at most, m; 0 of joints that turn."""
+        if self.prismatic is None:
+            return np.zeros(self.n)
+        far = np.maximum(np.abs(self.q_min), np.abs(self.q_max))
+        return np.where(self.prismatic, far, 0.0)

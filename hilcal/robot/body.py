@@ -204,7 +204,7 @@ class _Along:
 
 def _of_any(arm: Arm) -> tuple[Capsule, ...]:
     """One capsule per link, from its joint's frame to the next one's."""
-    reach = max(arm.reach, 0.1)
+    reach = max(arm.reach - float(arm.travels.sum()), 0.1)
     radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
     names = (BASE, *arm.joint_names)
     out = []

@@ -2,7 +2,8 @@
 
     T_base_flange = L_0 exp(ξ_0) M_1(q_1 + dq_1) L_1 exp(ξ_1) ... M_n(q_n + dq_n) L_n exp(ξ_n)
 
-with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly; there is no loop over states, only over the n joints.
+with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly; there is no loop over
+states, only over the n joints.
 """
 
 from collections.abc import Sequence

@@ -11,9 +11,9 @@ FLANGE = "flange"
 def pinocchio_model(arm: Arm) -> pin.Model:
     """Build a Pinocchio model with the same chain, masses and limits.
 
-    Joint i is a revolute joint about z, or a prismatic one along z, with the placement L_{i-1} in body i - 1; bodies are
-    point masses at their centres of mass; the frame "flange" has the placement L_n in the
-    last body. Gravity is Pinocchio's default.
+    Joint i is a revolute joint about z, or a prismatic one along z, with the placement L_{i-1} in
+    body i - 1; bodies are point masses at their centres of mass; the frame "flange" has the
+    placement L_n in the last body. Gravity is Pinocchio's default.
     """
     model = pin.Model()
     model.name = arm.name

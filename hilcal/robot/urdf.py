@@ -49,8 +49,8 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 
     Raises:
         InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
-            (lists the leaf links), a joint of more than one degree of freedom, or one that mimics no joint with a
-            value of its own within the chain.
+            (lists the leaf links), a joint of more than one degree of freedom, or one that mimics
+            no joint with a value of its own within the chain.
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -185,7 +185,9 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
         if i not in parents and frame.parentJoint != 0
     ]
     if not leaves:
-        raise InputError(f"{path.name}: no moving joint; expected an arm of joints that turn or slide")
+        raise InputError(
+            f"{path.name}: no moving joint; expected an arm of joints that turn or slide"
+        )
     if len(leaves) > 1:
         raise InputError(
             f"{path.name}: the chain branches; set tip_link to one of its leaf links "
