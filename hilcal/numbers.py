@@ -39,6 +39,17 @@ def angle_or(unit: str) -> tuple[str, float]:
     return ("°", 180.0 / math.pi) if unit == "rad" else (unit, 1.0)
 
 
+def of_joint(unit: str) -> tuple[str, float]:
+    """Unit for people, and its factor, of the value of a joint in rad, or in m where it slides."""
+    return ("mm", 1e3) if unit == "m" else angle_or(unit)
+
+
+def joint_value(value: float, unit: str, places: int = 1) -> str:
+    """Write the value of a joint in rad, or in m where it slides, for people."""
+    name, factor = of_joint(unit)
+    return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
+
+
 def sizes(of: Iterable[tuple[str, float]]) -> str:
     """Write (unit, value) pairs, SI, in units for people."""
     return ", ".join(f"{text} {name}" for text, _, name in (measured(u, v, count=2) for u, v in of))
