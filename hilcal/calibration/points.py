@@ -7,7 +7,7 @@ a name of ours, a mapping is guessed as `import --preview` does, and taken where
 unsure.
 
 - `pose`: its name; numbered without.
-- `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
+- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, the point is where the nominal arm has the tool
   there; together with a position they say on which branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
   vector: the pose of the tool in base axes. A position alone, beside joint values, has the
@@ -119,7 +119,7 @@ def read_points(
     q = found.pop("q_rad", None)
     if "q_deg" in found:
         q = found.pop("q_deg")
-        q = np.where(arm.slides, q, np.radians(q))
+        q = np.where(arm.slides, 1e-3 * q, np.radians(q))
     if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
@@ -309,7 +309,7 @@ def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
     q, n = joint_columns(arm.units), arm.n
     return {
         "q_rad": q,
-        "q_deg": tuple(name.replace("_rad", "_deg") for name in q),
+        "q_deg": tuple(f"{n}m" if n.endswith("_m") else n.replace("_rad", "_deg") for n in q),
         "position_m": POSITION,
         "position_mm": tuple(name.replace("_m", "_mm") for name in POSITION),
         "rotation_rad": ROTATION,

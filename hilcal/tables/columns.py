@@ -1,5 +1,6 @@
 """Columns of the exchange table: names, what a wrong header lacks, joints that mimic others."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
@@ -22,6 +23,7 @@ OWN_PREFIX = "x_"
 AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
 which tables round. A choice."""
+_JOINT = re.compile(r"qa?[0-9]+_(rad|m)")
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -129,6 +131,10 @@ def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> s
     parts = name.split("_")
     if len(parts) == 3 and parts[0] == "cov" and f"cov_{parts[2]}_{parts[1]}" in known:
         return f"; give the upper triangle only: 'cov_{parts[2]}_{parts[1]}'"
+    if _JOINT.fullmatch(name):
+        own = next((c for c in known if c.startswith(f"{parts[0]}_")), None)
+        if own is not None:
+            return f"; this joint {'slides' if own.endswith('_m') else 'turns'}: '{own}'"
     close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
     own = f"columns of your own start with '{OWN_PREFIX}'"
     joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
