@@ -7,8 +7,8 @@ a name of ours, a mapping is guessed as `import --preview` does, and taken where
 unsure.
 
 - `pose`: its name; numbered without.
-- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, the point is where the nominal arm has the tool
-  there; together with a position they say on which branch.
+- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, the point is where
+  the nominal arm has the tool there; together with a position they say on which branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
   vector: the pose of the tool in base axes. A position alone, beside joint values, has the
   orientation that the nominal arm has there.

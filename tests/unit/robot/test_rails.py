@@ -59,8 +59,8 @@ GANTRY = """<robot name="gantry"><link name="base_link"/>
 <link name="column"><inertial><origin xyz="0 0 -0.4"/><mass value="30"/>
 <inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
 <joint name="c" type="revolute"><origin xyz="0.1 0 -0.8"/><parent link="column"/>
-<child link="head"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="1"/></joint>
-<link name="head"/>
+<child link="head"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="1"/>
+</joint><link name="head"/>
 <joint name="a" type="revolute"><origin xyz="0 0 -0.2" rpy="1.2 0.3 0"/><parent link="head"/>
 <child link="wrist"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60" velocity="1"/>
 </joint><link name="wrist"/>
