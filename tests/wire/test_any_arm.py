@@ -1,4 +1,4 @@
-"""Arms of other makers in rehearsal: five to eight joints, slides among them, on simulated devices."""
+"""Arms of other makers in rehearsal: seven and eight joints, slides among them, on the wire."""
 
 import time
 from collections.abc import Iterator
