@@ -361,3 +361,48 @@ def test_the_jacobian_of_a_fitted_rail_is_the_difference_of_predictions(tmp_path
         np.testing.assert_allclose(
             derived[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(derived).max()
         )
+
+
+def plain_table(folder: Path, header: list[str], mirrored: bool = False) -> Path:
+    """Unloaded positions in mm, joints in degrees, the travel in mm; perhaps counted backwards."""
+    r, _ = campaign(folder, "nothing", 2, 24)
+    s = r.readings
+    with (folder / "theirs.csv").open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["pose", *header, "X", "Y", "Z"])
+        for k in np.flatnonzero(s.load == 0):
+            q = s.states.q[k]
+            travel = 3.0 - q[0] if mirrored else q[0]
+            joints = [1e3 * travel, *np.degrees(q[1:])]
+            figures = [*joints, *(1e3 * s.value[k])]
+            out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
+    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
+    (folder / "cell.toml").write_text(cell)
+    return folder / "theirs.csv"
+
+
+@pytest.mark.parametrize(
+    "header", [["E1", *(f"A{k}" for k in range(1, 7))], [f"J{k}" for k in range(1, 8)]]
+)
+def test_a_preview_sees_the_travel_in_mm(tmp_path: Path, capsys: Capsys, header: list[str]) -> None:
+    """Also that of an external axis, which controllers name apart from the arm's."""
+    table = plain_table(tmp_path, header)
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
+    assert 'slide_unit = "mm"' in mapping.read_text()
+    ok(capsys, "import", table, "--config", cell, "--format", mapping, "-o", run)
+    with hc.Campaign.open(run) as campaign_:
+        q = campaign_.readings.states.q
+    assert 2.9 < np.ptp(q[:, 0]) <= 3.0
+    assert np.abs(q[:, 1:]).max() < 2 * np.pi
+
+
+def test_a_travel_that_is_counted_backwards_is_named(tmp_path: Path, capsys: Capsys) -> None:
+    table = plain_table(tmp_path, [f"J{k}" for k in range(1, 8)], mirrored=True)
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
+    said = ok(capsys, "import", table, "--config", cell, "--format", mapping, "-o", run)
+    words = " ".join((said.out + said.err).split())
+    assert "joint_sign = [-1, 1, 1, 1, 1, 1, 1]" in words
