@@ -9,6 +9,9 @@ _UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "m": (("µm", 1e6, 1e-3), ("mm", 1e3, math.inf)),
     "rad": (("µrad", 1e6, 1e-3), ("mrad", 1e3, math.inf)),
     "rad/(N·m)": (("µrad/(N·m)", 1e6, math.inf),),
+    "m/N": (("nm/N", 1e9, math.inf),),
+    "m/N³": (("am/N³", 1e18, math.inf),),
+    "m/K": (("µm/K", 1e6, math.inf),),
     "rad/(N·m)³": (("prad/(N·m)³", 1e12, math.inf),),
     "m/s": (("µm/h", 3.6e9, math.inf),),
     "rad/s": (("µrad/h", 3.6e9, math.inf),),
@@ -34,6 +37,17 @@ def unit_for(unit: str, values: Sequence[float]) -> tuple[str, float]:
 def angle_or(unit: str) -> tuple[str, float]:
     """Unit for people, and its factor, of a recorded variable: angles in degrees, others in SI."""
     return ("°", 180.0 / math.pi) if unit == "rad" else (unit, 1.0)
+
+
+def of_joint(unit: str) -> tuple[str, float]:
+    """Unit for people, and its factor, of the value of a joint in rad, or in m where it slides."""
+    return ("mm", 1e3) if unit == "m" else angle_or(unit)
+
+
+def joint_value(value: float, unit: str, places: int = 1) -> str:
+    """Write the value of a joint in rad, or in m where it slides, for people."""
+    name, factor = of_joint(unit)
+    return f"{factor * value:.{places}f}{name if name == '°' else ' ' + name}"
 
 
 def sizes(of: Iterable[tuple[str, float]]) -> str:

@@ -12,86 +12,94 @@ from typing import Any
 
 import numpy as np
 
-N = 6
-"""Joints of the arm in the cell."""
 MOST_TARGETS = 8
 """Targets that a tool can carry in the simulated cell."""
-
-SECTIONS: dict[str, np.dtype[Any]] = {
-    # written once by the world
-    "world": np.dtype([("start_ns", "<i8"), ("scale", "<f8")]),
-    # written by the arm's controller
-    "arm": np.dtype(
-        [
-            ("alive", "<f8"),  # 1 once the controller has written its state
-            ("q", "<f8", N),  # where the commanded trajectory is, rad
-            ("qd", "<f8", N),  # its speed, rad/s
-            ("side", "<f8", N),  # direction of each joint's last motion, -1 or +1
-            ("arrivals", "<i8"),  # motions that have ended (also by a stop)
-            ("moving", "<f8"),  # 1 while the trajectory runs
-            ("payload", "<f8"),  # as set in the controller, kg
-            ("payload_com", "<f8", 3),  # flange axes, m
-        ]
-    ),
-    # written by the world: what is true
-    "truth": np.dtype(
-        [
-            ("time", "<f8"),  # world time of the content, s
-            ("load", "<i8"),  # number of the load in the cell's [[loads]] + 1, 0 is none
-            ("load_since", "<f8"),  # world time of its last change, s
-            ("target", "<f8", 3),  # tracked target, sensor (tracker) axes, m
-            ("target_rotation", "<f8", (3, 3)),
-            ("targets", "<f8", (MOST_TARGETS, 3)),  # of several all, `target` first; else NaN, m
-            ("flange", "<f8", (4, 4)),  # T_base_flange
-            ("sensor_wrench", "<f8", 6),  # on the force sensor by tool and load, sensor axes
-            ("drive_torque", "<f8", N),  # N·m
-            ("encoder", "<f8", N),  # what the encoders read, rad
-            ("joint_temperature", "<f8", N),  # °C
-            ("air_temperature", "<f8"),  # °C
-            ("arrivals", "<i8"),  # the arm's `arrivals` that the content belongs to
-        ]
-    ),
-}
 _SEQUENCE = 8
 _TRIES = 10_000
 
 
-def _offsets() -> tuple[dict[str, int], int]:
+def sections(n: int) -> dict[str, np.dtype[Any]]:
+    """Return the sections of the world of an arm of n joints; angles of a slide are in m."""
+    return {
+        # written once by the world
+        "world": np.dtype([("joints", "<i8"), ("start_ns", "<i8"), ("scale", "<f8")]),
+        # written by the arm's controller
+        "arm": np.dtype(
+            [
+                ("alive", "<f8"),  # 1 once the controller has written its state
+                ("q", "<f8", n),  # where the commanded trajectory is, rad
+                ("qd", "<f8", n),  # its speed, rad/s
+                ("side", "<f8", n),  # direction of each joint's last motion, -1 or +1
+                ("arrivals", "<i8"),  # motions that have ended (also by a stop)
+                ("moving", "<f8"),  # 1 while the trajectory runs
+                ("payload", "<f8"),  # as set in the controller, kg
+                ("payload_com", "<f8", 3),  # flange axes, m
+            ]
+        ),
+        # written by the world: what is true
+        "truth": np.dtype(
+            [
+                ("time", "<f8"),  # world time of the content, s
+                ("load", "<i8"),  # number of the load in the cell's [[loads]] + 1, 0 is none
+                ("load_since", "<f8"),  # world time of its last change, s
+                ("target", "<f8", 3),  # tracked target, sensor (tracker) axes, m
+                ("target_rotation", "<f8", (3, 3)),
+                ("targets", "<f8", (MOST_TARGETS, 3)),  # of several all, `target` first; else NaN
+                ("flange", "<f8", (4, 4)),  # T_base_flange
+                ("sensor_wrench", "<f8", 6),  # on the force sensor by tool and load, sensor axes
+                ("drive_torque", "<f8", n),  # N·m
+                ("encoder", "<f8", n),  # what the encoders read, rad
+                ("joint_temperature", "<f8", n),  # °C
+                ("air_temperature", "<f8"),  # °C
+                ("arrivals", "<i8"),  # the arm's `arrivals` that the content belongs to
+            ]
+        ),
+    }
+
+
+def _offsets(n: int) -> tuple[dict[str, int], int]:
     at, out = 0, {}
-    for name, kind in SECTIONS.items():
+    for name, kind in sections(n).items():
         out[name] = at
         at += -(-(_SEQUENCE + kind.itemsize) // 64) * 64
     return out, at
 
 
-_AT, SIZE = _offsets()
-
-
 class Blackboard:
-    """An open shared file; use `create` once and `attach` in every process."""
+    """An open shared file; use `create` once and `attach` in every process.
+
+    Attributes:
+        joints: of the arm in the cell.
+    """
 
     def __init__(self, path: Path) -> None:
         """Map an existing file."""
         with path.open("r+b") as stream:
-            self._map = mmap.mmap(stream.fileno(), SIZE)
+            self._map = mmap.mmap(stream.fileno(), 0)
+        self.joints = int(np.frombuffer(self._map, "<i8", 1, _SEQUENCE)[0])
+        at, size = _offsets(self.joints)
+        if len(self._map) != size:
+            raise ValueError(f"{path} is of {len(self._map)} bytes; expected {size}")
         self._sequence = {
-            name: np.frombuffer(self._map, "<i8", 1, offset) for name, offset in _AT.items()
+            name: np.frombuffer(self._map, "<i8", 1, offset) for name, offset in at.items()
         }
         self._content = {
-            name: np.frombuffer(self._map, kind, 1, _AT[name] + _SEQUENCE)
-            for name, kind in SECTIONS.items()
+            name: np.frombuffer(self._map, kind, 1, at[name] + _SEQUENCE)
+            for name, kind in sections(self.joints).items()
         }
 
     @classmethod
-    def create(cls, path: Path, scale: float, begun: float = 0.0) -> "Blackboard":
+    def create(cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6) -> "Blackboard":
         """Make the file and start the world's clock.
 
         Args:
             path: the file.
             scale: world seconds per real second.
             begun: world time that it starts at, s.
+            joints: of the arm.
         """
-        path.write_bytes(bytes(SIZE))
+        number = np.array([0, joints], "<i8").tobytes()
+        path.write_bytes(number + bytes(_offsets(joints)[1] - len(number)))
         board = cls(path)
         start = time.monotonic_ns() - round(1e9 * begun / scale)
         board.write("world", start_ns=start, scale=scale)
@@ -115,7 +123,7 @@ class Blackboard:
         sequence[0] = int(sequence[0]) + 1
 
     def read(self, section: str) -> Any:
-        """Return a consistent copy of a section, a record with the fields of `SECTIONS`."""
+        """Return a consistent copy of a section, a record with the fields of `sections`."""
         sequence, content = self._sequence[section], self._content[section]
         for _ in range(_TRIES):
             before = int(sequence[0])

@@ -15,11 +15,13 @@ from typing import Any, Self
 import numpy as np
 
 from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.world import World
 from drivers.simulated.world_server import open_board, write_world
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, InputError
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
 
 _ROOT = Path(__file__).resolve().parents[2]
 _END = 2.0  # s that a process has to end by itself, and again after it was asked to
@@ -127,6 +129,9 @@ START_TIMEOUT = 20.0
 """Real time in which every simulated device has to be ready, s."""
 
 UR_PORTS = (29999, 30003, 30004)
+UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+ARM_DRIVER = "drivers.simulated.arm:open_arm"
+"""Of every other arm, by its place: it is of use in a simulated cell alone."""
 FORCE_SENSORS = ("ft300", "bota", "hex")
 _STALE = (
     "world.json",
@@ -171,6 +176,7 @@ class SimulatedCell:
         *,
         base_dir: Path | None = None,
         begun: float = 0.0,
+        home: Floats | None = None,
     ) -> Self:
         """Start every device of the cell, and return when all of them are ready.
 
@@ -181,6 +187,7 @@ class SimulatedCell:
             seed: of everything random.
             base_dir: directory that a robot's file path in `config` is relative to.
             begun: world time at the start, s: over 0 where the world was there before.
+            home: (n,) where the arm stands at first; an arm of UR stands upright.
 
         Raises:
             InputError: a cell that cannot be simulated.
@@ -192,7 +199,9 @@ class SimulatedCell:
             for name in _STALE:
                 (directory / name).unlink(missing_ok=True)
             write_world(directory / "world.json", world, config, base_dir)
-            board = open_board(directory, config.simulation.clock, begun)
+            board = open_board(directory, config.simulation.clock, begun, world.cell.arm.n)
+            if not is_ur(world.cell.arm):
+                board.write("arm", q=_standing(world.cell.arm) if home is None else home)
         except OSError as error:
             raise InputError(
                 f"simulated cell: {directory} cannot be used ({error}); "
@@ -201,7 +210,8 @@ class SimulatedCell:
         for attempt in range(1, _HOSTS + 1):
             host = free_host()
             devices = _devices(world, config, directory, seed, host)
-            cell = cls(_filled_in(config, directory, host), directory, devices, board)
+            filled = _filled_in(config, directory, host, is_ur(world.cell.arm))
+            cell = cls(filled, directory, devices, board)
             try:
                 cell._begin(devices.values())
             except BaseException as error:
@@ -324,11 +334,6 @@ def free_host() -> str:
 
 def _check(world: World, config: CellConfig, directory: Path) -> None:
     """Refuse what the wire-level devices cannot be."""
-    arm = world.cell.arm
-    if arm.n != N:
-        raise InputError(
-            f"simulated cell: the arm {arm.name} has {arm.n} joints; valid: arms of {N} joints"
-        )
     if not np.array_equal(world.station, np.eye(4)):
         raise InputError(
             "simulated cell: a station measures from where it stands, but the readings' origin "
@@ -365,8 +370,11 @@ def _devices(
         "world": device("world", "world_server", "--seed", str(seed)),
         "arm": device(
             "arm",
-            "ur_server",
-            *("--host", host, "--robot", config.robot.model),
+            *(
+                ("ur_server", "--host", host, "--robot", config.robot.model)
+                if is_ur(world.cell.arm)
+                else ("arm_server",)
+            ),
             *("--seed", str(seed + 3)),
         ),
         "tracker": device(
@@ -383,10 +391,26 @@ def _devices(
     return out
 
 
-def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
-    """Return the configuration that leads to the simulated devices; what it gives stays."""
-    robot = {"host": host, "driver": config.robot.driver or "ur"}
+def is_ur(arm: Arm) -> bool:
+    """Whether an arm is one of Universal Robots in the catalogue: its own protocol is simulated."""
+    return arm.name.startswith("ur") and arm.n == len(UR_JOINTS) and arm.joint_names == UR_JOINTS
+
+
+def _standing(arm: Arm) -> Floats:
+    """(n,) the middle of what the joints are used in."""
+    low, high = arm.usual_range
+    return np.asarray(0.5 * (low + high))
+
+
+def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:
+    """Return the configuration that leads to the simulated devices.
+
+    What it gives stays, but for the driver of an arm whose own protocol is not simulated.
+    """
     directory = directory.absolute()
+    robot: dict[str, Any] = {"host": host, "driver": config.robot.driver or "ur"}
+    if not ur:
+        robot = {"driver": ARM_DRIVER, "options": {"socket": str(directory / "arm.sock")}}
     tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
     options = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {

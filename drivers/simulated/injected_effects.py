@@ -23,7 +23,7 @@ def joint_compliance(arm: Arm, rng: np.random.Generator) -> Floats:
 
     A drive gives about 2 mrad at its torque limit, whatever its size: 6 to 40 µrad/(N·m) on
     an arm of the UR10e's size (order of magnitude of harmonic drives, e.g. the stiffnesses
-    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue).
+    K1..K3 against rated torque in the Harmonic Drive CSD/SHD catalogue); a slide 70 µm.
     """
     return typical_compliance(arm) * rng.uniform(0.7, 1.3, arm.n)
 
@@ -31,13 +31,23 @@ def joint_compliance(arm: Arm, rng: np.random.Generator) -> Floats:
 def typical_compliance(arm: Arm) -> Floats:
     """Return the (n,) middle of the compliances that are drawn, rad/(N·m)."""
     give = _GIVE if arm.n == len(_GIVE) else np.full(arm.n, 1.9e-3)
-    return np.asarray(give / typical_torque(arm))
+    return np.asarray(np.where(arm.slides, 7e-5, give) / typical_torque(arm))
 
 
 def typical_torque(arm: Arm) -> Floats:
-    """Return the (n,) torque limits of the drives; 100 N·m where none is known."""
+    """Return the (n,) torque or force limits of the drives; 100 N·m, 1500 N where not known."""
     limit = np.asarray(arm.torque_max, dtype=float)
-    return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, 100.0))
+    unknown = np.where(arm.slides, 1500.0, 100.0)
+    return np.asarray(np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown))
+
+
+def typical_tilt(arm: Arm) -> Floats:
+    """Return the (n,) middle of twice the bearings' compliances, rad/(N·m).
+
+    Of a slide's carriage 1 mrad at its rated force half a metre off.
+    """
+    carriage = 2e-3 / (0.5 * typical_torque(arm))
+    return np.where(arm.slides, carriage, typical_compliance(arm))
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,22 +69,26 @@ class Draw:
     def effect(self, name: str, rng: np.random.Generator) -> Floats:
         """Return the parameters of the named effect, shaped as in `Truth`."""
         n, typical, order = self.arm.n, typical_compliance(self.arm), self.harmonics
-        even, normal = rng.uniform, rng.standard_normal
+        even, normal, slides = rng.uniform, rng.standard_normal, self.arm.slides
         decay = 1.0 / np.arange(1, order + 1)[:, None]
-        plate = 0.3 * float(typical[-1]) * np.array([0.5, 1.0])  # stiffer about its own axis
+        tilt = typical_tilt(self.arm)
+        plate = 0.3 * float(tilt[-1]) * np.array([0.5, 1.0])  # stiffer about its own axis
         heavy = np.maximum(self.arm.masses, 0.1)[:, None]
         draws: dict[str, Callable[[], Floats]] = {
             "joint_compliance": lambda: joint_compliance(self.arm, rng),
             "joint_stiffening": lambda: (
                 -(even(0.7, 1.0, n) / 3.0) * self.compliance / self.torque**2
             ),
-            "joint_tilt_compliance": lambda: 0.5 * typical * even(0.3, 1.0, n),
-            "base_compliance": lambda: 0.5 * float(typical[0]) * even(0.3, 1.0, 3),
+            "joint_tilt_compliance": lambda: 0.5 * tilt * even(0.3, 1.0, n),
+            "base_compliance": lambda: 0.5 * float(tilt[0]) * even(0.3, 1.0, 3),
             "link_compliance": lambda: self._beams(rng),
             "hysteresis": lambda: 5e-5 * even(0.3, 1.0, n),
             "encoder_offset": lambda: 2e-4 * normal(n),
             "joint_coupling": lambda: self._couplings(rng),
-            "transmission_error": lambda: 1e-4 * decay * normal((n, order, 2)),
+            "transmission_error": lambda: (
+                np.where(slides, 2e-5, 1e-4)[:, None, None] * decay * normal((n, order, 2))
+            ),
+            "guide_error": lambda: 3e-5 * normal(Truth.rigid(self.arm).guide_error.shape),
             "link_geometry": lambda: 3e-4 * normal((n + 1, 6)),
             "load_point": lambda: 5e-3 * normal(3),
             "target_offset": lambda: 5e-3 * normal(3),
@@ -104,13 +118,14 @@ class Draw:
         out = np.diag(rng.standard_normal(n - 1), -1) if n > 1 else np.zeros((n, n))
         if n > 2:
             out[n - 1, n - 3] = rng.standard_normal()
-        return np.asarray(2e-4 * out)
+        alike = self.arm.slides[:, None] == self.arm.slides
+        return np.asarray(2e-4 * out * alike)
 
     def _beams(self, rng: np.random.Generator) -> Floats:
         """Draw 1/EI and 1/GJ (b, 2): a tube that gives as much as half a drive over its length."""
         which = long_links(self.arm)
         length = np.linalg.norm(self.arm.links[which, :3, 3], axis=1)
-        size = 0.5 * typical_compliance(self.arm)[:3].mean() / length
+        size = 0.5 * typical_tilt(self.arm)[:3].mean() / length
         return np.asarray(size[:, None] * [1.0, 1.3] * rng.uniform(0.5, 1.5, (len(which), 2)))
 
 
@@ -150,6 +165,10 @@ EFFECTS = (
     "link_mass",
     "tracker_scale",
 )
+"""Every effect that can be hidden in any arm."""
+OF_SLIDES = ("guide_error",)
+"""Those that only arms with joints that slide have."""
+ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)
 """Every effect that can be hidden."""
 
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
@@ -236,7 +255,7 @@ def hide(
     Joints that drift with temperature do so from the states' first temperature on.
 
     Args:
-        effect: one of `EFFECTS`, an effect of a user's own, or "none".
+        effect: one of `ALL_EFFECTS`, an effect of a user's own, or "none".
         cell: the cell as configured.
         states: N states at which the strength holds.
         strength_sigma: RMS over all whitened elements, >= 0.
@@ -330,8 +349,9 @@ def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
         raise InputError(f"strength {strength} sigma cannot be; valid: a number >= 0")
     if isinstance(effect, OwnLaw):
         return
-    if effect not in (*EFFECTS, "none"):
-        raise InputError(f"effect {effect!r} is unknown; valid: {', '.join((*EFFECTS, 'none'))}")
+    if effect not in (*ALL_EFFECTS, "none"):
+        valid = ", ".join((*ALL_EFFECTS, "none"))
+        raise InputError(f"effect {effect!r} is unknown; valid: {valid}")
     if mode == "deflection" and effect not in (*DEFLECTION_EFFECTS, "none"):
         raise InputError(
             f'effect {effect!r} cancels in deflections; valid with readings "deflection": '

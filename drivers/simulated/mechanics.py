@@ -64,13 +64,18 @@ class ElasticTree:
     The tree from base to flange is
 
         RX RY RZ (base origin), then for each joint j: RX RY (bearing) RZ (drive),
+        of a joint that slides: PZ (drive), PX PY RX RY RZ (errors of the guide),
+        RX RY RZ (bearing of the carriage),
         and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam);
         last RX RY RZ (flange).
 
     Attributes:
         model: the Pinocchio model, v degrees of freedom.
         base: (3,) indices of the base's tilts about x, y, z; (0,) where nothing tilts.
-        tilt: (n, 2) indices of the bearings' tilts about the axes across each joint; or (n, 0).
+        tilt: indices of the bearings' tilts about the axes across each joint, of a slide about all;
+            (0,) where nothing tilts.
+        tilt_joint: the joint of each of them, counted from 0.
+        guide: (g, 5) indices of the errors of the guides of the g joints that slide; or (0, 5).
         drive: (n,) indices of the joints themselves: command, errors and elasticity add.
         beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
         beam_length: (b,) lengths, m.
@@ -83,6 +88,8 @@ class ElasticTree:
     model: pin.Model
     base: Ints
     tilt: Ints
+    tilt_joint: Ints
+    guide: Ints
     drive: Ints
     beam: Ints
     beam_length: Floats
@@ -103,6 +110,7 @@ def build(
     beams: bool = False,
     tool: bool = False,
     moments: Floats | None = None,
+    guides: bool = False,
 ) -> ElasticTree:
     """Build the tree from the true links (n + 1, 4, 4); lengths in m, masses in kg.
 
@@ -117,6 +125,7 @@ def build(
         tool: whether the flange can tilt; only then no constant transform is left behind the
             last degree of freedom.
         moments: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
+        guides: whether carriages of slides can be displaced by errors of their guides.
     """
     model = pin.Model()
     model.gravity.linear = np.asarray(gravity, dtype=float)
@@ -137,12 +146,22 @@ def build(
             add(pin.JointModelRZ(), "base_z"),
         ]
     here = pin.SE3(links[0])
-    tilt, drive, beam = [], [], []
+    tilt, tilt_joint, drive, beam = [], [], [], []
+    guide: list[list[int]] = []
     bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
     for j in range(arm.n):
-        kinds = ((pin.JointModelRX(), "x"), (pin.JointModelRY(), "y")) if tilts else ()
-        tilt.append([add(kind, f"tilt_{axis}{j + 1}") for kind, axis in kinds])
-        drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
+        slides = bool(arm.slides[j])
+        turns = [(pin.JointModelRX(), "x"), (pin.JointModelRY(), "y"), (pin.JointModelRZ(), "z")]
+        if slides:
+            drive.append(add(pin.JointModelPZ(), f"drive{j + 1}"))
+            shifts = [(pin.JointModelPX(), "px"), (pin.JointModelPY(), "py")]
+            if guides:
+                guide.append([add(kind, f"guide_{axis}{j + 1}") for kind, axis in shifts + turns])
+        axes = (turns if slides else turns[:2]) if tilts else []
+        tilt += [add(kind, f"tilt_{axis}{j + 1}") for kind, axis in axes]
+        tilt_joint += [j] * len(axes)
+        if not slides:
+            drive.append(add(pin.JointModelRZ(), f"drive{j + 1}"))
         body = _body(float(arm.masses[j]), arm.coms[j], None if moments is None else moments[j])
         model.appendBodyToJoint(last, body, pin.SE3.Identity())
         here = pin.SE3(links[j + 1])
@@ -171,6 +190,8 @@ def build(
         model=model,
         base=np.array(base, dtype=np.int64),
         tilt=np.array(tilt, dtype=np.int64),
+        tilt_joint=np.array(tilt_joint, dtype=np.int64),
+        guide=np.array(guide, dtype=np.int64).reshape(-1, 5),
         drive=np.array(drive),
         beam=np.array(beam, dtype=np.int64).reshape(-1, 5),
         beam_length=np.linalg.norm(links[bent, :3, 3], axis=1),
@@ -292,7 +313,7 @@ def elasticity(
     linear, cubic = np.zeros((size, size)), np.zeros(size)
     linear[tree.base, tree.base] = base[: len(tree.base)]
     linear[tree.drive, tree.drive] = joint
-    linear[tree.tilt, tree.tilt] = tilt[:, None]
+    linear[tree.tilt, tree.tilt] = tilt[tree.tilt_joint]
     cubic[tree.drive] = stiffening
     for (py, pz, rx, ry, rz), length, (bend, twist) in zip(
         tree.beam, tree.beam_length, beam, strict=True
@@ -351,6 +372,7 @@ def equilibrium(
     *,
     growth: Floats | None = None,
     sensor: Misreading | None = None,
+    guide: Floats | None = None,
 ) -> Equilibrium:
     """Solve delta = law(tau(delta)) by Newton's method, to rounding.
 
@@ -369,6 +391,7 @@ def equilibrium(
         growth: (N,) factor on every constant translation of the links, for a tree whose
             flange can tilt; None: 1.
         sensor: how `wrench` was misread, where it is not zero; None: it is true.
+        guide: (N, g, 5) errors of the guides, for a tree that has them; None: 0.
 
     Raises:
         InputError: when a state has no equilibrium, or the gear would soften to nothing.
@@ -377,7 +400,11 @@ def equilibrium(
     parts = [slice(k, k + _AT_ONCE) for k in range(0, max(len(q), 1), _AT_ONCE)]
     states = np.arange(len(q))
     grown = np.ones(len(q)) if growth is None else growth
-    rests = [arm.rest(q[part], wrench[part], grown[part], states[part]) for part in parts]
+    begun = np.zeros((len(q), tree.model.nv))
+    begun[:, tree.drive] = q
+    if guide is not None:
+        begun[:, tree.guide] = guide
+    rests = [arm.rest(begun[part], wrench[part], grown[part], states[part]) for part in parts]
     return Equilibrium(*(np.concatenate(values) for values in zip(*rests, strict=True)))
 
 
@@ -441,13 +468,12 @@ class _Loaded:
             self.model.jointPlacements[k] = pin.SE3(place.rotation, factor * place.translation)
 
     def rest(
-        self, q: Floats, wrench: Floats, growth: Floats, states: Ints
+        self, start: Floats, wrench: Floats, growth: Floats, states: Ints
     ) -> tuple[Floats, Floats, Floats, Floats]:
-        """Return the fields of `Equilibrium` for the states of these numbers."""
+        """Return the fields of `Equilibrium` for the states of these numbers, begun at `start`."""
         size = self.tree.model.nv
-        start, delta = np.zeros((len(q), size)), np.zeros((len(q), size))
-        start[:, self.tree.drive] = q
-        moves = np.arange(len(q))
+        delta = np.zeros_like(start)
+        moves = np.arange(len(start))
         for _ in range(_ITERATIONS):
             pull = self.pull(start[moves] + delta[moves], wrench[moves], growth[moves])
             give, slack = self.law.give(pull.torque, states[moves])

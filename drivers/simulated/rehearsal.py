@@ -3,15 +3,16 @@
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from drivers.simulated.cell_processes import SimulatedCell
 from drivers.simulated.injected_effects import (
+    ALL_EFFECTS,
     DEFLECTION_EFFECTS,
-    EFFECTS,
+    OF_SLIDES,
     hide,
     nothing_hidden,
     softened,
@@ -23,12 +24,12 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
-from hilcal.measuring.route import approach_sides, route
+from hilcal.measuring.route import approach_sides, home, route
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
 from hilcal.store.plan import UNLOADED, Plan
 from hilcal.toml import suggest
-from hilcal.types import Ints
+from hilcal.types import Floats, Ints
 
 NOTHING = "nothing"
 RANDOM = "random"
@@ -40,12 +41,12 @@ REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 
 def choices() -> tuple[str, ...]:
     """Effects that can be hidden: all that the world has; every arm has joint compliance."""
-    return tuple(e for e in EFFECTS if e != "joint_compliance")
+    return tuple(e for e in ALL_EFFECTS if e != "joint_compliance")
 
 
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """Effects of a user's own that can be hidden, too; see `own_law`."""
-    return () if catalogue is None else own_names(catalogue, EFFECTS)
+    return () if catalogue is None else own_names(catalogue, ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:
@@ -75,6 +76,7 @@ class SimulationCase:
         world: the truth.
         hidden: the name of the hidden effect, or "nothing".
         strength_sigma: rms of what it does to the readings, in units of their noise.
+        home: (n,) where the arm stands at first; None where no plan says it.
     """
 
     config: CellConfig
@@ -83,6 +85,7 @@ class SimulationCase:
     world: World
     hidden: str
     strength_sigma: float
+    home: Floats | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,6 +149,7 @@ def simulation_case(
     visit: Callable[[Cell], CampaignStates],
     noise: SimulatedNoise,
     catalogue: Catalogue | None = None,
+    base_dir: Path | None = None,
 ) -> SimulationCase:
     """Make a simulated cell and hide an effect in it at the configured strength.
 
@@ -156,17 +160,21 @@ def simulation_case(
         visit: returns the states at which the strength holds.
         noise: the tracker's noise of one reading.
         catalogue: has the effects of a user's own.
+        base_dir: directory that a robot's file path is relative to.
 
     Raises:
         InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
             without any.
     """
     config = as_told(config, choice, catalogue)
-    hidden = choice
+    cell = cell_from_config(config, base_dir)
+    slides, hidden = bool(cell.arm.slides.any()), choice
+    if choice in OF_SLIDES and not slides:
+        raise InputError(f"hide {choice}: no joint of {cell.arm.name} slides")
     if choice == RANDOM:  # a wrong registration shows only where one is believed
-        unseen = () if config.loads else DEFLECTION_EFFECTS
-        hidden = str(rng.choice([e for e in choices() if e not in ("base_frame", *unseen)]))
-    cell = cell_from_config(config)
+        unseen = ("base_frame", *(() if config.loads else DEFLECTION_EFFECTS))
+        unseen += () if slides else OF_SLIDES
+        hidden = str(rng.choice([e for e in choices() if e not in unseen]))
     v = visit(cell)
     own = None
     if catalogue is not None and hidden in own_choices(catalogue):
@@ -294,7 +302,12 @@ def planned_states(
 
 
 def case_of_plan(
-    config: CellConfig, plan: Plan, choice: str, seed: int, catalogue: Catalogue | None = None
+    config: CellConfig,
+    plan: Plan,
+    choice: str,
+    seed: int,
+    catalogue: Catalogue | None = None,
+    base_dir: Path | None = None,
 ) -> SimulationCase:
     """Hide an effect in the simulated cell of a configuration.
 
@@ -307,6 +320,7 @@ def case_of_plan(
         choice: an effect, "random" or "nothing".
         seed: of everything random.
         catalogue: has the effects of a user's own, which can be hidden, too.
+        base_dir: directory that a robot's file path is relative to.
 
     Raises:
         InputError: an unknown choice, or a cell without loads.
@@ -314,9 +328,16 @@ def case_of_plan(
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
     secret = simulation_case(
-        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean, catalogue
+        config,
+        choice,
+        rng,
+        lambda cell: planned_states(cell, config, plan),
+        mean,
+        catalogue,
+        base_dir,
     )
-    return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
+    world = replace(secret.world, noise=measurement_noise(config))
+    return replace(secret, world=world, home=plan.joints(home(plan)))
 
 
 def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
@@ -361,6 +382,12 @@ def simulated_cell(
     with tempfile.TemporaryDirectory(prefix="hilcal-") as made:
         where = directory or Path(made)
         with SimulatedCell.start(
-            secret.world, secret.config, where, seed, base_dir=base_dir, begun=begun
+            secret.world,
+            secret.config,
+            where,
+            seed,
+            base_dir=base_dir,
+            begun=begun,
+            home=secret.home,
         ) as cell:
             yield cell

@@ -33,6 +33,8 @@ _LABELS: dict[str, tuple[str, ...]] = {
     "sensor_misalignment": _TURNS,
     "tracker_scale": ("scale",),
 }
+_GUIDE = {"x": (2, 3, 4), "y": (2, 3, 4), "z": (1,)} | dict.fromkeys(_TURNS, (1, 2, 3, 4))
+"""Orders of the motion errors of a guide, by direction."""
 
 
 def long_links(arm: Arm) -> Ints:
@@ -77,6 +79,9 @@ class Truth:
         wrench_bias: (6,) of the force sensor, flange axes, N and N·m.
         wrench_gain: (6,) error of the gain of its six channels, 1.
         sensor_misalignment: (3,) its axes are turned against the flange, rotation vector, rad.
+        guide_error: (g, 19) of the g joints that slide: amplitudes of Legendre's polynomials over
+            the travel, -1 to 1, of the carriage's motion: x and y of orders 2 to 4, z of
+            order 1, m; rx, ry and rz of orders 1 to 4, rad.
         tracker_scale: (1,) s: positions read (1 + s) times as long, 1.
     """
 
@@ -104,6 +109,7 @@ class Truth:
     wrench_bias: Floats
     wrench_gain: Floats
     sensor_misalignment: Floats
+    guide_error: Floats
     tracker_scale: Floats
 
     @staticmethod
@@ -117,6 +123,7 @@ class Truth:
             "link_geometry": (n + 1, 6),
             "periodic_joint_compliance": (n, 2),
             "link_mass": (n, 3),
+            "guide_error": (int(arm.slides.sum()), sum(map(len, _GUIDE.values()))),
         }  # all others have one parameter per joint
         return Truth(**{f.name: np.zeros(shapes.get(f.name, (n,))) for f in fields(Truth)})
 
@@ -148,6 +155,10 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
         "link_geometry": (slots, _TWIST),
         "link_compliance": ([slots[k] for k in long_links(arm)], ("bend", "twist")),
         "link_mass": (slots[1:], _AXES),
+        "guide_error": (
+            [joints[j] for j in np.flatnonzero(arm.slides)],
+            [f"{kind}{k}" for kind, orders in _GUIDE.items() for k in orders],
+        ),
         "periodic_joint_compliance": (joints, ("cos2", "sin2")),
     }
     if effect not in parts:
@@ -158,7 +169,7 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
 LINK_REFERENCE = 20.0
 """Temperature at which links have their nominal length, °C (ISO 1)."""
 
-_UNKNOWN_TORQUE = 150.0  # N·m, rated torque of a drive whose limit is not known
+_UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, of a drive of unknown limit
 _CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
 
 
@@ -207,10 +218,28 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     if np.any(hidden.thermal_joint_drift):
         error += hidden.thermal_joint_drift * (joint_temperature(states) - reference)
     order = np.arange(1, hidden.transmission_error.shape[1] + 1)
-    phase = arm.drive_angles(states.q)[:, :, None] * order
+    phase = arm.phases(states.q)[:, :, None] * order
     error += (np.cos(phase) * hidden.transmission_error[:, :, 0]).sum(axis=2)
     error += (np.sin(phase) * hidden.transmission_error[:, :, 1]).sum(axis=2)
     return error
+
+
+def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
+    """Return the (N, g, 6) motions of the carriages of slides by errors of their guides; or None.
+
+    About the carriage, axes with z along the travel, m and rad; P_1 to P_4 are written out.
+    """
+    if not np.any(hidden.guide_error):
+        return None
+    slides = arm.slides
+    low, high = arm.q_min[slides], arm.q_max[slides]
+    s = 2.0 * (states.q[:, slides] - low) / (high - low) - 1.0
+    curves = (s, 1.5 * s**2 - 0.5, 2.5 * s**3 - 1.5 * s, 4.375 * s**4 - 3.75 * s**2 + 0.375)
+    out = np.zeros((*s.shape, 6))
+    terms = [(i, k) for i, kind in enumerate(_TWIST) for k in _GUIDE[kind]]
+    for column, (i, k) in enumerate(terms):
+        out[:, :, i] += hidden.guide_error[:, column] * curves[k - 1]
+    return out
 
 
 def joint_temperature(states: States) -> Floats:
@@ -238,7 +267,7 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
     extra: Floats | None = None
     if np.any(hidden.periodic_joint_compliance):
         cos, sin = hidden.periodic_joint_compliance.T
-        angle = arm.drive_angles(states.q)
+        angle = arm.phases(states.q)
         extra = cos * np.cos(2.0 * angle) + sin * np.sin(2.0 * angle)
     if np.any(hidden.creep):
         if states.load_time is None:
@@ -255,7 +284,8 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
 def crossing_torque(arm: Arm) -> Floats:
     """Return the (n,) torques tau_0 in b tanh(tau / tau_0), N·m: 1 % of the rated torque."""
     limit = np.asarray(arm.torque_max, dtype=float)
-    rated = np.where(np.isfinite(limit) & (limit > 0.0), limit, _UNKNOWN_TORQUE)
+    unknown = np.where(arm.slides, _UNKNOWN_FORCE, _UNKNOWN_TORQUE)
+    rated = np.where(np.isfinite(limit) & (limit > 0.0), limit, unknown)
     return np.asarray(_CROSSING * rated)
 
 

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.ur.controller import Controller, Dashboard
 from drivers.simulated.ur.programs import ScriptStream
 from drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
@@ -289,8 +289,8 @@ async def serve(options: argparse.Namespace) -> None:
         DeviceError: no shared world, or an address that cannot be had.
     """
     arm = load_arm(options.robot)
-    if arm.n != N:
-        raise InputError(f"--robot {options.robot}: {arm.n} joints; valid: arms of {N} joints")
+    if arm.n != len(HOME):
+        raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")
     world = options.directory / "world.bin"
     try:
         board = Blackboard.attach(world)

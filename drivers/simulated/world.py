@@ -24,6 +24,7 @@ from drivers.simulated.truth import (
     crossing_torque,
     drive_errors,
     further_compliance,
+    guide_motion,
     link_growth,
 )
 from hilcal.cell import Cell
@@ -174,6 +175,7 @@ class World:
             beams=bool(np.any(self.physics.link_compliance)),
             tool=bool(np.any(self.physics.tool_compliance) or np.any(self.physics.thermal_growth)),
             moments=self.physics.link_mass,
+            guides=bool(np.any(self.physics.guide_error)),
         )
         object.__setattr__(self, "_tree", tree)
 
@@ -212,7 +214,11 @@ class World:
         """
         arm, hidden = self.cell.arm, self.physics
         off = drive_errors(hidden, arm, states, self.joint_reference)
-        return np.asarray(arm.driven(off) + states.q @ hidden.joint_coupling.T)
+        error = np.asarray(arm.driven(off) + states.q @ hidden.joint_coupling.T)
+        guided = guide_motion(hidden, arm, states)
+        if guided is not None:
+            error[:, arm.slides] += guided[:, :, 2]
+        return error
 
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
         """Return the static equilibrium of N states.
@@ -225,6 +231,7 @@ class World:
             InputError: the states lack what a hidden effect depends on, or find no equilibrium.
         """
         q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
+        guided = guide_motion(self.physics, self.cell.arm, states)
         return equilibrium(
             self._tree,
             self._elasticity(states),
@@ -233,6 +240,7 @@ class World:
             self.cell.load_point + self.physics.load_point,
             growth=link_growth(self.physics, states),
             sensor=Misreading.of(self.physics),
+            guide=None if guided is None else guided[:, :, [0, 1, 3, 4, 5]],
         )
 
     def _elasticity(self, states: States) -> Elasticity:
@@ -358,6 +366,8 @@ def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[
         rng: generator.
         distance: from the base to the station, m.
     """
+    if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
+        distance = max(distance, cell.arm.reach + 1.0)
     side, turn = rng.uniform(0.0, 2.0 * np.pi, 2)
     drawn = np.eye(4)
     cos, sin = np.cos(turn), np.sin(turn)

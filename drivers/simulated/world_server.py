@@ -39,8 +39,8 @@ from hilcal.whole_file import replace_file
 FORMAT = "hilcal-world"
 VERSION = 2
 _CELL = ("all_targets", "load_point", "tool_mass", "tool_com", "gravity")
-_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling")
-_LATER = ("joint_coupling",)
+_ARM = ("links", "masses", "coms", "q_min", "q_max", "torque_max", "coupling", "slides")
+_LATER = ("joint_coupling", "guide_error")
 """Parameters that world files may lack, since they were added later."""
 
 
@@ -152,12 +152,12 @@ def _differences(a: Cell, b: Cell) -> list[str]:
 _POLL = 0.0025  # s, real time between two looks at the arm
 
 
-def open_board(directory: Path, scale: float, begun: float = 0.0) -> Blackboard:
+def open_board(directory: Path, scale: float, begun: float = 0.0, joints: int = 6) -> Blackboard:
     """Return the blackboard of a cell; the first who asks makes it, whole or not at all."""
     path = directory / "world.bin"
     if not path.exists():
         new = path.with_name("world.bin.new")
-        board = Blackboard.create(new, scale, begun)
+        board = Blackboard.create(new, scale, begun, joints)
         new.replace(path)  # the mapping goes with the file
         return board
     return Blackboard.attach(path)
@@ -170,7 +170,7 @@ def main() -> int:
     admin.end_with_parent()
     try:
         world, config = read_world(arguments.directory / "world.json")
-        board = open_board(arguments.directory, config.simulation.clock)
+        board = open_board(arguments.directory, config.simulation.clock, joints=world.cell.arm.n)
         living = WorldState(world, config, board, arguments.seed)
     except HilcalError as error:
         print(error, file=sys.stderr)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.blackboard import MOST_TARGETS, Blackboard, N
+from drivers.simulated.blackboard import MOST_TARGETS, Blackboard
 from drivers.simulated.mechanics import turned
 from drivers.simulated.truth import AIR, warm_up
 from drivers.simulated.world import World
@@ -110,10 +110,10 @@ class WorldState:
         Raises:
             InputError: the arm has another number of joints than the blackboard.
         """
-        if world.cell.arm.n != N:
+        if world.cell.arm.n != board.joints:
             raise InputError(
-                f"simulated cell: the arm {world.cell.arm.name} has {world.cell.arm.n} joints; "
-                f"valid: arms of {N} joints"
+                f"simulated cell: the arm {world.cell.arm.name} has {world.cell.arm.n} joints, "
+                f"the shared world one of {board.joints}"
             )
         if len(world.cell.all_targets) > MOST_TARGETS:
             raise InputError(
@@ -248,7 +248,7 @@ class WorldState:
     def slip(self, arrivals: int) -> Floats:
         """Return (n,) how far the joints missed their command at this arrival, rad."""
         rng = np.random.default_rng([self._seed, 1, arrivals])
-        return np.asarray(self._world.joint_std * rng.standard_normal(N))
+        return np.asarray(self._world.joint_std * rng.standard_normal(self._board.joints))
 
     def _publish(self, arm: Any) -> None:
         """Compute where the arm rests now, and write all of the truth."""
@@ -263,7 +263,7 @@ class WorldState:
             wrench=wrench[None],
             time=np.array([now]),
             load_time=np.array([now - self._since]),
-            joint_temperature=warm_up(np.array([now])),
+            joint_temperature=warm_up(np.array([now]), self._board.joints),
             approach=arm["side"][None].copy(),
         )
         slip = self.slip(int(arm["arrivals"]))[None]
@@ -309,8 +309,8 @@ class WorldState:
         time = self._board.time if now is None else now
         return {
             "time": time,
-            "encoder": arm["q"] + ENCODER_STD * self._rng.standard_normal(N),
-            "joint_temperature": warm_up(np.array([time]))[0],
+            "encoder": arm["q"] + ENCODER_STD * self._rng.standard_normal(self._board.joints),
+            "joint_temperature": warm_up(np.array([time]), self._board.joints)[0],
             "air_temperature": AIR,
         }
 

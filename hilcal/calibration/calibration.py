@@ -126,7 +126,7 @@ class Calibration:
             root=vectors * np.sqrt(kappa * np.maximum(values, 0.0)),
             misfit=p.excess.position / readings,
             scatter=scatter_of(found),
-            measured=Measured.of(used.states, p, noise),
+            measured=Measured.of(used.states, p, noise, model.cell.arm.units),
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),

@@ -70,6 +70,11 @@ class Compensation:
         return self._calibration.poses(self._tool, found, self._goal, self._std, self.untold)
 
     @property
+    def units(self) -> tuple[str, ...]:
+        """(n,) units of the joint values: rad, of joints that slide m."""
+        return self._tool.model.cell.arm.units
+
+    @property
     def limits(self) -> Bools:
         """(N, n) joint values that are beyond the arm's limits."""
         arm = self._tool.model.cell.arm

@@ -112,8 +112,8 @@ def compiled(tool: Tool, mode: Mode) -> Compiled | tuple[str, ...]:
         return ("numba, which is not installed",)
     model = tool.model
     arm, cell = model.cell.arm, model.cell
-    if arm.n != 6 or arm.drive is not None or arm.coupling is not None:
-        return (f"{arm.name}'s joints (not six, or coupled)",)
+    if arm.n != 6 or arm.slides.any() or not (arm.drive is arm.coupling is None):
+        return (f"{arm.name}'s joints (not six, coupled, or sliding)",)
     if tool.moving:
         return tuple(e.name for e, _ in tool.moving)
     s, form = _situation(tool), Form.empty(arm.n)

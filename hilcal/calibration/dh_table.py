@@ -60,6 +60,7 @@ class DhRows:
         flange_moves: the same of E, m.
         table_moves: the same of both together.
         disagreement: most that the flange is elsewhere with B and E, m: rounding.
+        slides: joints that slide, counted from 0: q adds to d.
     """
 
     convention: Convention
@@ -73,6 +74,7 @@ class DhRows:
     flange_moves: float = 0.0
     table_moves: float = 0.0
     disagreement: float = 0.0
+    slides: tuple[int, ...] = ()
 
 
 def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
@@ -109,17 +111,21 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     along = after[:n] + before[1:]
     shift = 1 if convention == "standard" else 0
     a, alpha = across[shift : n + shift].T
-    rows = DhRows(convention, a, along[:, 1], alpha, _wrapped(along[:, 0]), base, flange)
+    slides = tuple(np.flatnonzero(arm.slides).tolist())
+    rows = DhRows(
+        convention, a, along[:, 1], alpha, _wrapped(along[:, 0]), base, flange, slides=slides
+    )
     return _judged(rows, arm)
 
 
 def row_transforms(rows: DhRows, q: Floats) -> Floats:
-    """(N, n, 4, 4) transforms of the rows at joint values (N, n)."""
+    """(N, n, 4, 4) transforms of the rows at joint values (N, n), rad; m where joints slide."""
     out = np.empty((*q.shape, 4, 4))
     for k in range(q.shape[1]):
         across = _across(rows.a[k], rows.alpha[k])
-        for i, angle in enumerate(q[:, k]):
-            turn = screw(angle + rows.offset[k], rows.d[k])
+        for i, value in enumerate(q[:, k]):
+            angle, travel = (0.0, value) if k in rows.slides else (value, 0.0)
+            turn = screw(angle + rows.offset[k], rows.d[k] + travel)
             out[i, k] = turn @ across if rows.convention == "standard" else across @ turn
     return out
 
@@ -171,11 +177,9 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
             "offset_deg": float(np.degrees(rows.offset[k])),
             "mass_kg": float(arm.masses[k]),
             "com_m": com[k].tolist(),
-            "q_min_deg": float(np.degrees(arm.q_min[k])),
-            "q_max_deg": float(np.degrees(arm.q_max[k])),
-            **({"torque_max_Nm": torque} if np.isfinite(torque) else {}),
+            **_ranges(arm, k),
         }
-        for k, torque in enumerate(arm.torque_max.tolist())
+        for k in range(arm.n)
     ]
     law = {
         "standard": "B * product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) * E",
@@ -188,6 +192,16 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
         f"{1e3 * rows.table_moves:.4f} mm elsewhere.\n"
     )
     return head + tomli_w.dumps(content)
+
+
+def _ranges(arm: Arm, k: int) -> dict[str, object]:
+    """Kind, limits and torque of a joint, as a row has them."""
+    low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
+    if arm.slides[k]:
+        out: dict[str, object] = {"type": "prismatic", "q_min_m": low, "q_max_m": high}
+        return out | ({"force_max_N": torque} if np.isfinite(torque) else {})
+    out = {"q_min_deg": float(np.degrees(low)), "q_max_deg": float(np.degrees(high))}
+    return out | ({"torque_max_Nm": torque} if np.isfinite(torque) else {})
 
 
 def _judged(rows: DhRows, arm: Arm) -> DhRows:
@@ -206,6 +220,7 @@ def _judged(rows: DhRows, arm: Arm) -> DhRows:
         flange_moves=moved(rows.base @ held),
         table_moves=moved(held),
         disagreement=moved(rows.base @ held @ rows.flange),
+        slides=rows.slides,
     )  # fmt: skip
 
 

@@ -48,7 +48,8 @@ def urdf(arm: Arm, note: str = "") -> str:
     for k, place in enumerate(arm.links):
         fixed = k == arm.n
         name = "flange" if fixed else escaped(arm.joint_names[k])
-        joint = SubElement(root, "joint", name=name, type="fixed" if fixed else "revolute")
+        kind = "fixed" if fixed else "prismatic" if arm.slides[k] else "revolute"
+        joint = SubElement(root, "joint", name=name, type=kind)
         xyz, rpy = _origin(place)
         SubElement(joint, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
         SubElement(joint, "parent", link=links[k])

@@ -1,6 +1,6 @@
 """What a calibration was measured at, and which points lie outside of it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -8,7 +8,14 @@ import numpy as np
 
 from hilcal.identification.extrapolation import FAR
 from hilcal.identification.predictive import Predictive
-from hilcal.readings.ranges import Range, angle_name, ranges_of, turning_variables, variables
+from hilcal.readings.ranges import (
+    Range,
+    angle_name,
+    ranges_of,
+    travel_name,
+    turning_variables,
+    variables,
+)
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats
 
@@ -42,7 +49,7 @@ class Measured:
     most_std_m: float
 
     @classmethod
-    def of(cls, states: States, p: Predictive, noise: Floats) -> "Measured":
+    def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
         """Return where fitted states lie.
 
         Args:
@@ -50,14 +57,16 @@ class Measured:
             p: what the fit knows of others.
             noise: (D,) trace of the position's covariance of each measurement, by noise and
                 misfit, m².
+            units: (n,) of the joints' values.
         """
         spread = noise * p.leverage / (1 - p.leverage)
-        return cls(ranges_of(states), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
+        return cls(ranges_of(states, units), float(np.sqrt(FAR * np.quantile(spread, 0.99))))
 
     def middle(self, n: int) -> Floats:
-        """(n,) joint values in the middle of what was measured, rad; zero where that is unknown."""
+        """(n,) joint values in the middle of what was measured, rad or m; zero where unknown."""
         known = {r.variable: 0.5 * (r.low + r.high) for r in self.ranges}
-        return np.array([known.get(angle_name(j), 0.0) for j in range(n)])
+        names = (travel_name(j) if travel_name(j) in known else angle_name(j) for j in range(n))
+        return np.array([known.get(name, 0.0) for name in names])
 
     def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
         """Return what points leave, by variable.
@@ -68,9 +77,10 @@ class Measured:
             turns: (n,) joints that are the same whole turns on.
         """
         known, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
+        units = ["m" if travel_name(j) in known else "rad" for j in range(states.q.shape[1])]
         found = [
             Outside(known[name], known[name].beyond(values, turning=name in turning), values)
-            for name, _, values in variables(states)
+            for name, _, values in variables(states, units)
             if name in known
         ]
         if std_m is not None:

@@ -7,8 +7,8 @@ a name of ours, a mapping is guessed as `import --preview` does, and taken where
 unsure.
 
 - `pose`: its name; numbered without.
-- `q1_rad` … or `q1_deg` …: joint values. Alone, the point is where the nominal arm has the tool
-  there; together with a position they say on which branch.
+- `q1_rad` … or `q1_deg` …: joint values, of slides `q1_m` or `q1_mm`. Alone, the point is where
+  the nominal arm has the tool there; together with a position they say on which branch.
 - `x_m`, `y_m`, `z_m` (or `x_mm` …) and `rx_rad`, `ry_rad`, `rz_rad` (or `rx_deg` …), a rotation
   vector: the pose of the tool in base axes. A position alone, beside joint values, has the
   orientation that the nominal arm has there.
@@ -114,13 +114,14 @@ def read_points(
         if mapping is None:
             mapping, taken = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
-    groups = _groups(arm.n)
+    groups = _groups(arm)
     found = {k: table.matrix(names) for k, names in groups.items() if names[0] in table.number}
     q = found.pop("q_rad", None)
     if "q_deg" in found:
-        q = np.radians(found.pop("q_deg"))
-    if q is not None and np.any(np.abs(q) > LARGEST):
-        k = int(np.argmax(np.any(np.abs(q) > LARGEST, axis=1)))
+        q = found.pop("q_deg")
+        q = np.where(arm.slides, 1e-3 * q, np.radians(q))
+    if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
+        k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
             f"{table.at(k)}: a joint at {np.abs(q[k]).max():.4g} rad; columns q1_rad … are in rad, "
             "q1_deg … in degrees"
@@ -133,8 +134,8 @@ def read_points(
     wanted = _poses(found, q, arm)
     if q is None and wanted is None:
         raise InputError(
-            f"{path}: neither joint values nor poses; valid: columns q1_rad … q{arm.n}_rad, or "
-            "x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
+            f"{path}: neither joint values nor poses; valid: columns {groups['q_rad'][0]} … "
+            f"{groups['q_rad'][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
         )
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
@@ -144,7 +145,7 @@ def read_points(
 
 def _plain(path: Path, arm: Arm) -> tuple[Table | None, str]:
     """Return a table whose columns are called as above; None where none of them is."""
-    groups = _groups(arm.n)
+    groups = _groups(arm)
     chosen: list[Sequence[str]] = []
 
     def check(given: Sequence[str]) -> None:
@@ -214,7 +215,7 @@ def _nearest(
         solved = invert(arm, poses, starts, rotation, position)
         q = solved.q
         if arm.coupling is None and arm.mimic is None:  # whole turns on it is the same pose
-            q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi))
+            q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi)) * ~arm.slides
             q = np.where((q < arm.q_min) | (q > arm.q_max), solved.q, q)
         inside = ((q >= arm.q_min) & (q <= arm.q_max)).all(axis=1)
         far = np.linalg.norm(q - near, axis=1) + np.where(inside, 0.0, BEYOND)
@@ -222,7 +223,7 @@ def _nearest(
         if far.min() < NEAR:
             break
         if len(starts) == 1:
-            low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
+            low, high = arm.usual_range
             spread = np.random.default_rng(0).random((STARTS, arm.n))
             spread = arm.complete(low + spread * (high - low))
             starts = np.concatenate([near[None], spread])
@@ -303,12 +304,12 @@ def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> Table:
     return replace(table, text=text)
 
 
-def _groups(n: int) -> dict[str, tuple[str, ...]]:
+def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
     """Columns by what they give; those of one group come together."""
-    q = joint_columns(n)
+    q, n = joint_columns(arm.units), arm.n
     return {
         "q_rad": q,
-        "q_deg": tuple(name.replace("_rad", "_deg") for name in q),
+        "q_deg": tuple(f"{n}m" if n.endswith("_m") else n.replace("_rad", "_deg") for n in q),
         "position_m": POSITION,
         "position_mm": tuple(name.replace("_m", "_mm") for name in POSITION),
         "rotation_rad": ROTATION,
@@ -332,7 +333,7 @@ def _checked(
         InputError: an unknown or double column, an incomplete group, or one in two units.
     """
     known = [name for names in groups.values() for name in names]
-    exchanged = set(known_columns(arm.n))
+    exchanged = set(known_columns(arm.units))
     ours = {*known, *exchanged} - {"pose", "load", "target"}
     for name in header:
         if name not in (*known, "pose", "load", *exchanged) and not name.startswith(OWN_PREFIX):

@@ -248,7 +248,8 @@ class Campaign:
             readings, covers = self.file.readings(), self.stored_covers
             about["readings_sha256"] = content_hash(readings)
             readings = _with_instrument(readings, self.file, self.config, self.changes, self.noise)
-        write_table(readings, path, with_what_rounding_does(covers, readings), about)
+        told = with_what_rounding_does(covers, readings)
+        write_table(readings, path, told, about, self.cell.arm.units)
 
     def close(self) -> None:
         """Close the file."""

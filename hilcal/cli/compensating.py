@@ -3,6 +3,7 @@
 import csv
 import io
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -99,7 +100,8 @@ def compensate(
         ),
     ] = None,
     near: Annotated[
-        str | None, option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees.")
+        str | None,
+        option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees; m of slides."),
     ] = None,
     outside: Annotated[
         bool, option("--allow-outside", "Also points outside of what was measured.")
@@ -127,7 +129,8 @@ def compensate(
         if task.points.taken:
             t.notice(f"{points}: {task.points.taken}")
         given = _wrench(task.points, calibration, load, wrench)
-        start = None if near is None else np.radians(_numbers(near, arm.n, "--near"))
+        start = None if near is None else _numbers(near, arm.n, "--near")
+        start = None if start is None else np.where(arm.slides, start, np.radians(start))
         say(f"compensating {len(task.points.names)} points")
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
@@ -155,7 +158,7 @@ def compensate(
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
     for path in output or ():
-        _write(path, task, found, document)
+        _write(path, task, found, document, arm.units)
     t.show(compensation_report(calibration, task.points.names, q, found))
     t.show(waypoints_table(become))
     _say_written(t, output or [])
@@ -293,7 +296,13 @@ def _check_output(path: Path, force: bool) -> None:
     check_new(path, force)
 
 
-def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> None:
+def _write(
+    path: Path,
+    task: _Task,
+    found: Compensation,
+    document: dict[str, object],
+    units: Sequence[str],
+) -> None:
     """Write the joint values as the file's name asks.
 
     Raises:
@@ -303,7 +312,7 @@ def _write(path: Path, task: _Task, found: Compensation, document: dict[str, obj
     if path.suffix == ".json":
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
-        content = _csv(names, found)
+        content = _csv(names, found, units)
     elif n != JOINTS:
         raise InputError(f"{path}: a UR program has {JOINTS} joints, this arm has {n}")
     elif task.program is None:
@@ -313,12 +322,11 @@ def _write(path: Path, task: _Task, found: Compensation, document: dict[str, obj
     replace_file(path, content)
 
 
-def _csv(names: tuple[str, ...], found: Compensation) -> str:
+def _csv(names: tuple[str, ...], found: Compensation, units: Sequence[str]) -> str:
     """Return the table of points, with what is expected of them."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
-    n = found.q.shape[1]
-    rows.writerow(["pose", *joint_columns(n), "before_m", "std_m", "band_m"])
+    rows.writerow(["pose", *joint_columns(units), "before_m", "std_m", "band_m"])
     for k, name in enumerate(names):
         numbers = (found.before.error_m[k], found.after.std_m[k], found.after.band_m[k])
         values = [f"{v:.9f}" for v in found.q[k]]

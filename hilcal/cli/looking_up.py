@@ -59,10 +59,10 @@ def effects(
     if ctx.invoked_subcommand is not None:
         return
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
-    cell = example_cell()
+    cell, rail = example_cell(), example_cell(slides=True)
     states = example_states(cell)
-    made = [kind(cell, states) for kind in catalogue.effects]
-    defaults = {e.name: option_defaults(type(e), cell, states) for e in made}
+    made = [kind(cell if kind.applies(cell) else rail, states) for kind in catalogue.effects]
+    defaults = {e.name: option_defaults(type(e), e.cell, states) for e in made}
     out = table("effect", "law", left=(0, 1))
     for e in made:
         units = ", ".join(dict.fromkeys(p.unit for p in e.parameters))

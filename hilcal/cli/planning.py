@@ -76,7 +76,7 @@ def write(
     made.save(output)
     if csv is not None:
         pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
-        replace_file(csv, plan_csv(made.plan, pulls))
+        replace_file(csv, plan_csv(made.plan, pulls, cell.arm.units))
     if record is not None:
         from hilcal.present.viewer.plan import record_plan
 

@@ -87,6 +87,10 @@ class RehearsalSettings:
         """The effects that can be hidden."""
         return self.catalogue if self.lacking is None else self.lacking
 
+    def case(self, plan: Plan) -> SimulationCase:
+        """Hide what is chosen in the simulated cell; see `case_of_plan`."""
+        return case_of_plan(self.config, plan, self.choice, self.seed, self.world, self.base_dir)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
@@ -132,7 +136,7 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
+            secret = told.case(plan)
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
         t.notice(NEWCOMER)
@@ -167,7 +171,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     They are written bit by bit, as a real campaign grows.
     """
     with working(t.progress):
-        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
+        secret = told.case(plan)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(
@@ -267,7 +271,7 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         now = time.time()
         log.append(WORLD, {"wall_s": now})
     choice, seed = p.settings.hide or NOTHING, p.settings.seed
-    secret = case_of_plan(p.config, plan, choice, seed, p.catalogue)
+    secret = case_of_plan(p.config, plan, choice, seed, p.catalogue, p.base_dir)
     passed = now - starts[0]["wall_s"] if starts else 0.0
     begun = max(passed, 0.0) * p.config.simulation.clock
     own = seed + NEXT_SEED * len(starts)
@@ -319,7 +323,7 @@ def simulate(
         else:
             made = load_plan(plan)
         say("preparing the simulated cell")
-        secret = case_of_plan(config, made, choice, number, catalogue)
+        secret = case_of_plan(config, made, choice, number, catalogue, base_dir)
     if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
         what = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
         t.notice(

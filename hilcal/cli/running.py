@@ -117,8 +117,9 @@ def run(
                 from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 
                 choice = config.simulation.hide or NOTHING
-                secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)
-                simulated = simulated_cell(secret, config.simulation.seed, base_dir)
+                seed = config.simulation.seed
+                secret = case_of_plan(config, made, choice, seed, catalogue, base_dir)
+                simulated = simulated_cell(secret, seed, base_dir)
                 config = stack.enter_context(simulated).config
         if append:
             RunLog(campaign).append(further)

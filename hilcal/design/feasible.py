@@ -48,13 +48,13 @@ class Space(Feasibility):
 
     @property
     def low(self) -> Floats:
-        """(n,) lowest usable joint angles, rad; at most half a turn."""
-        return np.asarray(np.maximum(self.cell.arm.q_min, -np.pi) + self._margin)
+        """(n,) lowest usable joint values, rad or m; at most half a turn."""
+        return np.asarray(self.cell.arm.usual_range[0] + self._margin)
 
     @property
     def high(self) -> Floats:
-        """(n,) highest usable joint angles, rad; at most half a turn."""
-        return np.asarray(np.minimum(self.cell.arm.q_max, np.pi) - self._margin)
+        """(n,) highest usable joint values, rad or m; at most half a turn."""
+        return np.asarray(self.cell.arm.usual_range[1] - self._margin)
 
     @property
     def _margin(self) -> float:

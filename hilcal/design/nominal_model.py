@@ -277,7 +277,8 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """
     asked = config.planning.against
     if asked == "catalogue":
-        names = tuple(kind.name for kind in model.catalogue.effects if not kind.needs)
+        kinds = (kind for kind in model.catalogue.effects if kind.applies(model.cell))
+        names = tuple(kind.name for kind in kinds if not kind.needs)
     else:
         names = checked(asked, "against", model.catalogue)
     return tuple(name for name in names if name not in model.names)

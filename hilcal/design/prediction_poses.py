@@ -139,8 +139,9 @@ def _poses(
         return feasible[np.sort(chosen)], f"at {len(chosen)} feasible poses"
     box = np.array(planning.work_min_m), np.array(planning.work_max_m)
     found = _inside(nominal, feasible, *box)
-    low = np.maximum(cell.arm.q_min, -np.pi) + config.limits.joint_margin_rad
-    high = np.minimum(cell.arm.q_max, np.pi) - config.limits.joint_margin_rad
+    low, high = cell.arm.usual_range
+    margin = config.limits.joint_margin_rad
+    low, high = low + margin, high - margin
     for _ in range(_ROUNDS if may is not None else 0):
         if len(found) >= COUNT:
             break

@@ -49,6 +49,12 @@ class Undetermined:
                 f"{self.name}: not determined; no reading in this cell separates it from "
                 f"{', '.join(self.confounded)}. The plan goes on without it"
             )
+        if self.joint and self.unit == "m/N":
+            return (
+                f"{self.name}: not determined; no load of this cell makes a force along the travel "
+                f"of {self.joint}. The plan goes on without it: {self.joint} needs a pull along "
+                "it, [[loads]] with force_N, e.g. [80.0, 0.0, 0.0]"
+            )
         if self.joint:
             needs = "need" if self.joint.startswith("joints") else "needs"
             return (

@@ -73,7 +73,7 @@ def _most_wanted(fit: Fit, names: Collection[str]) -> str | None:
     for kind in fit.model.catalogue.effects:
         if kind.name not in names or kind.name in fit.model.names:
             continue
-        if not kind.computable(states):
+        if not (kind.computable(states) and kind.applies(fit.model.cell)):
             continue
         effect = fit.model.catalogue.make(kind.name, fit.model.cell, states, m=fit.whitening.m)
         score = p.score(effect_columns(fit, effect.for_scoring(states)).white)

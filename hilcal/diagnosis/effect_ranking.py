@@ -188,7 +188,8 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
                 valid = ", ".join(model.catalogue.names)
                 raise InputError(f"[{section}] {name}: no such effect; valid: {valid}")
     for kind in model.catalogue.effects:
-        if kind.name not in model.names and kind.computable(states):
+        possible = kind.computable(states) and kind.applies(model.cell)
+        if kind.name not in model.names and possible:
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
             out.append(effect.for_scoring(states))
     finer = (e.refined(states) for e in model.effects if e.name not in model.random)

@@ -17,6 +17,7 @@ from scipy.stats import chi2
 from hilcal.diagnosis.pose_constants import pose_constants
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
+from hilcal.readings.ranges import angle_name, travel_name
 from hilcal.types import Floats
 
 POLYNOMIAL = 3
@@ -141,10 +142,14 @@ def _variables(p: Linearisation) -> list[tuple[str, Floats, bool]]:
     for j in range(situation.angle.shape[1]):
         phase = situation.angle[:, j, None] * harmonics
         functions = np.concatenate([np.cos(phase), np.sin(phase)], axis=1)
-        out.append((f"joint {j + 1} angle", functions, False))
+        slides = bool(situation.cell.arm.slides[j])
+        if slides:
+            functions = np.column_stack([functions, _powers(situation.values[:, j])])
+        out.append((travel_name(j) if slides else angle_name(j), functions, False))
         torque = situation.torque[:, j]
         if np.ptp(torque) > 1e-6:
-            out.append((f"joint {j + 1} torque", _powers(torque, 0.0), True))
+            name = f"joint {j + 1} {'force' if slides else 'torque'}"
+            out.append((name, _powers(torque, 0.0), True))
         if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
             out.append((f"joint {j + 1} approach", s.approach[:, [j]], True))
         if s.joint_temperature is not None and np.ptp(s.joint_temperature[:, j]) > 0:

@@ -132,7 +132,8 @@ def pose_powers(before: Fit, effects: Sequence[str], more: int) -> Iterator[Pose
     states = before.readings[~before.outlier].states
     first, *rivals = effects
     made = before.model.catalogue.make(first, before.model.cell, states, m=before.readings.m)
-    count = len(before.model.catalogue.effects) - len(before.model.effects)
+    possible = [kind for kind in before.model.catalogue.effects if kind.applies(made.cell)]
+    count = len(possible) - len(before.model.effects)
     level = FALSE_ALARM / max(count, 1)
     strength = strength_of(linearise(before), made)
     for rival in rivals:

@@ -8,6 +8,7 @@ import numpy as np
 from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
+from hilcal.readings.ranges import angle_name, travel_name
 from hilcal.types import Floats, Ints
 
 HARMONICS = 4
@@ -73,12 +74,19 @@ def recorded(p: Linearisation) -> list[Variable]:
         k = np.arange(1, HARMONICS + 1)
         waves = np.stack([np.cos(angle[:, None] * k) / k, np.sin(angle[:, None] * k) / k], axis=2)
         waves = np.column_stack([np.ones(len(angle)), waves.reshape(len(angle), -1)])
-        out.append(Variable(f"joint {j + 1} angle", "rad", angle, waves))
+        # Laws go by the phase of a travel, people by the travel.
+        slides = bool(situation.cell.arm.slides[j])
+        name, unit = (travel_name(j), "m") if slides else (angle_name(j), "rad")
+        shown = situation.values[:, j] if slides else angle
+        out.append(Variable(name, unit, shown, waves))
         if np.ptp(pull) > 0.01:
             out.append(replace(out[-1], other=hung))
         first = np.stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)], axis=1)
-        turns.append(Variable(f"joint {j + 1} angle", "rad", angle, first))
-        smooth(f"joint {j + 1} torque", "N·m", situation.torque[:, j], 0.0)
+        turns.append(Variable(name, unit, shown, first))
+        if slides:
+            smooth(name, unit, shown, float(situation.cell.arm.usual_range[0][j]))
+        load = (f"joint {j + 1} force", "N") if slides else (f"joint {j + 1} torque", "N·m")
+        smooth(*load, situation.torque[:, j], 0.0)
         if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
             side = s.approach[:, j]
             sides = np.stack([np.ones(len(side)), side], axis=1)

@@ -323,7 +323,7 @@ def _curve(p: Linearisation, v: Variable, number: int, way: Floats, share: float
         x=x,
         y=PER_MOTION * (y - y.mean()),
         error=PER_MOTION * error,
-        y_unit="rad" if joint else "m",
+        y_unit=p.fit.model.cell.arm.unit(number) if joint else "m",
         labels=v.labels,
     )
 

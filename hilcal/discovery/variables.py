@@ -84,7 +84,7 @@ def _varies(x: Floats) -> bool:
 def _all(s: Situation) -> list[Variable]:
     n = s.angle.shape[1]
     return [
-        *_angles(n),
+        *_angles(s),
         *_wrenches(n),
         *_loads(),
         *_sensed(),
@@ -96,15 +96,22 @@ def _all(s: Situation) -> list[Variable]:
     ]
 
 
-def _angles(n: int) -> list[Variable]:
+def _angles(s: Situation) -> list[Variable]:
+    """Angles of joints and their sums; of a joint that slides the phase of its travel, φ."""
+    arm = s.cell.arm
+    turning = np.flatnonzero(~arm.slides).tolist()
+    n = arm.n
+    phase = ["φ" if slides else "q" for slides in arm.slides]
+    latex = [r"\phi" if slides else "q" for slides in arm.slides]
     out = [
         Variable(
-            "angle", (f"joint {j + 1} angle",), f"q_{j + 1}", f"q_{j + 1}", "rad",
+            "angle", (f"joint {j + 1} {arm.kind(j)}",), f"{phase[j]}_{j + 1}",
+            f"{latex[j]}_{j + 1}", "rad",
             f"s.angle[:, {j}]", lambda s, j=j: s.angle[:, j], joint=j,  # type: ignore[misc]
         )
         for j in range(n)
     ]  # fmt: skip
-    for i, j in combinations(range(n), 2):
+    for i, j in combinations(turning, 2):
         for sign, word in ((1.0, "+"), (-1.0, "-")):
             text = f"(q_{i + 1} {word} q_{j + 1})"
             out.append(
@@ -117,6 +124,8 @@ def _angles(n: int) -> list[Variable]:
     for first, count in ((i, k) for k in range(3, n + 1) for i in range(n - k + 1)):
         # The turn of a link against another one: of consecutive joints.
         mine = range(first, first + count)
+        if arm.slides[first : first + count].any():
+            continue
         text = f"({' + '.join(f'q_{j + 1}' for j in mine)})"
         last = first + count
         out.append(

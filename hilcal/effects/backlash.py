@@ -49,4 +49,4 @@ class Backlash(PerJoint):
         """Return b_j (1 − tanh²(τ_j/τ0_j))/τ0_j dτ_j."""
         side = np.tanh(s.torque / self.crossing)
         slope = self.of_joints(theta) * (1 - side**2) / self.crossing
-        return Response(dq=change[:, :, :-1, 5] * slope[:, None, :])
+        return Response(dq=s.along(change) * slope[:, None, :])

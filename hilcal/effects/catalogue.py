@@ -13,6 +13,7 @@ from hilcal.effects.check import check_effect
 from hilcal.effects.creep import Creep
 from hilcal.effects.encoder_offset import EncoderOffset
 from hilcal.effects.from_file import EffectFile, read_effects
+from hilcal.effects.guide_error import GuideError
 from hilcal.effects.hysteresis import Hysteresis
 from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_coupling import JointCoupling
@@ -49,6 +50,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     JointCoupling,
     LinkGeometry,
     TransmissionError,
+    GuideError,
     Hysteresis,
     JointCompliance,
     JointStiffening,

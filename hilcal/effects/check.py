@@ -78,7 +78,7 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     except InputError as error:
         raise InputError(f"{where}: class {kind.__name__} {error}") from None
     problems = []
-    for example in map(example_cell, JOINTS) if cell is None else (cell,):
+    for example in _examples(kind) if cell is None else (cell,):
         try:
             _try(kind, example)
         except HilcalError as error:
@@ -89,6 +89,12 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
         else:
             return
     raise problems[0]
+
+
+def _examples(kind: type[Effect]) -> tuple[Cell, ...]:
+    """Arms to try an effect on, with a slide where it is of slides."""
+    slides = not kind.applies(example_cell())
+    return tuple(example_cell(joints, slides=slides) for joints in JOINTS)
 
 
 def _need(good: object, wrong: str) -> None:

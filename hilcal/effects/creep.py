@@ -69,7 +69,7 @@ class Creep(PerJoint):
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return k c_j log10(1 + t/1 s) dτ_j."""
         slope = self.of_joints(theta) * s.compliance * self._decades(s)
-        return Response(dq=change[:, :, :-1, 5] * slope[:, None, :])
+        return Response(dq=s.along(change) * slope[:, None, :])
 
     def compliance_columns(self, theta: Floats, s: Situation) -> tuple[Columns, ...]:
         """Return ∂dq_j/∂c_j = k τ_j log10(1 + t/1 s)."""

@@ -15,8 +15,11 @@ from hilcal.robot.statics import Load, slot_wrenches
 ROBOT = "ur10e"
 
 
-def example_cell(joints: int | None = None) -> Cell:
-    """Return the cell of an example arm; `joints` repeats its last joint, or leaves joints out."""
+def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
+    """Return the cell of an example arm; `joints` repeats its last joint, or leaves joints out.
+
+    With `slides` its first joint slides, by as many metres as it turns by radians.
+    """
     cell = cell_from_config(CellConfig(robot=Robot(model=ROBOT)))
     arm = cell.arm
     rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
@@ -28,6 +31,7 @@ def example_cell(joints: int | None = None) -> Cell:
         q_min=arm.q_min[rows],
         q_max=arm.q_max[rows],
         torque_max=arm.torque_max[rows],
+        prismatic=np.arange(len(rows)) == 0 if slides else None,
         joint_names=tuple(f"joint {k + 1}" for k in range(len(rows))),
     )
     return replace(cell, arm=longer, load_point=np.array([0.02, -0.01, 0.1]))
@@ -67,5 +71,5 @@ def example_situation(cell: Cell, states: States) -> Situation:
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     wrench = slot_wrenches(cell.arm, chain, load)
     wrench.flags.writeable = False
-    turned = cell.arm.drive_angles(angle)
+    turned = cell.arm.phases(angle)
     return Situation(cell, states, turned, chain, wrench, load, typical_compliances(cell))

@@ -1,14 +1,14 @@
 """`joint_compliance`: the drive train twists under torque."""
 
 from hilcal.effects.changed import Changeable
-from hilcal.effects.options import rated_torques
+from hilcal.effects.options import ordinary_give, rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.types import Floats
 
 
 class JointCompliance(PerJoint):
-    """dq_j = c_j τ_j, a compliance of each joint [rad/(N·m)]."""
+    """dq_j = c_j τ_j, a compliance of each joint [rad/(N·m)]; of a slide c_j f_j [m/N]."""
 
     name = "joint_compliance"
     summary = "dq_j = c_j τ_j: each joint gives way in proportion to its torque"
@@ -30,8 +30,8 @@ class JointCompliance(PerJoint):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """One compliance per joint; 3 mrad at the joint's rated torque are ordinary."""
-        ordinary = 3e-3 / rated_torques(self.cell)
+        """One compliance per joint; 3 mrad (0.1 mm) at its rated torque (force) are ordinary."""
+        ordinary = ordinary_give(self.cell) / rated_torques(self.cell)
         return self.group_parameters("rad/(N·m)", ordinary, "compliance of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
@@ -40,7 +40,7 @@ class JointCompliance(PerJoint):
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return dq_j = c_j dτ_j."""
-        return Response(dq=change[:, :, :-1, 5] * self.of_joints(theta))
+        return Response(dq=s.along(change) * self.of_joints(theta))
 
     def compliance(self, theta: Floats) -> Floats:
         """Return c itself: `creep` builds on it."""

@@ -10,8 +10,8 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.conventions import may_follow
 
-ABOUT = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0])
-"""Twist of a slot by a turn about its z, the axis of its joint."""
+ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]
+"""Twists of a slot by a turn about its z, the axis of its joint, and by a shift along it."""
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
 
 
@@ -41,7 +41,9 @@ class JointCoupling(Effect):
     def setup(self, states: States) -> None:
         """Read the pairs."""
         n = self.cell.arm.n
-        usual = "/".join(f"{j}:{i}" for j, i in may_follow(n)) or "1:1"
+        slides = self.cell.arm.slides
+        alike = [(j, i) for j, i in may_follow(n) if slides[j - 1] == slides[i - 1]]
+        usual = "/".join(f"{j}:{i}" for j, i in alike) or "1:1"
         given = self.options.setdefault("pairs", usual)
         found = _pairs(given, n)
         if not found:
@@ -55,10 +57,12 @@ class JointCoupling(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """One factor per pair; 2e-4, a length of 0.04 mm in 200 mm of a parallelogram, is usual."""
+        slides = self.cell.arm.slides
+        units = {(False, True): "rad/m", (True, False): "m/rad"}
         return tuple(
             Parameter(
                 f"j{j}.q{i}",
-                "1",
+                units.get((bool(slides[j - 1]), bool(slides[i - 1])), "1"),
                 2e-4,
                 f"own ratio of joint {j}" if i == j else f"joint {j} per turn of joint {i}",
             )
@@ -71,7 +75,8 @@ class JointCoupling(Effect):
         Not a displacement of drive j, which turns others along where joints are coupled.
         """
         turned, by = self._pairs.T
-        twist = s.values[:, by, None] * ABOUT
+        moved = np.where(self.cell.arm.slides[turned, None], ALONG, ABOUT)
+        twist = s.values[:, by, None] * moved
         return (Columns("twist", np.arange(len(turned)), turned, twist),)
 
 

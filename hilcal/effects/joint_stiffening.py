@@ -1,6 +1,6 @@
 """`joint_stiffening`: a gear stiffens under load."""
 
-from hilcal.effects.options import rated_torques
+from hilcal.effects.options import ordinary_give, rated_torques
 from hilcal.effects.per_joint import PerJoint
 from hilcal.effects.protocol import Columns, Parameter, Response, Situation
 from hilcal.types import Floats
@@ -19,7 +19,7 @@ class JointStiffening(PerJoint):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """One coefficient per joint; as much as the compliance at the joint's rated torque."""
-        ordinary = 3e-3 / rated_torques(self.cell) ** 3
+        ordinary = ordinary_give(self.cell) / rated_torques(self.cell) ** 3
         return self.group_parameters("rad/(N·m)³", ordinary, "stiffening of {joint}")
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
@@ -29,4 +29,4 @@ class JointStiffening(PerJoint):
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Return dq_j = 3 s_j τ_j² dτ_j."""
         slope = 3 * self.of_joints(theta) * s.torque**2
-        return Response(dq=change[:, :, :-1, 5] * slope[:, None, :])
+        return Response(dq=s.along(change) * slope[:, None, :])

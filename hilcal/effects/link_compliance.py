@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.options import rated_torques
+from hilcal.effects.options import rated_moments
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -39,7 +39,7 @@ class LinkCompliance(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """1/EI and 1/GJ of each; 1 mrad at the tip by the rated torque of its joint."""
-        rated = rated_torques(self.cell)
+        rated = rated_moments(self.cell)
         out = []
         for k in self.links:
             length = float(np.linalg.norm(self.cell.arm.links[k, :3, 3])) or 1.0

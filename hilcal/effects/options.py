@@ -11,11 +11,14 @@ from hilcal.types import Floats
 Options = Mapping[str, object]
 
 
-UNKNOWN_RATING = 150.0
-"""Rated torque where the arm's description has none, N·m: a middle-sized joint; a guess."""
-TYPICAL_TWIST = 2e-3
-"""Twist of a joint at its rated torque where its compliance is unknown, rad. A guess within the
-0.3 to 5 mrad of most arms."""
+TYPICAL_TWIST, TYPICAL_SHIFT = 2e-3, 7e-5
+"""Twist of a joint at its rated torque where its compliance is unknown, rad, and shift of a slide
+at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for racks and screws of
+10 to 100 N/µm."""
+ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4
+"""The same as ordinary magnitudes of the compliance, rad and m."""
+LEVER = 0.5
+"""Moment on a carriage per rated force of its drive, m: a choice."""
 
 PRIOR_HELP = dict.fromkeys(
     ("prior_m", "prior_rad"), "standard deviation of what is known of it already."
@@ -73,14 +76,26 @@ def choice(effect: str, options: Options, key: str, valid: tuple[str, ...]) -> s
 
 
 def rated_torques(cell: Cell) -> Floats:
-    """(n,) rated torques, the measure of how stiff a joint is built; 150 N·m where unknown."""
-    rated = cell.arm.torque_max
-    return np.where(np.isfinite(rated) & (rated > 0), rated, UNKNOWN_RATING)
+    """(n,) rated torques, of slides forces: the measure of how stiff a joint is built.
+
+    150 N·m and 1500 N where unknown.
+    """
+    return cell.arm.ratings
+
+
+def rated_moments(cell: Cell) -> Floats:
+    """(n,) moments that joints are built for; of a slide its rated force at half a metre, N·m."""
+    return np.asarray(cell.arm.ratings * np.where(cell.arm.slides, LEVER, 1.0))
+
+
+def ordinary_give(cell: Cell) -> Floats:
+    """(n,) how far a joint ordinarily gives at its rated torque or force, rad or m."""
+    return np.where(cell.arm.slides, ORDINARY_SHIFT, ORDINARY_TWIST)
 
 
 def typical_compliances(cell: Cell) -> Floats:
-    """(n,) joint compliances where nothing is known of them, rad/(N·m)."""
-    return TYPICAL_TWIST / rated_torques(cell)
+    """(n,) joint compliances where nothing is known of them, rad/(N·m); of slides m/N."""
+    return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / rated_torques(cell)
 
 
 def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floats | None:

@@ -15,6 +15,8 @@ from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 
 EACH, COMMON = "each", "common"
+OF_SLIDES = {"rad": "m", "rad/(N·m)": "m/N", "rad/(N·m)³": "m/N³", "rad/K": "m/K"}
+"""Units of a drive that turns, and of one that slides."""
 JointField = Literal["dq", "twist"]
 _RANGE = re.compile(r"([0-9]{1,3})(?:-([0-9]{1,3}))?")
 
@@ -149,26 +151,46 @@ class PerJoint(Effect):
         return whole and len(apart) == len(own.labels) > len(other.shared.labels)
 
     def group_parameters(
-        self, unit: str, ordinary: Floats, meaning: str, kinds: Mapping[str, str] | None = None
+        self,
+        unit: str,
+        ordinary: Floats,
+        meaning: str,
+        kinds: Mapping[str, str] | None = None,
+        *,
+        of_drive: bool = True,
     ) -> tuple[Parameter, ...]:
         """Parameters of all groups, one for each, or one for each of `kinds`.
 
         Args:
-            unit: of all of them.
+            unit: of joints that turn; that of slides has m for rad, N for N·m.
             ordinary: (n,) ordinary magnitude at each joint; that of a group is the geometric
                 mean of its joints'.
             meaning: with "{joint}" and "{kind}" where they belong.
             kinds: suffixes of the parameters of one group, as ".cos2", each with its words.
+            of_drive: whether it is of what the drive moves; else slides have the same unit.
+
+        Raises:
+            InputError: joints that turn and joints that slide share a parameter.
         """
         g = self.shared
         sizes: list[list[float]] = [[] for _ in g.labels]
         for size, k in zip(ordinary[g.joint].tolist(), g.group.tolist(), strict=True):
             sizes[k].append(size)
         scales = [math.prod(s) ** (1 / len(s)) for s in sizes]
+        units = [unit] * len(scales)
+        if of_drive and unit in OF_SLIDES and self.cell.arm.prismatic is not None:
+            for k in range(len(scales)):
+                slides = set(self.cell.arm.slides[g.joint[g.group == k]].tolist())
+                if len(slides) > 1:
+                    raise InputError(
+                        f"effect {self.name}: {g.words[k]} turn and slide, and share a parameter "
+                        f"in {unit}; valid: groups of joints of one kind"
+                    )
+                units[k] = OF_SLIDES[unit] if True in slides else unit
         each = (kinds or {"": ""}).items()
         return tuple(
-            Parameter(f"j{label}{kind}", unit, scale, meaning.format(joint=words, kind=phrase))
-            for label, words, scale in zip(g.labels, g.words, scales, strict=True)
+            Parameter(f"j{label}{kind}", own, scale, meaning.format(joint=words, kind=phrase))
+            for label, words, scale, own in zip(g.labels, g.words, scales, units, strict=True)
             for kind, phrase in each
         )
 

@@ -54,7 +54,7 @@ class PeriodicJointCompliance(PerJoint):
         """Two per joint and order; a fifth of an ordinary compliance."""
         kinds = {f".{w}{k}": f"{w} {k} q" for k in self.orders for w in ("cos", "sin")}
         meaning = "part of the compliance of {joint} that goes with {kind}"
-        ordinary = 6e-4 / rated_torques(self.cell)
+        ordinary = np.where(self.cell.arm.slides, 2e-5, 6e-4) / rated_torques(self.cell)
         return self.group_parameters("rad/(N·m)", ordinary, meaning, kinds)
 
     def _waves(self, s: Situation) -> Floats:
@@ -71,4 +71,4 @@ class PeriodicJointCompliance(PerJoint):
         """Return the compliance at the angle times dτ_j."""
         mine = self.of_joints(theta.reshape(-1, 2 * len(self.orders)))
         here = np.sum(self._waves(s) * mine, axis=2)
-        return Response(dq=change[:, :, :-1, 5] * here[:, None, :])
+        return Response(dq=s.along(change) * here[:, None, :])

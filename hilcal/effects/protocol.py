@@ -60,10 +60,11 @@ class Situation:
         cell: arm, tool and target.
         states: the N states.
         angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
-            recorded; those of the drives where joints are coupled (`Arm.drive_angles`).
+            recorded; those of the drives where joints are coupled, and the phase of its travel
+            where a joint slides (`Arm.phases`).
         chain: the deviated chain, or None before it is known.
         wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
-            (j, 5) is the torque τ about the axis of joint j + 1.
+            (j, 5) is the torque τ about the axis of joint j + 1, (j, 2) the force along it.
         load: the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and
             the weights.
         compliance: (n,) joint compliances, rad/(N·m): those of the model, or typical ones where
@@ -88,8 +89,15 @@ class Situation:
 
     @property
     def torque(self) -> Floats:
-        """(N, n) static torques that the drives carry, N·m; about the axes unless coupled."""
-        return self.cell.arm.drive_torques(self.wrench[:, :-1, 5])
+        """(N, n) static torques that the drives carry, N·m; about the axes unless coupled.
+
+        Of a joint that slides the force along it, N.
+        """
+        return self.cell.arm.drive_torques(self.along(self.wrench))
+
+    def along(self, change: Floats) -> Floats:
+        """Torques or forces (..., n) along the joints, of slot wrenches (..., n + 1, 6)."""
+        return self.cell.arm.along(change)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -269,7 +277,7 @@ class Effect(ABC):
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
         """Changeable of the deviation by changes (N, P, n + 1, 6) of the slot wrenches.
 
-        For `dq`, element (j, 5) is the torque of drive j + 1 (see `Situation.torque`).
+        For `dq`, `s.along(change)` are the torques of the drives (see `Situation.torque`).
         """
         return Response()
 
@@ -372,6 +380,11 @@ class Effect(ABC):
     def computable(cls, states: States) -> bool:
         """Whether `states` has all the columns that the effect needs."""
         return all(_has(states, need) for need in cls.needs)
+
+    @classmethod
+    def applies(cls, cell: Cell) -> bool:
+        """Whether an arm can have the effect at all: one of slides needs a joint that slides."""
+        return True
 
     def for_scoring(self, states: States) -> "Effect":
         """Return a version that is cheap to score as a suspect; the same unless overridden."""

@@ -93,8 +93,8 @@ class Template(Effect):
         """Change of the deviation by changes of the wrenches: a_j sin(q_j) dτ_j.
 
         `theta` (P,) are the parameters, `change` (N, C, n + 1, 6) are C changes of s.wrench;
-        that of the torques is change[:, :, :-1, 5]. Returns dq (N, C, n), twist (N, C, n + 1, 6)
+        that of the torques is s.along(change). Returns dq (N, C, n), twist (N, C, n + 1, 6)
         or both.
         """
         slope = theta * np.sin(s.angle)
-        return Response(dq=slope[:, None, :] * change[:, :, :-1, 5])
+        return Response(dq=slope[:, None, :] * s.along(change))

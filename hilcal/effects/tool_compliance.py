@@ -3,7 +3,7 @@
 import numpy as np
 
 from hilcal.effects.changed import Changeable
-from hilcal.effects.options import rated_torques
+from hilcal.effects.options import rated_moments
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
@@ -31,7 +31,7 @@ class ToolCompliance(Effect):
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Along and across; 1 mrad at the rated torque of the last joint is ordinary."""
-        scale = 1e-3 / float(rated_torques(self.cell)[-1])
+        scale = 1e-3 / float(rated_moments(self.cell)[-1])
         return (
             Parameter("along", "rad/(N·m)", scale, "turn about the flange's z axis"),
             Parameter("across", "rad/(N·m)", scale, "tilt across the flange's z axis"),

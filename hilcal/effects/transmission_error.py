@@ -17,14 +17,16 @@ FEWEST_HARMONICS = 4
 POSES_PER_HARMONIC = 5
 """A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
 majority. A guess, as the bounds are: the upper one limits the cost."""
-ORDINARY = 5e-5
-"""Ordinary amplitude of a harmonic, rad."""
+ORDINARY, ORDINARY_M = 5e-5, 1e-5
+"""Ordinary amplitude of a harmonic, rad; of a slide m."""
 SCORED_HARMONICS = 40
 """Bounds the cost of scoring; a guess."""
 
 
 class TransmissionError(PerJoint):
     """dq_j = Σ_k a_jk cos k q_j + b_jk sin k q_j, k = 1..K [rad].
+
+    Of a slide with the phase 2π q_j / (length of its travel) for q_j [m].
 
     The evidence decides how strong each harmonic of each joint is, and drops the needless
     ones; K only bounds the search. Joints that share parameters have the same phase at their zeros.
@@ -65,12 +67,19 @@ class TransmissionError(PerJoint):
     def parameters(self) -> tuple[Parameter, ...]:
         """Cosine and sine amplitude of each harmonic of each joint."""
         kinds = {f".{w}{k}": "" for k in self.harmonics for w in ("cos", "sin")}
-        return self.group_parameters("rad", np.full(self.cell.arm.n, ORDINARY), "", kinds)
+        return self.group_parameters("rad", self._ordinary, "", kinds)
 
     @cached_property
     def magnitudes(self) -> Floats:
-        """The same for all, however many there are."""
-        return np.full(2 * len(self.harmonics) * len(self.shared.labels), ORDINARY)
+        """The same for all of a joint, however many there are."""
+        g = self.shared
+        each = self._ordinary[[g.joint[g.group == k][0] for k in range(len(g.labels))]]
+        return np.repeat(each, 2 * len(self.harmonics))
+
+    @property
+    def _ordinary(self) -> Floats:
+        """(n,) ordinary amplitudes of a harmonic."""
+        return np.where(self.cell.arm.slides, ORDINARY_M, ORDINARY)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Waves: ∂dq_j/∂a_jk = cos k q_j, ∂dq_j/∂b_jk = sin k q_j."""

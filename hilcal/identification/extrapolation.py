@@ -114,9 +114,10 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
     leverage = np.linalg.eigvalsh(root @ spread @ np.swapaxes(root, 1, 2))[:, -1]
     outside = np.zeros(len(w.reading), dtype=np.bool_)
     beyond_any = []
-    known = {r.variable: r for r in ranges_of(fitted.states)}
+    units = p.model.cell.arm.units
+    known = {r.variable: r for r in ranges_of(fitted.states, units)}
     turning = turning_variables(whole_turns(p.model, p.theta))
-    for name, unit, values in variables(other.states):
+    for name, unit, values in variables(other.states, units):
         if name not in known:
             continue
         r, after, turns = known[name], values[w.reading], name in turning

@@ -224,9 +224,17 @@ KINDS: dict[str, Kind] = {
         _mapped("value", lambda p: 1e3 * p),
         "the positions are metres, and were taken for millimetres",
     ),
-    "joint_degrees": Kind(_mapped("q", np.radians), "the joint values are degrees, not radians"),
+    "joint_degrees": Kind(
+        lambda d, _: replace(d, q=np.where(d.arm.slides, d.q, np.radians(d.q))),
+        "the joint values are degrees, not radians",
+    ),
     "joint_radians": Kind(
-        _mapped("q", np.degrees), "the joint values are radians, and were taken for degrees"
+        lambda d, _: replace(d, q=np.where(d.arm.slides, d.q, np.degrees(d.q))),
+        "the joint values are radians, and were taken for degrees",
+    ),
+    "travel_millimetres": Kind(
+        lambda d, _: replace(d, q=np.where(d.arm.slides, 1e-3 * d.q, d.q)),
+        "the travels of the joints that slide are millimetres, not metres",
     ),
     "turn_degrees": Kind(_mapped("turn", np.radians), "the attitudes are degrees, not radians"),
     "turn_radians": Kind(
@@ -257,7 +265,7 @@ OF_ATTITUDES = ("mirrored_positions", "turn_degrees", "turn_radians", "inverse",
 
 def hypotheses(d: Described) -> Iterator[Hypothesis]:
     """Yield what is tried by itself."""
-    n = d.arm.n
+    n, slides = d.arm.n, d.arm.slides
     if not d.base_unknown:
         yield Hypothesis("base_unknown")
     if not d.target_unknown:
@@ -265,12 +273,13 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     for j in range(1, n + 1):
         for sign in (-1, 1):
             for quarter in (0, 2, 1, -1):
-                if sign < 0 or quarter:
+                if (sign < 0 or quarter) and not (quarter and d.arm.slides[j - 1]):
                     yield Hypothesis("joint", j, sign, quarter * np.pi / 2)
     for joint, follows in may_follow(n):
-        for factor in (1.0, -1.0):
+        for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
             yield Hypothesis("coupling", joint, follows=follows, factor=factor)
     simple = ("millimetres", "metres", "joint_degrees", "joint_radians", "mirrored")
+    simple += ("travel_millimetres",) * bool(slides.any())
     yield from map(Hypothesis, simple if d.turn is None else simple + OF_ATTITUDES)
     for name in robot_names():
         if name != d.arm.name and load_arm(name).n == n:

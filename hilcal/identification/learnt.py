@@ -49,7 +49,7 @@ def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
         information=found / (scale[:, None] * scale),
         own_precision=own[interest] / scale**2,
         scatter=fit.readings.arm_scatter,
-        ranges=ranges_of(used.states),
+        ranges=ranges_of(used.states, cell.arm.units),
         prints=prints(fit.readings),
         source=replace(
             source,

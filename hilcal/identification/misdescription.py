@@ -298,7 +298,12 @@ class _Search:
                 if h.subject not in [other.subject for other in begun]
             ]
             if depth == 1:
-                ways += pairs(self._cell.arm.n)
+                slides = self._cell.arm.slides
+                ways += [
+                    way
+                    for way in pairs(self._cell.arm.n)
+                    if not any(h.offset and slides[h.joint - 1] for h in way)
+                ]
             rough = {w: self.score(w, True) for w in dict.fromkeys(map(_sorted, ways))}
             best = sorted(rough, key=lambda w: (rough[w], _cost(w)))[:CAREFUL]
             now = {**rough, **{w: self.score(w) for w in best}}
@@ -345,7 +350,7 @@ class _Search:
         for way in ways:
             counted = [h.joint for h in way if h.kind == "joint"]
             for j in range(1, self._cell.arm.n + 1):
-                if j in counted:
+                if j in counted or self._cell.arm.slides[j - 1]:
                     continue
                 zero, rms = self._zero_of(way, j)
                 if abs(np.degrees(zero)) > OFF_DEG:

@@ -139,7 +139,9 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
     )
     model = replace(model, effects=finer)
     for kind in model.catalogue.effects:
-        if kind.name in model.names or kind.role in FRAME_ROLES or not kind.computable(states):
+        if kind.name in model.names or kind.role in FRAME_ROLES:
+            continue
+        if not (kind.computable(states) and kind.applies(model.cell)):
             continue
         fine = {"harmonics": harmonics} if "harmonics" in kind.option_help else {}
         model = model + EffectSpec(kind.name, fine)

@@ -130,7 +130,7 @@ def whole_turns(model: Model, theta: Floats) -> Bools:
     states, n = random_states(model.cell), model.cell.arm.n
     before = model.predict(states, theta).observation
     out = np.zeros(n, dtype=np.bool_)
-    for j in range(n):
+    for j in np.flatnonzero(~model.cell.arm.slides).tolist():
         on = states.q + FULL_TURN * np.eye(n)[j]
         after = model.predict(replace(states, q=on), theta).observation
         moved = np.abs(after.position - before.position).max()
@@ -176,7 +176,7 @@ def _fitted(model: Model, theta: Floats) -> tuple[Floats, Floats]:
 def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tuple[str, ...]]:
     """Return the links (n + 1, 4, 4) with what is constant; what is in them, and what is not.
 
-        A_k = L_k exp(ξ_k) Rz(dq_{k+1}),      A_n = L_n exp(ξ_n)
+        A_k = L_k exp(ξ_k) M(dq_{k+1}),      A_n = L_n exp(ξ_n)
 
     An effect is constant whose deviation is the same in random states under random loads.
     """
@@ -196,10 +196,11 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         within.append(e.name)
         dq = dq if d.dq is None else dq + d.dq[0]
         twist = twist if d.twist is None else twist + d.twist[0]
-    turns = np.zeros((arm.n + 1, 3))
-    turns[: arm.n, 2] = arm.driven(dq)
+    moved = arm.driven(dq)
+    turns, shifts = np.zeros((2, arm.n + 1, 3))
+    turns[: arm.n, 2], shifts[: arm.n, 2] = moved * ~arm.slides, moved * arm.slides
     links = arm.links @ se3.matrix(*se3.exp(twist))
-    links = links @ se3.matrix(se3.rotation(turns), np.zeros((arm.n + 1, 3)))
+    links = links @ se3.matrix(se3.rotation(turns), shifts)
     return links, tuple(within), tuple(beyond)
 
 

@@ -10,6 +10,7 @@ arm's own errors; those of a wrong convention do not. The positions are needed: 
 the axes' names turns one convention into another, and A and B take it up.
 """
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,7 @@ CLEARER = 5.0
 """How much worse the next choice must fit for the first to be certain; a choice."""
 FEWEST, MOST = 6, 300
 """Readings below which two free rotations fit too easily, and readings that are tried; choices."""
+_EXTERNAL = re.compile(r"e(xt)?_?[1-6]\b", re.IGNORECASE)
 ROUNDS = 20
 """Steps between A and B; a choice."""
 
@@ -106,6 +108,7 @@ def preview_table(
         return Preview(len(found.grid.rows), found.proposal, None)
     settings = cell.configured()
     _name_targets(found, [target.name for target in settings.tool.targets])
+    _decide_travels(found, cell.arm)
     outcome = _decide_columns(table, found, settings, cell)
     outcome += _decide_convention(found, cell.arm)
     outcome += _try(table, found, settings, cell)
@@ -120,6 +123,50 @@ def _name_targets(found: Proposed, names: list[str]) -> None:
         words = f"the targets are {', '.join(names)}, in the cell's order"
         kept = [doubt for doubt in found.proposal.unsure if doubt != ("position", SIDE_BY_SIDE)]
         found.proposal.unsure[:] = [*kept, ("position", words)]
+
+
+def _decide_travels(found: Proposed, arm: Arm) -> None:
+    """Settle columns and units of joints that slide, by their names and by the arm's limits.
+
+    External axes E1, E2, … stand where the arm slides. Travels beyond ten times the limits are mm.
+    """
+    proposal, grid = found.proposal, found.grid
+    section, slides = proposal.sections.get("joints"), np.flatnonzero(arm.slides).tolist()
+    if section is None or not slides:
+        return
+    names = list(section["columns"])
+    external = [name for name, _ in proposal.unused if _EXTERNAL.match(name)]
+    if len(names) + len(external) == arm.n and len(external) == len(slides):
+        for j, name in zip(slides, external, strict=True):
+            names.insert(j, name)
+        kept = [each for each in proposal.unused if each[0] not in external]
+        proposal.unused[:] = kept
+        doubts = [
+            d for d in proposal.unsure if not d[1].startswith(f"{len(names) - len(slides)} c")
+        ]
+        proposal.unsure[:] = [*doubts, ("joints", f"{', '.join(external)} taken for what slides")]
+    if len(names) != arm.n:
+        return
+    q = np.abs(np.stack([grid.numbers(name) for name in names], axis=1))
+    far = np.nanmax(q, axis=0)
+    turning = far[~arm.slides]
+    unit = section["unit"]
+    if unit == "deg" and turning.max(initial=0.0) <= TURN and not any("deg" in n for n in names):
+        unit = "rad"
+        proposal.unsure.append(
+            ("joints", f"rad, since none turns by more than {turning.max():.3g}")
+        )
+    mm = bool(np.any(far[slides] > 10 * arm.travels[slides]))
+    section |= {"columns": names, "unit": unit, "slide_unit": "mm" if mm else "m"}
+    if mm:
+        words = f"what slides in mm, since it goes to {far[slides].max():.4g}"
+        proposal.unsure.append(("joints", words))
+    row = int(np.flatnonzero(np.isfinite(q).all(axis=1))[0])
+    example = tuple(f"{grid.numbers(name)[row]:g}" for name in names)
+    k = next(k for k, told in enumerate(proposal.understood) if told.what == "joints")
+    proposal.understood[k] = Understood(
+        "joints", tuple(names), f"{unit}, {section['slide_unit']}", example
+    )
 
 
 def _decide_convention(found: Proposed, arm: Arm) -> list[str]:

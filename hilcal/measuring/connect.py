@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from hilcal.config import CellConfig
@@ -87,13 +87,15 @@ def driver(group: str, name: str, key: str) -> Factory:
 
     Args:
         group: the group of entry points, see `devices`.
-        name: the driver's name.
+        name: the driver's name, or its place as "module:function".
         key: where the configuration gives it, for messages.
 
     Raises:
         InputError: unknown name (lists the valid ones), or the driver cannot be loaded.
     """
     found = {point.name: point for point in entry_points(group=group)}
+    if ":" in name:
+        found[name] = EntryPoint(name, name, group)
     if name not in found:
         valid = ", ".join(sorted(found)) or "none is installed"
         raise InputError(

@@ -266,8 +266,8 @@ class Feasibility:
         def told(k: int, over: float, state: int) -> Finding:
             return Finding(
                 JOINTS, arm.joint_names[k], UNLOADED,
-                f"{arm.joint_names[k]} is at {q[state, k]:.4g} rad; usable are {low[k]:.4g} to "
-                f"{high[k]:.4g} (joint_margin_rad {kept:g})",
+                f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
+                f"{low[k]:.4g} to {high[k]:.4g} (joint_margin_rad {kept:g})",
             )  # fmt: skip
 
         over = np.maximum(low - q, q - high) + more
@@ -305,14 +305,15 @@ class Feasibility:
         pull = self._pull(load)
         wrench = np.broadcast_to(pull, (chain.position.shape[1], 6))
         carried = Load(wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
-        about_axes = slot_wrenches(arm, chain, carried)[:, : arm.n, 5]
-        torque = np.abs(arm.drive_torques(about_axes))
+        torque = np.abs(arm.drive_torques(arm.along(slot_wrenches(arm, chain, carried))))
         usable = share * np.asarray(arm.torque_max, dtype=float)
+        slides = arm.slides
 
         def told(k: int, over: float, state: int) -> Finding:
             name = arm.joint_names[k]
             text = (
-                f"{name} bears {torque[state, k]:.4g} N·m; usable are {usable[k]:.4g} "
+                f"{name} bears {torque[state, k]:.4g} {'N' if slides[k] else 'N·m'}; usable are "
+                f"{usable[k]:.4g} "
                 f"(torque_share {share:g} of {arm.torque_max[k]:g})"
             )
             return Finding(TORQUE, name, load, text)
@@ -323,6 +324,9 @@ class Feasibility:
         beyond = self._levers @ np.append(weights, np.linalg.norm(pull[:3]))
         rates = beyond[np.maximum(joint[:, None], joint)]
         rates += np.linalg.norm(pull[3:]) * (joint < joint[:, None])
+        # A slide shifts the forces beyond it; what turns it turns the forces against its travel.
+        force = weights.sum() + np.linalg.norm(pull[:3])
+        rates = np.where(slides[:, None] | slides, force, rates)
         drive = np.eye(arm.n) if arm.drive is None else np.abs(arm.drive)
         limit = self.margins.bear * usable
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
@@ -370,7 +374,10 @@ class Feasibility:
         self._held = np.repeat(moving[:, None], len(_SIDES), axis=1)
         mount = self._body < min(2, arm.n - 1)
         turns = np.zeros((64, arm.n))
-        turns[:, 0] = np.linspace(-np.pi, np.pi, len(turns))
+        slides = bool(arm.slides[0])
+        first = float(arm.q_min[0]) if slides else -np.pi
+        last = float(arm.q_max[0]) if slides else np.pi
+        turns[:, 0] = np.linspace(first, last, len(turns))
         poses = body_poses(arm, turns)[:, self._body[mount]]
         ends = (poses[:, :, None, :3, :3] @ self._ends[mount][..., None])[..., 0]
         ends = ends + poses[:, :, None, :3, 3]

@@ -30,8 +30,8 @@ TOLERANCE = 1e-8
 """Part of the derivative, root mean square over the states, that may be missing; a choice, with
 room for states whose loads are several times the mean."""
 MAX_TERMS = 40
-TORQUE = 5
-"""Component of a slot's wrench about the axis of its joint."""
+TORQUE, ALONG = 5, 2
+"""Components of a slot's wrench about the axis of its joint, and along it."""
 FORCE, MOMENT = slice(0, 3), slice(3, 6)
 """Components of a slot's wrench."""
 
@@ -63,7 +63,10 @@ def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Blo
     whole = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
     found = [part for b in whole for part in _halves(b)]
     drive = s.cell.arm.drive
-    return found if drive is None else [c for b in found for c in _of_joints(b, drive)]
+    if drive is None:
+        return found
+    borne = np.where(s.cell.arm.slides, ALONG, TORQUE).tolist()
+    return [c for b in found for c in _of_joints(b, drive, borne)]
 
 
 def _halves(b: Block) -> Iterator[Block]:
@@ -77,15 +80,16 @@ def _halves(b: Block) -> Iterator[Block]:
     yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
 
 
-def _of_joints(b: Block, drive: Floats) -> Iterator[Block]:
+def _of_joints(b: Block, drive: Floats, borne: list[int]) -> Iterator[Block]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
-    Forces and moments across an axis are those of the slot itself.
+    Forces and moments across an axis are those of the slot itself. `borne`: the component that the
+    drive of each joint bears.
     """
     if not b.joint:
         yield b
         return
-    by_torque = b.components.stop == TORQUE + 1 and b.slot < len(drive)
+    by_torque = b.slot < len(drive) and b.components.stop == borne[b.slot] + 1
     last = b.components.stop - by_torque
     for to in np.flatnonzero(drive[:, b.to]):
         moved = replace(b, to=int(to), values=drive[to, b.to] * b.values)
@@ -95,7 +99,7 @@ def _of_joints(b: Block, drive: Floats) -> Iterator[Block]:
         if by_torque:
             for slot in np.flatnonzero(drive[:, b.slot]):
                 values = drive[slot, b.slot] * moved.values[:, -1:]
-                at = slice(TORQUE, TORQUE + 1)
+                at = slice(borne[slot], borne[slot] + 1)
                 yield replace(moved, slot=int(slot), components=at, values=values)
 
 

@@ -185,7 +185,7 @@ class Model:
         chain = chain or chains.evaluate(cell.arm, angle, nominal=turns)
         nothing = zeros(len(states), cell.arm.n + 1, 6)
         recorded = self._load(states, theta)
-        turned = along_states(cell.arm.drive_angles(angle))
+        turned = along_states(cell.arm.phases(angle))
         s = Situation(cell, states, turned, chain, nothing, recorded, self._compliance(theta))
         rigid = _deviation([(e, t) for e, t in parts if not e.elastic], s)
         elastic = [(e, t) for e, t in parts if e.elastic]

@@ -263,7 +263,8 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
         if c.singular[k]:
             why.append("the pose is singular")
         for j in np.flatnonzero(c.limits[k]):
-            why.append(f"joint {j + 1} would be beyond its limit ({_degrees(c.q[k, j])})")
+            at = numbers.joint_value(c.q[k, j], c.units[j])
+            why.append(f"joint {j + 1} would be beyond its limit ({at})")
         if not allowed_outside:
             why += [_outside(o, k) for o in c.after.outside if o.points[k]]
         out.append("; ".join(why))
@@ -273,8 +274,9 @@ def refusals(c: Compensation, allowed_outside: bool) -> list[str]:
 def _outside(o: Outside, k: int) -> str:
     """Say what a point leaves of that which was measured."""
     value, r = float(o.values[k]), o.of
-    if r.unit == "rad":
-        return f"{r.variable} {_degrees(value)}, measured {_degrees(r.low)} to {_degrees(r.high)}"
+    if r.unit == "rad" or (r.unit == "m" and r.variable.endswith(" travel")):
+        at, low, high = (numbers.joint_value(x, r.unit) for x in (value, r.low, r.high))
+        return f"{r.variable} {at}, measured {low} to {high}"
     if r.unit == "m":
         return (
             f"far from all that was measured (± {numbers.length(value)} by the parameters alone, "
@@ -315,11 +317,12 @@ def compensation_report(
     for k in sorted(order):
         turn = np.abs(c.q[k] - before[k])
         joint = int(np.argmax(turn))
+        size = numbers.joint_value(turn[joint], c.units[joint], 3)
         out.add(
             names[k],
             numbers.length(float(now[k])),
             f"± {numbers.length(float(later[k]))}",
-            f"joint {joint + 1}: {np.degrees(turn[joint]):.3f}°",
+            f"joint {joint + 1}: {size}",
         )
     yield ""
     yield out

@@ -451,8 +451,8 @@ def curve(d: Dependence) -> Curve:
 
 def _unit_of(d: Dependence) -> tuple[str, float]:
     """Unit for people, and its factor, of the variable."""
-    if d.unit == "rad":
-        return "°", 180.0 / np.pi
+    if d.unit in ("rad", "m"):
+        return numbers.of_joint(d.unit)
     if d.unit == "s":
         span = float(np.ptp(d.x))
         return ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60) if span > 120 else ("s", 1.0)

@@ -1,6 +1,6 @@
 """The ranges of what predictions may extrapolate in: joint angles, loads, temperatures."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,15 +46,23 @@ def angle_name(joint: int) -> str:
     return f"joint {joint + 1} angle"
 
 
+def travel_name(joint: int) -> str:
+    """Return the variable of the travel of a joint that slides; joints count from 0."""
+    return f"joint {joint + 1} travel"
+
+
 def turning_variables(turns: Bools) -> frozenset[str]:
     """Return the variables that mean the same whole turns on, of joints (n,) that do."""
     return frozenset(angle_name(j) for j in np.flatnonzero(turns).tolist())
 
 
-def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
-    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
-    for j in range(s.q.shape[1]):
-        yield angle_name(j), "rad", s.q[:, j]
+def variables(s: States, units: Sequence[str]) -> Iterator[tuple[str, str, Floats]]:
+    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in.
+
+    `units` (n,): "rad", or "m" of joints that slide.
+    """
+    for j, unit in enumerate(units):
+        yield (travel_name if unit == "m" else angle_name)(j), unit, s.q[:, j]
     for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
         yield name, unit, np.linalg.norm(s.wrench[:, part], axis=1)
     if s.air_temperature is not None:
@@ -64,8 +72,8 @@ def variables(s: States) -> Iterator[tuple[str, str, Floats]]:
             yield f"joint {j + 1} temperature", "K", s.joint_temperature[:, j]
 
 
-def ranges_of(s: States) -> tuple[Range, ...]:
+def ranges_of(s: States, units: Sequence[str]) -> tuple[Range, ...]:
     """Return the ranges of `variables`."""
     return tuple(
-        Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(s)
+        Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(s, units)
     )

@@ -9,6 +9,7 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.types import Bools, Floats
 
+UNKNOWN_TORQUE, UNKNOWN_FORCE = 150.0, 1500.0
 NO_MASSES = (
     "{} has no masses: the arm's own weight makes no torque in the model. Compliance is "
     "right from deflections (loaded minus unloaded), and from absolute readings of poses under "
@@ -18,7 +19,11 @@ NO_MASSES = (
 
 
 def missing(
-    file: str, weighed: bool, unlimited: Sequence[str], weak: Sequence[str]
+    file: str,
+    weighed: bool,
+    unlimited: Sequence[str],
+    weak: Sequence[str],
+    forceless: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Return what a description lacks, and what that means, a sentence each.
 
@@ -27,6 +32,7 @@ def missing(
         weighed: whether it has masses.
         unlimited: joints without limits.
         weak: joints without a torque or effort.
+        forceless: prismatic ones without a force or effort.
     """
     out = [] if weighed else [NO_MASSES.format(file)]
     if unlimited:
@@ -36,21 +42,30 @@ def missing(
             f"no torque limit in {file} for {', '.join(weak)}: plans have none there, and "
             "what compliance counts as ordinary is taken from 150 N·m"
         )
+    if forceless:
+        out.append(
+            f"no force limit in {file} for {', '.join(forceless)}: plans have none there, and "
+            "what compliance counts as ordinary is taken from 1500 N"
+        )
     return tuple(out)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Arm:
-    """A serial arm of n revolute joints.
+    """A serial arm of n joints, revolute or prismatic (rails, columns, gantries).
 
     The chain from base to flange is
 
-        T_base_flange(q) = L_0 Rz(q_1) L_1 Rz(q_2) ... Rz(q_n) L_n
+        T_base_flange(q) = L_0 M_1(q_1) L_1 M_2(q_2) ... M_n(q_n) L_n,   M = Rz or Tz
 
-    with constant rigid transforms L_k; coupled joints turn by `chain_angles`. *Slot* k
+    with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k
     (k = 0..n) is the frame right after L_k: for k < n its origin is a point of the axis of joint
     k + 1 and its z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves;
-    its frame is slot i - 1 turned by joint i.
+    its frame is slot i - 1 moved by joint i.
+
+    What is an angle of a revolute joint (rad) is a displacement of a prismatic one (m), and what is
+    a torque (N·m) is a force along its axis (N); speeds and tolerances in the configuration are the
+    same number in m for a prismatic joint as in rad for a revolute one.
 
     Attributes:
         name: catalogue name or file stem.
@@ -74,6 +89,7 @@ class Arm:
             None for 1 everywhere.
         notes: what its description lacks, and what that means, a sentence each.
         repeatability: pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown.
+        prismatic: (n,) which joints slide; None where all turn.
     """
 
     name: str
@@ -92,6 +108,63 @@ class Arm:
     sign: Floats | None = None
     notes: tuple[str, ...] = ()
     repeatability: float | None = None
+    prismatic: Bools | None = None
+
+    @property
+    def slides(self) -> Bools:
+        """(n,) which joints are prismatic."""
+        return np.zeros(self.n, np.bool_) if self.prismatic is None else self.prismatic
+
+    def unit(self, joint: int) -> str:
+        """Unit of the value of a joint, counted from 0: "rad", or "m" where it slides."""
+        return "m" if self.slides[joint] else "rad"
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """(n,) units of the values of the joints."""
+        return tuple(map(self.unit, range(self.n)))
+
+    def kind(self, joint: int) -> str:
+        """What the value of a joint, counted from 0, is called: "angle" or "travel"."""
+        return "travel" if self.slides[joint] else "angle"
+
+    @property
+    def usual_range(self) -> tuple[Floats, Floats]:
+        """(n,) lowest and highest joint values in use: within half a turn, or the whole travel."""
+        low, high = np.maximum(self.q_min, -np.pi), np.minimum(self.q_max, np.pi)
+        slides = self.slides
+        return np.where(slides, self.q_min, low), np.where(slides, self.q_max, high)
+
+    @property
+    def ratings(self) -> Floats:
+        """(n,) rated torques or forces; where unknown those of a joint of middle size.
+
+        150 N·m and 1500 N: guesses.
+        """
+        rated = np.asarray(self.torque_max, dtype=float)
+        known = np.isfinite(rated) & (rated > 0)
+        return np.where(known, rated, np.where(self.slides, UNKNOWN_FORCE, UNKNOWN_TORQUE))
+
+    def along(self, wrench: Floats) -> Floats:
+        """Loads (..., n) along the joints, of wrenches (..., n + 1, 6) through the slots.
+
+        The torque about the axis, of a prismatic joint the force along it.
+        """
+        torque = wrench[..., :-1, 5]
+        if self.prismatic is None:
+            return torque
+        return np.where(self.prismatic, wrench[..., :-1, 2], torque)
+
+    def phases(self, q: Floats) -> Floats:
+        """Phases (..., n) that periodic laws depend on, rad, from the controller's values.
+
+        The angle of the drive; of a prismatic joint one turn over its whole travel.
+        """
+        angle = self.drive_angles(q)
+        if self.prismatic is None:
+            return angle
+        turn = 2 * np.pi / np.where(self.prismatic, self.q_max - self.q_min, 1.0)
+        return np.where(self.prismatic, angle * turn, angle)
 
     def chain_angles(self, q: Floats) -> Floats:
         """Angles (..., n) that the axes of the chain turn by, from the controller's values."""
@@ -137,11 +210,16 @@ class Arm:
         return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     def __post_init__(self) -> None:
-        """Refuse an arm of more joints than any has.
+        """Refuse an arm of more joints than any has, or a slide without an end.
 
         Raises:
-            InputError: says how many it may have.
+            InputError: says what would be valid.
         """
+        travel = (self.q_max - self.q_min)[self.slides]
+        if not np.all(np.isfinite(travel) & (travel > 0.0)):
+            raise InputError(
+                f"{self.name}: a prismatic joint needs a lower and an upper limit, in m"
+            )
         if self.n > limits.JOINTS:
             raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 
@@ -152,5 +230,13 @@ class Arm:
 
     @property
     def reach(self) -> float:
-        """Sum of the lengths of all link transforms, m."""
-        return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum())
+        """Sum of the lengths of all link transforms, and of how far slides go, m."""
+        return float(np.linalg.norm(self.links[:, :3, 3], axis=1).sum() + self.travels.sum())
+
+    @property
+    def travels(self) -> Floats:
+        """(n,) how far slides go from their zeros at most, m; 0 of joints that turn."""
+        if self.prismatic is None:
+            return np.zeros(self.n)
+        far = np.maximum(np.abs(self.q_min), np.abs(self.q_max))
+        return np.where(self.prismatic, far, 0.0)

@@ -77,14 +77,15 @@ def put(whole: R, rows: slice, part: R, axis: int = 0) -> None:
     """Write a record of the chosen states into one of all states."""
     for f in fields(whole):
         values = getattr(part, f.name)
-        if values is not None:
+        if isinstance(values, np.ndarray):
             getattr(whole, f.name)[(*(slice(None),) * axis, rows)] = values
 
 
 def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
-    """Combine records field by field, leaving out what is None."""
+    """Combine records array by array, leaving out what is None; other fields are the first's."""
     combined = {}
     for f in fields(records[0]):
-        given = [a for record in records if (a := getattr(record, f.name)) is not None]
-        combined[f.name] = combine(given) if given else None
+        given = [a for r in records if isinstance(a := getattr(r, f.name), np.ndarray)]
+        if given:
+            combined[f.name] = combine(given)
     return replace(records[0], **combined)

@@ -109,7 +109,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
 def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
     """Poses T_base_body of base and bodies, and of the flange.
 
-    T_base_body0 = 1, T_base_bodyi = L_0 Rz(θ_1) ... L_{i-1} Rz(θ_i).
+    T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
 
     Args:
         arm: the arm.
@@ -125,6 +125,10 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
     out[:, 1:, :3, 3] = np.swapaxes(chain.position, 0, 1)
     turn = np.tile(np.eye(3), (len(q), arm.n, 1, 1))
     angle = arm.chain_angles(q)
+    if arm.prismatic is not None:
+        along = np.swapaxes(chain.rotation[:-1, :, :, 2], 0, 1)
+        out[:, 1:-1, :3, 3] += along * (angle * arm.prismatic)[..., None]
+        angle = angle * ~arm.prismatic
     turn[..., 0, 0] = turn[..., 1, 1] = np.cos(angle)
     turn[..., 1, 0] = np.sin(angle)
     turn[..., 0, 1] = -turn[..., 1, 0]
@@ -200,7 +204,7 @@ class _Along:
 
 def _of_any(arm: Arm) -> tuple[Capsule, ...]:
     """One capsule per link, from its joint's frame to the next one's."""
-    reach = max(arm.reach, 0.1)
+    reach = max(arm.reach - float(arm.travels.sum()), 0.1)
     radii = np.linspace(_THICK, _THIN, arm.n + 1) * reach
     names = (BASE, *arm.joint_names)
     out = []

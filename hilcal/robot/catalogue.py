@@ -46,7 +46,7 @@ def load_arm(
 
     Raises:
         InputError: unknown name (lists the valid ones), or a file that does not describe a
-            serial arm of revolute joints.
+            serial arm.
     """
     path = (base_dir or Path()) / model
     suffix = path.suffix.lower()

@@ -1,8 +1,9 @@
 """The deviated chain, batched over N states, and what moves its target.
 
-    T_base_flange = L_0 exp(ξ_0) Rz(q_1 + dq_1) L_1 exp(ξ_1) ... Rz(q_n + dq_n) L_n exp(ξ_n)
+    T_base_flange = L_0 exp(ξ_0) M_1(q_1 + dq_1) L_1 exp(ξ_1) ... M_n(q_n + dq_n) L_n exp(ξ_n)
 
-evaluated exactly; there is no loop over states, only over the n joints.
+with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly; there is no loop over
+states, only over the n joints.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.batch import along_states, empty
 from hilcal.robot.deviation import Deviation
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,34 +27,42 @@ class Chain:
         position: (n + 1, N, 3) origin of slot k, after its twist, m.
         com: (n, N, 3) centre of mass of body i + 1, m.
         twist: (n + 1, N, 6) the twists that were applied, or None.
+        slides: which joints are prismatic, counted from 0.
     """
 
     rotation: Floats
     position: Floats
     com: Floats
     twist: Floats | None
+    slides: tuple[int, ...] = ()
 
     def point(self, offset: Floats) -> Floats:
         """Position of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-Turns = tuple[Floats, Floats]
-"""Cosines and sines (N, n) of the angles of the chain."""
+Turns = tuple[Floats, Floats, Floats | None]
+"""Cosines and sines (N, n) of the angles of the chain, and displacements (N, n) of its slides."""
 
 
 def turns(arm: Arm, q: Floats) -> Turns:
-    """Return the turns of the chain at the controller's values q (N, n)."""
+    """Return the motions of the chain's joints at the controller's values q (N, n)."""
     angle = along_states(arm.chain_angles(q))
-    return np.cos(angle), np.sin(angle)
+    slid = None
+    if arm.prismatic is not None:
+        angle, slid = angle * ~arm.prismatic, angle * arm.prismatic
+    return np.cos(angle), np.sin(angle), slid
 
 
-def _turned(nominal: Turns, dq: Floats) -> Turns:
-    """Turn on by displacements (N, n), by the addition theorems: they cost less where small."""
-    (cos, sin), t2 = nominal, dq * dq
+def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
+    """Move on by displacements (N, n), by the addition theorems: they cost less where small."""
+    cos, sin, slid = nominal
+    if prismatic is not None and slid is not None:
+        dq, slid = dq * ~prismatic, slid + dq * prismatic
+    t2 = dq * dq
     b, c = se3.coefficients(t2)
     by_cos, by_sin = 1 - b * t2, dq * (1 - c * t2)
-    return cos * by_cos - sin * by_sin, sin * by_cos + cos * by_sin
+    return cos * by_cos - sin * by_sin, sin * by_cos + cos * by_sin, slid
 
 
 def evaluate(
@@ -64,9 +73,10 @@ def evaluate(
     `nominal`: `turns` at q where they are known.
     """
     deviation = deviation or Deviation()
-    cos, sin = turns(arm, q) if nominal is None else nominal
+    moved = turns(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
-        cos, sin = _turned((cos, sin), along_states(arm.driven(deviation.dq)))
+        moved = _turned(moved, along_states(arm.driven(deviation.dq)), arm.prismatic)
+    cos, sin, slid = moved
     twist = deviation.twist
     if twist is not None:
         twist = np.swapaxes(along_states(twist), 0, 1)
@@ -91,7 +101,11 @@ def evaluate(
                 position[k] += se3.apply(r, se3.exp(twist[k])[1])
             r = np.einsum("nij,njk->nik", linked, step_r, out=rotation[k])
         p = position[k]
-        if k < n:
+        if k < n and slid is not None and arm.slides[k]:
+            p = p + r[..., 2] * slid[:, k, None]
+            body[...] = r
+            com[k] = _offset(p, body, coms[k])
+        elif k < n:
             c, s = cos[:, k], sin[:, k]
             np.multiply(r[..., 0], c, out=body[..., 0])
             body[..., 0] += r[..., 1] * s
@@ -99,7 +113,7 @@ def evaluate(
             body[..., 1] -= r[..., 0] * s
             body[..., 2] = r[..., 2]
             com[k] = _offset(p, body, coms[k])
-    return Chain(rotation, position, com, twist)
+    return Chain(rotation, position, com, twist, tuple(np.flatnonzero(arm.slides).tolist()))
 
 
 def _combine(axes: Floats, weights: Sequence[float], out: Floats) -> None:
@@ -126,7 +140,7 @@ def joint_jacobian(chain: Chain, x: Floats) -> Floats:
 
     By the angles of the chain; `drive_jacobian` is that by the drives.
 
-    Column j is (z_j × (x − p_j), z_j); rows are m/rad and rad/rad.
+    Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); rows are m/rad and rad/rad.
     """
     n = len(chain.com)
     z = np.swapaxes(chain.rotation[:n, :, :, 2], 0, 1)
@@ -134,6 +148,8 @@ def joint_jacobian(chain: Chain, x: Floats) -> Floats:
     out = empty(len(x), 6, n)
     out[:, :3] = np.swapaxes(se3.cross(z, lever), 1, 2)
     out[:, 3:] = np.swapaxes(z, 1, 2)
+    for j in chain.slides:
+        out[:, :3, j], out[:, 3:, j] = out[:, 3:, j], 0.0
     return out
 
 

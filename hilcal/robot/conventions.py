@@ -1,6 +1,6 @@
 """How a controller counts joints: signs, zeros, and joints that follow others.
 
-The joint j of the chain turns by
+The joint j of the chain moves by
 
     θ_j = s_j q_j + o_j + Σ_i k_ji q_i
 
@@ -45,6 +45,16 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
                 f"joint_coupling names joint {max(c.joint, c.follows)}; {arm.name} has joints "
                 f"1 to {arm.n}"
             )
+        if arm.slides[c.joint - 1] != arm.slides[c.follows - 1]:
+            raise InputError(
+                f"joint_coupling: of joints {c.joint} and {c.follows} one slides and one turns; "
+                "valid: two that slide, or two that turn"
+            )
+    for j in np.flatnonzero(arm.slides & (np.array(by.joint_offset_deg or (0.0,) * arm.n) != 0)):
+        raise InputError(
+            f"joint_offset_deg of joint {j + 1}, which slides; valid: 0, with its zero in d_m or "
+            "in the <origin> of the joint"
+        )
     sign = np.array(by.joint_sign or (1,) * arm.n, dtype=float)
     offset = np.radians(by.joint_offset_deg or (0.0,) * arm.n)
     coupling, counted = np.zeros((2, arm.n, arm.n))
@@ -61,7 +71,7 @@ def with_conventions(
 
     Signs and zeros go into the constant links:
 
-        Rz(s q + o) = Rz(o) X Rz(q) X⁻¹,  X = Rx(π) for s = −1, else 1
+        M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
 
     Limits are those of the controller's values and stay.
 
@@ -70,7 +80,7 @@ def with_conventions(
     Args:
         arm: the arm as drawn.
         sign: (n,) s.
-        offset: (n,) o, rad.
+        offset: (n,) o, rad; m where a joint slides.
         coupling: (n, n) k, zero on the diagonal.
         counted: (n, n) the part of it that is not mechanical.
     """
@@ -78,7 +88,7 @@ def with_conventions(
     own = np.eye(arm.n) if arm.coupling is None else arm.coupling
     for j, zero in enumerate(own @ offset):
         if zero:
-            links[j] = links[j] @ _about_z(zero)
+            links[j] = links[j] @ (_along_z(zero) if arm.slides[j] else _about_z(zero))
         if sign[j] < 0:
             links[j] = links[j] @ _HALF_TURN
             links[j + 1] = _HALF_TURN @ links[j + 1]
@@ -124,6 +134,12 @@ def may_follow(n: int) -> tuple[tuple[int, int], ...]:
     last but two (a wrist whose three motors stand in the forearm).
     """
     return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())
+
+
+def _along_z(travel: float) -> Floats:
+    shift = np.eye(4)
+    shift[2, 3] = travel
+    return shift
 
 
 def _about_z(angle: float) -> Floats:

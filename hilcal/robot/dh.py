@@ -26,6 +26,9 @@ class JointRow(Section):
     """One joint of a DH table: row i, and the body that joint i moves."""
 
     name: str = Field(min_length=1, description="a name")
+    type: Literal["revolute", "prismatic"] = Field(
+        "revolute", description='"revolute", or "prismatic" of a rail or column: q_i adds to d_m'
+    )
     a_m: Number = Field(description=_LENGTH)
     d_m: Number = Field(description=_LENGTH)
     alpha_deg: Number = Field(description=_ANGLE)
@@ -37,22 +40,37 @@ class JointRow(Section):
     q_min_deg: Number | None = Field(None, description=_ANGLE)
     q_max_deg: Number | None = Field(None, description=_ANGLE)
     torque_max_Nm: Positive | None = Field(None, description="a torque in N·m, more than 0")
+    q_min_m: Number | None = Field(None, description=_LENGTH + ", of a prismatic joint")
+    q_max_m: Number | None = Field(None, description=_LENGTH + ", of a prismatic joint")
+    force_max_N: Positive | None = Field(
+        None, description="the force of a prismatic joint's drive in N, more than 0"
+    )
 
     @model_validator(mode="after")
     def _range(self) -> "JointRow":
-        low, high = self.q_min_deg, self.q_max_deg
+        slides = self.type == "prismatic"
+        keys = (("q_min_deg", "q_max_deg", "torque_max_Nm"), ("q_min_m", "q_max_m", "force_max_N"))
+        for key in keys[not slides]:
+            if getattr(self, key) is not None:
+                raise ValueError(f"{key} of a {self.type} joint; valid: {', '.join(keys[slides])}")
+        low, high = (getattr(self, key) for key in keys[slides][:2])
+        of = " and ".join(keys[slides][:2])
+        if slides and (low is None or high is None):
+            raise ValueError(f"{of} are missing; a prismatic joint needs both")
         if (low is None) != (high is None):
-            raise ValueError("q_min_deg and q_max_deg: give both or neither")
+            raise ValueError(f"{of}: give both or neither")
         if low is not None and high is not None and low >= high:
-            raise ValueError(f"q_min_deg = {low} must be less than q_max_deg = {high}")
+            raise ValueError(f"{of.replace(' and', f' = {low} must be less than')} = {high}")
         return self
 
     @property
-    def range_deg(self) -> tuple[float, float]:
-        """Lowest and highest joint value; a whole turn to either side where none is given."""
+    def range(self) -> tuple[float, float]:
+        """Lowest and highest joint value, rad or m; a whole turn to either side if not given."""
+        if self.q_min_m is not None and self.q_max_m is not None:
+            return self.q_min_m, self.q_max_m
         if self.q_min_deg is None or self.q_max_deg is None:
-            return -360.0, 360.0
-        return self.q_min_deg, self.q_max_deg
+            return -2 * math.pi, 2 * math.pi
+        return math.radians(self.q_min_deg), math.radians(self.q_max_deg)
 
 
 class DhTable(Conventions):
@@ -87,6 +105,8 @@ def arm_from_dh(path: Path) -> Arm:
     L_0 = Rx(alpha_1) Tx(a_1) Rz(offset_1), L_i = Tz(d_i) Rx(alpha_{i+1}) Tx(a_{i+1})
     Rz(offset_{i+1}), L_n = Tz(d_n); in the body frame centres of mass are Tz(d) com.
 
+    A prismatic joint has Tz(d_i + q_i) and Rz(offset_i) instead: M_i = Tz(q_i) between the same L.
+
     With `base_m_rad` = B and `flange_m_rad` = E, as calibrated arms have, T_base_flange = B Π … E.
 
     What a row may leave out is said in `Arm.notes`, as of a URDF: masses (none), limits (±360°),
@@ -110,25 +130,28 @@ def arm_from_dh(path: Path) -> Arm:
         links[0] = se3.of_six(table.base_m_rad) @ links[0]
     if table.flange_m_rad is not None:
         links[-1] = links[-1] @ se3.of_six(table.flange_m_rad)
+    slides = np.array([row.type == "prismatic" for row in rows])
     coms = [f[:3, :3] @ row.com_m + f[:3, 3] for f, row in zip(fixed, rows, strict=True)]
     arm = Arm(
         name=path.stem,
         links=links,
         masses=np.array([row.mass_kg for row in rows]),
         coms=np.array(coms),
-        q_min=np.radians([row.range_deg[0] for row in rows]),
-        q_max=np.radians([row.range_deg[1] for row in rows]),
-        torque_max=np.array([row.torque_max_Nm or math.inf for row in rows]),
+        q_min=np.array([row.range[0] for row in rows]),
+        q_max=np.array([row.range[1] for row in rows]),
+        torque_max=np.array([row.torque_max_Nm or row.force_max_N or math.inf for row in rows]),
         payload=table.payload_kg or math.inf,
         joint_names=tuple(row.name for row in rows),
         source=table.source or f"DH rows of {path.name}",
         notes=missing(
             path.name,
             any(row.mass_kg for row in rows),
-            [row.name for row in rows if row.q_min_deg is None],
-            [row.name for row in rows if row.torque_max_Nm is None],
+            [row.name for row in rows if row.q_min_deg is None and row.q_min_m is None],
+            [row.name for row in rows if row.torque_max_Nm is None and row.type == "revolute"],
+            [row.name for row in rows if row.force_max_N is None and row.type == "prismatic"],
         ),
         repeatability=table.repeatability_m,
+        prismatic=slides if slides.any() else None,
     )
     try:
         return as_counted(arm, table)

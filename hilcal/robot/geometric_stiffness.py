@@ -10,7 +10,8 @@ over all that is beyond slot k (l: lever from p_k), the components in slot axes 
     k < j:  δf_k = 0,             δt_k = v × f_j + D_j ω         (slot k stands still)
     k ≥ j:  δf_k = −ω × f_k,      δt_k = D_kᵀ ω − ω × m          (slot k moves along)
 
-The displacement of joint j + 1 is a turn about z_j that leaves slot j standing still. What is
+The displacement of joint j + 1 is a turn about z_j, of a prismatic joint a shift along z_j, that
+leaves slot j standing still. What is
 computed is the transpose: the gradient by the motions of a linear form of the slot wrenches.
 
 Source of the term: geometric (initial stress) stiffness, e.g. Chen and Kao, *Conservative
@@ -115,12 +116,18 @@ class MotionGradient:
     def joint(self, j: int) -> Floats:
         """(N, m) gradient by the displacement of joint j + 1."""
         z, arm = self.stiffness.chain.rotation[j, :, :, 2], self.stiffness
+        if j in arm.chain.slides:
+            # Slot j stands still, and the force through it is shifted along z against p_j.
+            still = self.still[j + 1]
+            found = None if still is None else _rows_dot(still, se3.cross(z, arm.force[j]))
+            if self.flange is not None:
+                found = _sum(found, _rows_dot(self.flange[..., :3], z))
+            return zeros(*self.rows) if found is None else found
         parts = [(self.along[j + 1], z), (self.still[j + 1], arm.spun[j])]
         if self.flange is not None:
             lever = arm.chain.position[-1] - arm.chain.position[j]
             parts += [(self.flange[..., 3:], z), (self.flange[..., :3], se3.cross(z, lever))]
-        found = (None if a is None else _rows_dot(a, by) for a, by in parts)
-        out = reduce(_sum, found)
+        out = reduce(_sum, (None if a is None else _rows_dot(a, by) for a, by in parts))
         return zeros(*self.rows) if out is None else out
 
     def displacement(self, j: int) -> Floats | None:

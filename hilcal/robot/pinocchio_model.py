@@ -11,9 +11,9 @@ FLANGE = "flange"
 def pinocchio_model(arm: Arm) -> pin.Model:
     """Build a Pinocchio model with the same chain, masses and limits.
 
-    Joint i is a revolute joint about z with the placement L_{i-1} in body i - 1; bodies are
-    point masses at their centres of mass; the frame "flange" has the placement L_n in the
-    last body. Gravity is Pinocchio's default.
+    Joint i is a revolute joint about z, or a prismatic one along z, with the placement L_{i-1} in
+    body i - 1; bodies are point masses at their centres of mass; the frame "flange" has the
+    placement L_n in the last body. Gravity is Pinocchio's default.
     """
     model = pin.Model()
     model.name = arm.name
@@ -21,7 +21,7 @@ def pinocchio_model(arm: Arm) -> pin.Model:
     for i in range(arm.n):
         joint = model.addJoint(
             joint,
-            pin.JointModelRZ(),
+            pin.JointModelPZ() if arm.slides[i] else pin.JointModelRZ(),
             pin.SE3(arm.links[i]),
             arm.joint_names[i],
             arm.torque_max[i : i + 1],

@@ -10,13 +10,14 @@ import pinocchio as pin
 from hilcal.config import Obstacle
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.body import Capsule, capsules
+from hilcal.robot.body import Capsule, capsules, is_known
 from hilcal.robot.pinocchio_model import pinocchio_model
 from hilcal.types import Bools, Floats
 
 _SAMPLES = 256  # states that tell which pairs touch by their crude shape alone
 _SHORT = 1e-12  # m, of a segment without a direction
 _ALWAYS = 0.3  # share of those states from which on a pair is not checked
+_NEAR = 0.03  # m; where shapes are guessed, neighbours that are always so near are none, a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -147,8 +148,9 @@ class Scene:
         """Leave out what touches in many states, whatever the arm does."""
         arm = self._arm
         drawn = _spread(_SAMPLES, arm.n)
-        low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
-        often = self._pairs(pairs).how_often(low + drawn * (high - low))
+        low, high = arm.usual_range
+        near = 0.0 if is_known(arm) else _NEAR
+        often = self._pairs(pairs).how_often(low + drawn * (high - low), near)
         return [pair for pair, share in zip(pairs, often, strict=True) if share < _ALWAYS]
 
 
@@ -214,9 +216,10 @@ class Pairs:
                     out[name] = min(out.get(name, np.inf), self._gap(k))
         return out
 
-    def how_often(self, q: Floats) -> Floats:
-        """(K,) share of the states in which each pair touches."""
+    def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
+        """(K,) share of the states in which each pair is closer than a margin, m."""
         count = np.zeros(len(self._pairs))
+        self._prepare(margin, None)
         for turned in self._arm.chain_angles(q):
             self._place(turned)
             pin.computeCollisions(self._geometry, self._state, False)
@@ -259,7 +262,8 @@ class Pairs:
 def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
     """Return a bound on how far points of a body are from the axis of a joint, m, in every state.
 
-    So far they go at most per radian of the joint, or it per radian seen from them. It is the
+    So far they go at most per radian of the joint, or it per radian seen from them; 1 of a joint
+    that slides. It is the
     length of the way along the links, |L_k| each; exact for a body that the joint carries, or
     that carries the joint.
 
@@ -269,6 +273,8 @@ def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
         points: (K, 3) points in the body's frame, m.
         joint: 1 to n.
     """
+    if arm.slides[joint - 1]:
+        return 1.0
     if joint > body:
         if joint > body + 1:
             return _along(arm, body, points, joint)
@@ -279,7 +285,8 @@ def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
         return float(np.hypot(points[:, 0], points[:, 1]).max())
     lengths = np.linalg.norm(arm.links[joint + 1 : body, :3, 3], axis=1)
     first = float(np.hypot(*arm.links[joint][:2, 3]))
-    return float(first + lengths.sum() + np.linalg.norm(points, axis=1).max())
+    slid = arm.travels[joint:body].sum()
+    return float(first + lengths.sum() + slid + np.linalg.norm(points, axis=1).max())
 
 
 def on_flange(arm: Arm, point: Floats) -> Floats:
@@ -297,6 +304,7 @@ def _farthest(arm: Arm, part: Capsule) -> Floats:
 def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
     """The longest way from points of a body along the links to the frame of a later body, m."""
     lengths = np.linalg.norm(arm.links[body + 1 : last, :3, 3], axis=1).sum()
+    lengths += arm.travels[body:last].sum()
     return float(np.linalg.norm(points - arm.links[body][:3, 3], axis=1).max() + lengths)
 
 

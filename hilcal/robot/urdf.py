@@ -1,4 +1,4 @@
-"""Arms from URDF files: any serial chain of revolute joints about arbitrary axes.
+"""Arms from URDF files: any serial chain of revolute and prismatic joints, any axes.
 
 Joints of a URDF that follow another one: `<mimic joint="i" multiplier="k" offset="o"/>`.
 """
@@ -23,7 +23,7 @@ from hilcal.errors import InputError
 from hilcal.names import check_name
 from hilcal.robot.arm import Arm, missing
 from hilcal.toml import suggest
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 _WHOLE_TURN = 2.0 * math.pi
 DEFAULTS = (("multiplier", "1"), ("offset", "0"))
@@ -49,8 +49,8 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 
     Raises:
         InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
-            (lists the leaf links), a joint that is not revolute, or one that mimics no joint with a
-            value of its own within the chain.
+            (lists the leaf links), a joint of more than one degree of freedom, or one that mimics
+            no joint with a value of its own within the chain.
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -71,7 +71,9 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
 def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     """Turn the frames of a model whose joints are just the chain so that z is the axis."""
     joints = range(1, model.njoints)
-    turns = [_z_to(axis[3:]) for axis in _axes(model)]
+    axes = _axes(model)
+    slides = np.array([bool(np.any(axis[:3])) for axis in axes])
+    turns = [_z_to(axis[:3] if s else axis[3:]) for axis, s in zip(axes, slides, strict=True)]
     coms = [
         turn[:3, :3].T @ model.inertias[joint].lever
         for turn, joint in zip(turns, joints, strict=True)
@@ -93,15 +95,17 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
         payload=math.inf,
         joint_names=names,
         source=f"URDF {path.name}",
-        notes=_missing(model, masses),
+        notes=_missing(model, masses, slides),
+        prismatic=slides if slides.any() else None,
     )
 
 
-def _missing(model: pin.Model, masses: Floats) -> tuple[str, ...]:
+def _missing(model: pin.Model, masses: Floats, slides: Bools) -> tuple[str, ...]:
     joints = [(str(model.names[j]), j) for j in range(1, model.njoints)]
     open_ended = [name for name, j in joints if _no_limits(model, j)]
-    weak = [n for n, j in joints if not model.upperEffortLimit[model.joints[j].idx_v]]
-    return missing("the URDF", bool(np.any(masses)), open_ended, weak)
+    weak = [(n, j) for n, j in joints if not model.upperEffortLimit[model.joints[j].idx_v]]
+    turning, sliding = ([n for n, j in weak if slides[j - 1] == s] for s in (False, True))
+    return missing("the URDF", bool(np.any(masses)), open_ended, turning, sliding)
 
 
 def _no_limits(model: pin.Model, joint: int) -> bool:
@@ -112,7 +116,7 @@ def _no_limits(model: pin.Model, joint: int) -> bool:
 
 
 def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
-    """Lower and upper limit in rad, and effort in N·m."""
+    """Lower and upper limit in rad or m, and effort in N·m or N."""
     kind = model.joints[joint]
     effort = float(model.upperEffortLimit[kind.idx_v]) or math.inf
     if kind.nq != 1 or _no_limits(model, joint):  # continuous: Pinocchio keeps cosine and sine
@@ -141,7 +145,7 @@ def _z_to(axis: Floats) -> Floats:
 
 
 def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
-    """Joints between two links, all of them revolute."""
+    """Joints between two links, each revolute or prismatic."""
     start, joint = _link(model, base).parentJoint, _link(model, tip).parentJoint
     chain: list[int] = []
     while joint not in (start, 0):
@@ -154,12 +158,16 @@ def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
         )
     axes = _axes(model)
     for joint in chain:
-        if model.joints[joint].nv != 1 or np.any(axes[joint - 1][:3]):
-            name = model.names[joint]
+        name, slides = model.names[joint], bool(np.any(axes[joint - 1][:3]))
+        if model.joints[joint].nv != 1 or (slides and np.any(axes[joint - 1][3:])):
             raise InputError(
-                f'{path.name}: joint "{name}" is not revolute; every moving joint of the arm must '
-                "be revolute or continuous. A rail or column: set base_link to the link after "
-                f'"{name}", or give it type="fixed" with an <origin> where it stands'
+                f'{path.name}: joint "{name}" has more than one degree of freedom; every moving '
+                "joint of the arm must be revolute, continuous or prismatic"
+            )
+        if slides and _no_limits(model, joint):
+            raise InputError(
+                f'{path.name}: prismatic joint "{name}" has no <limit lower="..." upper="...">, '
+                "in m; the length of a rail has to be known"
             )
     return chain
 
@@ -177,7 +185,9 @@ def _only_leaf(model: pin.Model, path: Path) -> str:
         if i not in parents and frame.parentJoint != 0
     ]
     if not leaves:
-        raise InputError(f"{path.name}: no moving joint; expected an arm of revolute joints")
+        raise InputError(
+            f"{path.name}: no moving joint; expected an arm of joints that turn or slide"
+        )
     if len(leaves) > 1:
         raise InputError(
             f"{path.name}: the chain branches; set tip_link to one of its leaf links "
@@ -240,7 +250,7 @@ class Mimic:
     Attributes:
         joint: name of the joint that it follows.
         multiplier: 1 where it is not written.
-        offset: 0 where it is not written, rad.
+        offset: 0 where it is not written, rad or m.
     """
 
     joint: str
@@ -301,8 +311,13 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
         turns[j], values[j] = 0.0, 0.0
         turns[j, i] = values[j, i] = m.multiplier
         values[j, n] = m.offset
+        if arm.slides[i] != arm.slides[j]:
+            raise InputError(f"{said}, of which one slides and one turns; valid: two of a kind")
         turn = np.eye(4)
-        c, s = math.cos(m.offset), math.sin(m.offset)
-        turn[:2, :2] = [[c, -s], [s, c]]
+        if arm.slides[j]:
+            turn[2, 3] = m.offset
+        else:
+            c, s = math.cos(m.offset), math.sin(m.offset)
+            turn[:2, :2] = [[c, -s], [s, c]]
         links[j] = links[j] @ turn
     return replace(arm, links=links, coupling=turns, drive=turns, mimic=values)

@@ -77,7 +77,7 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> Design:
     Raises:
         CannotAnswerError: the arm has fewer feasible poses among the candidates than asked for.
     """
-    low, high = np.maximum(arm.q_min, -np.pi), np.minimum(arm.q_max, np.pi)
+    low, high = arm.usual_range
     q = low + (high - low) * rng.random((_CANDIDATES, arm.n))
     q = q[_feasible(arm, q)][:poses]
     if len(q) < poses:
@@ -163,7 +163,7 @@ def _torques(arm: Arm, chain: Chain, wrench: Floats) -> Floats:
     """(N, n) static joint torques under weight and a wrench at the target, N·m."""
     wrenches = np.broadcast_to(wrench, (chain.position.shape[1], 6))
     load = Load(wrenches, TARGET, 0.0, np.zeros(3), np.array([0.0, 0.0, -9.80665]))
-    return arm.drive_torques(slot_wrenches(arm, chain, load)[:, : arm.n, 5])
+    return arm.drive_torques(arm.along(slot_wrenches(arm, chain, load)))
 
 
 def _correlation(covariance: Floats) -> Floats:

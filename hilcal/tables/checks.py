@@ -30,11 +30,15 @@ def check_joints(table: Table, names: tuple[str, ...], q: Floats, arm: Arm) -> N
     if not bad.any():
         return
     i, j = divmod(int(np.argmax(bad)), q.shape[1])
-    turns = float(np.max(np.maximum(np.abs(arm.q_min), np.abs(arm.q_max)))) + 1.0
-    degrees = " (looks like degrees)" if np.abs(q).max() > turns else ""
+    most = np.maximum(np.abs(arm.q_min), np.abs(arm.q_max))
+    large, turns = np.abs(q[:, ~arm.slides]), most[~arm.slides]
+    seems = " (looks like degrees)" if large.max(initial=0.0) > turns.max(initial=0.0) + 1 else ""
+    if arm.slides[j]:
+        seems = " (looks like millimetres)" if abs(q[i, j]) > 10 * most[j] else ""
+    unit = arm.unit(j)
     raise InputError(
-        f"{table.at(i, names[j])}: {q[i, j]:g} rad is beyond the limits of {arm.joint_names[j]} "
-        f"of {arm.name}, {arm.q_min[j]:g} to {arm.q_max[j]:g} rad{degrees}"
+        f"{table.at(i, names[j])}: {q[i, j]:g} {unit} is beyond the limits of "
+        f"{arm.joint_names[j]} of {arm.name}, {arm.q_min[j]:g} to {arm.q_max[j]:g} {unit}{seems}"
     )
 
 
@@ -47,9 +51,11 @@ def check_actual_joints(table: Table, names: tuple[str, ...], actual: Floats, q:
     bad = np.abs(actual - q) > _TRACKING
     if bad.any():
         i, j = divmod(int(np.argmax(bad)), q.shape[1])
+        unit = names[j].rsplit("_", 1)[1]
+        what = "joint angle" if unit == "rad" else "travel"
         raise InputError(
-            f"{table.at(i, names[j])}: {actual[i, j]:g} rad is not within {_TRACKING} rad of the "
-            f"commanded {q[i, j]:g} rad; expected the joint angle that was reached, in rad"
+            f"{table.at(i, names[j])}: {actual[i, j]:g} {unit} is not within {_TRACKING} {unit} of "
+            f"the commanded {q[i, j]:g} {unit}; expected the {what} that was reached, in {unit}"
         )
 
 

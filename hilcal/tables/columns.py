@@ -1,5 +1,6 @@
 """Columns of the exchange table: names, what a wrong header lacks, joints that mimic others."""
 
+import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
@@ -22,17 +23,23 @@ OWN_PREFIX = "x_"
 AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
 which tables round. A choice."""
+_JOINT = re.compile(r"qa?[0-9]+_(rad|m)")
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
-def joint_columns(n: int) -> tuple[str, ...]:
-    """Columns of the commanded joints, rad."""
-    return tuple(f"q{i}_rad" for i in range(1, n + 1))
+Units = int | Sequence[str]
+"""Units of the joints' values, "rad" or "m" (`Arm.units`); or how many joints there are, in rad."""
 
 
-def actual_columns(n: int) -> tuple[str, ...]:
-    """Columns of the joints that the encoders reported, rad."""
-    return tuple(f"qa{i}_rad" for i in range(1, n + 1))
+def joint_columns(units: Units) -> tuple[str, ...]:
+    """Columns of the commanded joints, rad; of a joint that slides m."""
+    units = ("rad",) * units if isinstance(units, int) else units
+    return tuple(f"q{i}_{unit}" for i, unit in enumerate(units, start=1))
+
+
+def actual_columns(units: Units) -> tuple[str, ...]:
+    """Columns of the joints that the encoders reported, rad; of a joint that slides m."""
+    return tuple(f"qa{name[1:]}" for name in joint_columns(units))
 
 
 def temperature_columns(n: int) -> tuple[str, ...]:
@@ -50,26 +57,27 @@ def covariance_columns(m: int) -> tuple[str, ...]:
     return tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i in range(m) for j in range(i, m))
 
 
-def required_columns(n: int) -> tuple[str, ...]:
-    """Columns that every table of an arm of n joints has."""
-    return (*TEXT, *joint_columns(n), *POSITION)
+def required_columns(units: Units) -> tuple[str, ...]:
+    """Columns that every table of an arm has."""
+    return (*TEXT, *joint_columns(units), *POSITION)
 
 
-def groups(n: int) -> tuple[tuple[str, ...], ...]:
+def groups(units: Units) -> tuple[tuple[str, ...], ...]:
     """Optional columns of which a table has all or none."""
-    return ROTATION, temperature_columns(n), approach_columns(n), actual_columns(n)
+    n = len(joint_columns(units))
+    return ROTATION, temperature_columns(n), approach_columns(n), actual_columns(units)
 
 
-def known_columns(n: int) -> tuple[str, ...]:
-    """All columns that have a meaning for an arm of n joints."""
+def known_columns(units: Units) -> tuple[str, ...]:
+    """All columns that have a meaning for an arm."""
     return (
-        *required_columns(n),
+        *required_columns(units),
         TARGET,
         COVERS,
         *covariance_columns(6),
         *WRENCH,
         *("cycle", "time_s", "load_time_s", "air_degC"),
-        *(name for group in groups(n) for name in group),
+        *(name for group in groups(units) for name in group),
     )
 
 
@@ -82,9 +90,9 @@ def _closest(name: str, valid: Iterable[str]) -> str | None:
 
 
 def check_header(
-    path: str, header: Sequence[str], n: int, arm: str, spare: Collection[str] = ()
+    path: str, header: Sequence[str], units: Units, arm: str, spare: Collection[str] = ()
 ) -> None:
-    """Refuse a header that does not fit an arm of n joints; `spare` columns may be missing.
+    """Refuse a header that does not fit an arm; `spare` columns may be missing.
 
     Raises:
         InputError: a column is unnamed, duplicated, unknown or missing, or a group of columns
@@ -98,8 +106,8 @@ def check_header(
     for name, count in Counter(header).items():
         if count > 1:
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
-    known = known_columns(n)
-    missing = [c for c in required_columns(n) if c not in header and c not in spare]
+    known, n = known_columns(units), len(joint_columns(units))
+    missing = [c for c in required_columns(units) if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
@@ -107,9 +115,9 @@ def check_header(
             raise InputError(f"{path}: unknown column '{name}'{advice}{form}")
     if missing:
         raise InputError(
-            f"{path}: column '{missing[0]}' is missing{_hint(missing, header, n, arm)}"
+            f"{path}: column '{missing[0]}' is missing{_hint(missing, header, units, arm)}"
         )
-    for group in groups(n):
+    for group in groups(units):
         lacking = [c for c in group if c not in header and c not in spare]
         if lacking and any(c in header for c in group):
             raise InputError(
@@ -123,20 +131,24 @@ def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> s
     parts = name.split("_")
     if len(parts) == 3 and parts[0] == "cov" and f"cov_{parts[2]}_{parts[1]}" in known:
         return f"; give the upper triangle only: 'cov_{parts[2]}_{parts[1]}'"
+    if _JOINT.fullmatch(name):
+        own = next((c for c in known if c.startswith(f"{parts[0]}_")), None)
+        if own is not None:
+            return f"; this joint {'slides' if own.endswith('_m') else 'turns'}: '{own}'"
     close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
     own = f"columns of your own start with '{OWN_PREFIX}'"
     joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
     return f"; did you mean '{close}'{joints}? Else: {own}" if close else f"; {own}"
 
 
-def _hint(missing: Sequence[str], header: Sequence[str], n: int, arm: str) -> str:
+def _hint(missing: Sequence[str], header: Sequence[str], units: Units, arm: str) -> str:
     """Return what may stand in place of a missing column."""
     own = [c for c in header if c.startswith(OWN_PREFIX)]
     close = _closest(missing[0], own) if missing[0] not in TEXT else None
     if close:
         return f"; '{close}' is taken as a column of your own: positions must be '{missing[0]}'"
     others = f", and so are {len(missing) - 1} more" if len(missing) > 1 else ""
-    return f"{others}; a table for {arm} needs {', '.join(required_columns(n))}"
+    return f"{others}; a table for {arm} needs {', '.join(required_columns(units))}"
 
 
 def covariance_size(path: str, header: Sequence[str]) -> int | None:
@@ -165,7 +177,7 @@ def covariance_size(path: str, header: Sequence[str]) -> int | None:
 
 def following_columns(arm: Arm) -> tuple[str, ...]:
     """Columns of joints that a table may leave out."""
-    names = (joint_columns(arm.n), actual_columns(arm.n))
+    names = (joint_columns(arm.units), actual_columns(arm.units))
     return tuple(n for group in names for n, own in zip(group, arm.own, strict=True) if not own)
 
 
@@ -185,21 +197,21 @@ def with_following(table: Table, arm: Arm) -> Table:
     if arm.own.all():
         return table
     number = dict(table.number)
-    for names in (joint_columns(arm.n), actual_columns(arm.n)):
+    for names in (joint_columns(arm.units), actual_columns(arm.units)):
         own = [name for name, is_own in zip(names, arm.own, strict=True) if is_own]
         if not set(own) <= number.keys():
             continue
         nothing = np.full(len(number[own[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
-        for k in np.flatnonzero(~arm.own):
+        for k in np.flatnonzero(~arm.own).tolist():
             off = np.abs(q[:, k] - full[:, k]) > AGREES  # False where there is no value
             if off.any():
                 i = int(np.argmax(off))
                 raise InputError(
-                    f"{table.at(i, names[k])}: {q[i, k]:g} rad, but by the arm's description "
-                    f"{arm.joint_names[k]} follows to {full[i, k]:g} rad; leave the column out, or "
-                    "correct <mimic> in the URDF"
+                    f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
+                    f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
+                    "column out, or correct <mimic> in the URDF"
                 )
             number[names[k]] = full[:, k]
     return replace(table, number=number)

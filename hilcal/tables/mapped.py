@@ -105,7 +105,7 @@ def mapped_table(
         mapping = mapping.model_copy(update={"air": None})
     raw, joints, side = _raw(grid, mapping, arm), mapping.joints, None
     if mapping.approach is not None and mapping.approach.by_order and joints is not None:
-        side = approach_by_order(units.ANGLES[joints.unit] * _block(raw, grid, joints.columns))
+        side = approach_by_order(_joint_units(joints, arm) * _block(raw, grid, joints.columns))
         notes.append(
             f"approach: side of the move from the row before; moves below {STILL:g} rad keep the "
             "last side, the first row counts as +1"
@@ -129,7 +129,7 @@ def mapped_table(
     table.text["load"] = _loads(grid, mapping, wrench)
     q = None
     if joints is not None:
-        q = units.ANGLES[joints.unit] * _block(raw, grid, joints.columns)
+        q = _joint_units(joints, arm) * _block(raw, grid, joints.columns)
     table.text["pose"] = _poses(grid, mapping.pose, q)
     if joints is not None and q is not None and joints.reported:
         _as_commanded(table, q, arm)
@@ -169,7 +169,7 @@ def import_mapped(
     """
     of = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
-    q = units.ANGLES[mapping.joints.unit] * _block(of.raw, grid, mapping.joints.columns)
+    q = _joint_units(mapping.joints, arm) * _block(of.raw, grid, mapping.joints.columns)
     position = table.matrix(columns.POSITION)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
     covariance, told = mapped_covariance(table, grid, mapping, position, of.angles, noise, station)
@@ -188,6 +188,8 @@ def import_mapped(
         notes += _stale(grid, position, q)
     notes += [*(told or result.notes[:1]), *result.notes[1:]]
     unit, name = units.ANGLES[mapping.joints.unit], mapping.joints.unit
+    names = own_columns(columns.joint_columns(arm.units), q.shape[1], arm)
+    q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
     notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
     return ImportResult(readings, tuple(notes))
 
@@ -237,16 +239,15 @@ def _quantities(
     def times(size: float) -> Callable[[Floats], Floats]:
         return lambda values: size * values
 
-    def of_joints(section: Joints, names: tuple[str, ...]) -> Sequence[str]:
-        return own_columns(names, len(section.columns), arm)
-
     m = mapping
     if m.position is not None:
         yield columns.POSITION, m.position.columns, times(units.LENGTHS[m.position.unit])
-    commanded, reported = columns.joint_columns(arm.n), columns.actual_columns(arm.n)
+    commanded, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     for s, names in ((m.joints, commanded), (m.actual_joints, reported)):
         if s is not None:
-            yield of_joints(s, names), s.columns, times(units.ANGLES[s.unit])
+            own, sizes = own_columns(names, len(s.columns), arm), _joint_units(s, arm).tolist()
+            for name, column, size in zip(own, s.columns, sizes, strict=True):
+                yield (name,), (column,), times(size)
     if m.cycle is not None:
         yield ("cycle",), (m.cycle.column,), times(1.0)
     if m.approach is not None and m.approach.columns:
@@ -255,6 +256,13 @@ def _quantities(
         yield ("air_degC",), (m.air.column,), _celsius(m.air.unit)
     if (w := m.joint_temperatures) is not None:
         yield columns.temperature_columns(arm.n), w.columns, _celsius(w.unit)
+
+
+def _joint_units(section: Joints, arm: Arm) -> Floats:
+    """(k,) rad, or m where a joint slides, per unit of each of the section's columns."""
+    names = own_columns(columns.joint_columns(arm.units), len(section.columns), arm)
+    angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
+    return np.array([length if name.endswith("_m") else angle for name in names])
 
 
 def _celsius(unit: str) -> Callable[[Floats], Floats]:
@@ -420,7 +428,7 @@ def _as_commanded(table: Table, q: Floats, arm: Arm) -> None:
     first: dict[str, int] = {}
     rows = [first.setdefault(name, k) for k, name in enumerate(table.text["pose"])]
     names, reported = (
-        own_columns(of(arm.n), q.shape[1], arm)
+        own_columns(of(arm.units), q.shape[1], arm)
         for of in (columns.joint_columns, columns.actual_columns)
     )
     for k, (name, actual) in enumerate(zip(names, reported, strict=True)):

@@ -148,6 +148,7 @@ class Joints(Section):
     columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
         description="one column per joint"
     )
+    slide_unit: Length = Field("m", description=_LENGTH + ", of joints that slide")
     unit: Angle = Field(description=_ANGLE)
 
 

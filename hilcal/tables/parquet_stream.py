@@ -117,14 +117,14 @@ def open_stream(
     header = list(file.schema_arrow.names)
     # Without the names of poses and loads the header is that of an exchange table.
     wanted = [*columns.TEXT, *(name for name in header if name not in NAMES)]
-    columns.check_header(str(path), wanted, arm.n, arm.name)
+    columns.check_header(str(path), wanted, arm.units, arm.name)
     if columns.TARGET in header:
         raise InputError(
             f"{path}: column '{columns.TARGET}': a stream is of one target; import a table of "
             "several with `hilcal import`"
         )
     columns.covariance_size(str(path), header)
-    known = set(columns.known_columns(arm.n)) - {*NAMES, columns.COVERS}
+    known = set(columns.known_columns(arm.units)) - {*NAMES, columns.COVERS}
     meta = file.metadata
     rows = tuple(meta.row_group(k).num_rows for k in range(meta.num_row_groups))
     if not sum(rows):

@@ -156,14 +156,14 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
             f"{path}: columns must be separated by ',' with '.' as decimal mark; for any other "
             f"table: {columns.PREVIEW}"
         )
-    known = columns.known_columns(arm.n)
+    known = columns.known_columns(arm.units)
     if not any(name in known for name in header):
         raise InputError(
             f"{path}: not an exchange table: row 1 has none of its columns "
-            f"({', '.join(columns.required_columns(arm.n))}); for any other table: "
+            f"({', '.join(columns.required_columns(arm.units))}); for any other table: "
             f"{columns.PREVIEW}"
         )
-    columns.check_header(path, header, arm.n, arm.name, following_columns(arm))
+    columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
     columns.covariance_size(path, header)
     optional = (columns.TARGET, columns.COVERS)
     text = (*columns.TEXT, *(name for name in header if name in optional))
@@ -263,18 +263,19 @@ def measured_of(table: Table, arm: Arm) -> tuple[States, Floats]:
 def _states(table: Table, arm: Arm) -> States:
     table = with_following(table, arm)
     number, n = table.number, arm.n
-    q = table.matrix(columns.joint_columns(n))
-    checks.check_joints(table, columns.joint_columns(n), q, arm)
+    joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
+    q = table.matrix(joints)
+    checks.check_joints(table, joints, q, arm)
     zero = np.zeros(len(q))
     wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
     temperature = _group(table, columns.temperature_columns(n))
     approach = _group(table, columns.approach_columns(n))
-    actual = _group(table, columns.actual_columns(n))
+    actual = _group(table, reported)
     if approach is not None:
         names = columns.approach_columns(n)
         table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
     if actual is not None:
-        checks.check_actual_joints(table, columns.actual_columns(n), actual, q)
+        checks.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if "air_degC" in number:
@@ -356,6 +357,7 @@ def write_table(
     path: str | Path,
     covers: str = INSTRUMENT,
     about: Mapping[str, object] | None = None,
+    units: Sequence[str] | None = None,
 ) -> None:
     """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
 
@@ -364,6 +366,7 @@ def write_table(
         path: the file; CSV unless it ends in .parquet.
         covers: what their covariances cover, see `covariance` and `with_what_rounding_does`.
         about: further metadata of a Parquet file.
+        units: of the joints' values (`Arm.units`); all in rad where None.
 
     Raises:
         InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
@@ -377,7 +380,7 @@ def write_table(
         found[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
     if covers != INSTRUMENT:
         found[columns.COVERS] = [covers] * len(readings)
-    header, numbers = _number_columns(readings)
+    header, numbers = _number_columns(readings, units)
     found |= zip(header, numbers, strict=True)
     write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
 
@@ -405,13 +408,15 @@ def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
     return [names[k] for k in index.tolist()]
 
 
-def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]:
+def _number_columns(
+    readings: Readings, units: Sequence[str] | None
+) -> tuple[list[str], list[Floats | Ints]]:
     """Names and (N,) arrays of the number columns that the readings have."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
     blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
         (("cycle",), readings.cycle),
-        (columns.joint_columns(n), s.q),
+        (columns.joint_columns(units or n), s.q),
         ((columns.POSITION + columns.ROTATION)[:m], readings.value),
         (columns.covariance_columns(m), readings.covariance[:, i, j]),
         (columns.WRENCH, s.wrench if np.any(s.wrench) or np.signbit(s.wrench).any() else None),
@@ -420,7 +425,7 @@ def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]
         (("air_degC",), s.air_temperature),
         (columns.temperature_columns(n), s.joint_temperature),
         (columns.approach_columns(n), s.approach),
-        (columns.actual_columns(n), s.q_actual),
+        (columns.actual_columns(units or n), s.q_actual),
     ]
     header: list[str] = []
     numbers: list[Floats | Ints] = []

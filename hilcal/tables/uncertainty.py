@@ -344,7 +344,7 @@ def check_joint_rounding(
         covariance: (N, m, m), m².
         reach: of the arm, m.
     """
-    size = max(step(q[:, k]) for k in range(q.shape[1]))
+    size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)
     noise = float(np.sqrt(np.median(covariance[:, range(3), range(3)])))
     if std * reach <= noise:

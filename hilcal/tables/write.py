@@ -143,7 +143,11 @@ def _number(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def plan_csv(plan: Plan, wrenches: Mapping[str, Floats] | None = None) -> str:
+def plan_csv(
+    plan: Plan,
+    wrenches: Mapping[str, Floats] | None = None,
+    units: Sequence[str] | None = None,
+) -> str:
     """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
 
     The columns are those of the exchange table: who measures by hand adds x_m, y_m, z_m and
@@ -152,6 +156,7 @@ def plan_csv(plan: Plan, wrenches: Mapping[str, Floats] | None = None) -> str:
     Args:
         plan: poses and steps.
         wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
+        units: of the joints' values (`Arm.units`); all in rad where None.
 
     Raises:
         KeyError: a load of the plan has no wrench.
@@ -159,7 +164,7 @@ def plan_csv(plan: Plan, wrenches: Mapping[str, Floats] | None = None) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     forces = WRENCH if wrenches is not None else ()
-    writer.writerow((ORDER, *TEXT, "cycle", *joint_columns(plan.q.shape[1]), *forces))
+    writer.writerow((ORDER, *TEXT, "cycle", *joint_columns(units or plan.q.shape[1]), *forces))
     for k, step in enumerate(plan.steps, start=1):
         texts = csv_text(step.pose), csv_text(step.load)
         row: list[object] = [k, *texts, step.cycle, *plan.joints(step.pose).tolist()]

@@ -12,28 +12,33 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.types import Floats
 
-ODD = "odd"
-ARMS = (*robot_names(), ODD)
+ODD, RAILS = "odd", "rails"
+ARMS = (*robot_names(), ODD, RAILS)
 
 
 def arm_of(name: str) -> Arm:
-    """An arm of the catalogue, or one of seven joints with axes in odd directions."""
-    if name != ODD:
-        return load_arm(name)
+    """An arm of the catalogue, drawn; or one of seven joints with axes in odd directions.
+
+    That of rails slides in its first, fourth and last joint.
+    """
+    if name not in (ODD, RAILS):
+        return replace(load_arm(name), coupling=None, drive=None)
     rng = np.random.default_rng(7)
     n = 7
+    slides = np.isin(np.arange(n), [0, 3, 6]) & (name == RAILS)
     ends = rng.normal(size=(n + 1, 6)) * [0.3, 0.3, 0.3, 1.5, 1.5, 1.5]
     return Arm(
-        name=ODD,
+        name=name,
         links=np.array([displacement(end) for end in ends]),
         masses=rng.uniform(0.5, 8.0, n),
         coms=rng.normal(size=(n, 3)) * 0.1,
         q_min=np.full(n, -np.pi),
         q_max=np.full(n, np.pi),
-        torque_max=np.full(n, 200.0),
+        torque_max=np.where(slides, 2000.0, 800.0 if name == RAILS else 200.0),
         payload=5.0,
         joint_names=tuple(f"j{i + 1}" for i in range(n)),
         source="made up",
+        prismatic=slides if name == RAILS else None,
     )
 
 
@@ -70,8 +75,9 @@ def twisted(arm: Arm, twist: Floats) -> Arm:
 def slots_of(arm: Arm, q: Floats) -> Floats:
     """(n + 1, 4, 4) slots of one state, by products of homogeneous matrices."""
     pose, out = arm.links[0], [arm.links[0]]
-    for angle, link in zip(q, arm.links[1:], strict=True):
-        pose = pose @ displacement([0, 0, 0, 0, 0, angle]) @ link
+    for value, slides, link in zip(q, arm.slides, arm.links[1:], strict=True):
+        motion = [0, 0, value, 0, 0, 0] if slides else [0, 0, 0, 0, 0, value]
+        pose = pose @ displacement(motion) @ link
         out.append(pose)
     return np.array(out)
 

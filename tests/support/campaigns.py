@@ -13,6 +13,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats, Ints
 from studies.random_campaigns import rehearsal_states
@@ -146,12 +147,16 @@ def true_parameters(world: World, effect: str, *, m: int = 3) -> Floats:
     if effect == "target_offset" and m == 6:
         return np.concatenate([truth, np.zeros(3)])
     if effect == "joint_coupling":
-        return truth[followed(len(world.physics.encoder_offset))]
+        return truth[followed(world.cell.arm)]
     return truth
 
 
-def followed(n: int) -> Ints:
-    """Where among n x n factors, row by row, those of joints behind one another are."""
+def followed(arm: Arm) -> Ints:
+    """Where among n x n factors, row by row, those of joints behind one another are.
+
+    Of one kind both: that turn, or that slide.
+    """
+    n = arm.n
     pairs = np.eye(n, k=-1)
     pairs[n - 1, n - 3] = 1.0
-    return np.flatnonzero(pairs)
+    return np.flatnonzero(pairs * (arm.slides[:, None] == arm.slides))

@@ -12,13 +12,15 @@ from hilcal.robot import chain as chains
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats
-from tests.support.arm_cases import arm_of
+from tests.support.arm_cases import RAILS, arm_of
 from tests.support.arm_cases import cell_of as odd_cell
 from tests.support.campaigns import cell_of
 
 make = installed().make
 effect_class = installed().__getitem__
-NAMES = tuple(e.name for e in BUILT_IN)
+ALL_NAMES = tuple(e.name for e in BUILT_IN)
+NAMES = tuple(e.name for e in BUILT_IN if e.applies(cell_of()))
+"""Those that an arm without slides can have."""
 ELASTIC = tuple(e.name for e in BUILT_IN if e.elastic)
 FIELDS = ("dq", "twist", "base", "station", "target", "scale")
 
@@ -76,10 +78,11 @@ def situation(cell: Cell, seed: int = 2) -> Situation:
     chain = chains.evaluate(cell.arm, states.q, deviation)
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)
     wrench = slot_wrenches(cell.arm, chain, load)
-    return Situation(cell, states, states.q, chain, wrench, load, typical_compliances(cell))
+    phases = cell.arm.phases(states.q)
+    return Situation(cell, states, phases, chain, wrench, load, typical_compliances(cell))
 
 
-CELLS = {"ur10e": cell_of(), "odd": odd_cell(arm_of("odd"))}
+CELLS = {name: odd_cell(arm_of(name)) for name in ("odd", RAILS)} | {"ur10e": cell_of()}
 
 
 def random_theta(effects, rng, elastic=1.0):

@@ -170,7 +170,7 @@ def in_a_cell(text: str) -> CellConfig:
 
 
 def test_the_cells_of_the_guides_are_accepted() -> None:
-    urdf, _, signs = blocks(HOW_TO / "add-a-robot.md", "toml")
+    urdf, _, _, signs = blocks(HOW_TO / "add-a-robot.md", "toml")
     assert in_a_cell(urdf).robot.tip_link == "tool0"
     assert in_a_cell(signs).robot.joint_sign == (1, 1, 1, -1, 1, 1)
     _, driver = blocks(HOW_TO / "add-a-device.md", "toml")
@@ -182,8 +182,11 @@ def test_the_cells_of_the_guides_are_accepted() -> None:
 
 def test_the_arm_of_the_guide_is_an_arm(tmp_path: Path) -> None:
     path = tmp_path / "my_arm.toml"
-    path.write_text(blocks(HOW_TO / "add-a-robot.md", "toml")[1], encoding="utf-8")
+    _, arm, track, _ = blocks(HOW_TO / "add-a-robot.md", "toml")
+    path.write_text(arm, encoding="utf-8")
     assert load_arm(str(path)).n == 1
+    path.write_text(f"{arm}\n{track}", encoding="utf-8")
+    assert load_arm(str(path)).units == ("rad", "m")
 
 
 def test_the_entry_points_of_the_guides_are_those_that_are_read() -> None:

@@ -29,23 +29,45 @@ SLOW = 0.2  # rad/s
 PATIENCE = 60.0  # s
 
 
-@pytest.fixture(scope="module")
+TRACK = """title = "UR10e on a track"
+base_m_rad = [0.0, 0.0, 0.3, 0.0, 1.5707963267948966, 0.0]
+[[joints]]
+name = "track"
+type = "prismatic"
+a_m = 0.0
+d_m = 0.0
+alpha_deg = -90.0
+offset_deg = 90.0
+mass_kg = 40.0
+q_min_m = 0.0
+q_max_m = 1.5
+force_max_N = 2000.0
+"""
+
+
+@pytest.fixture(scope="module", params=["ur10e", "track.toml"])
 def there(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[CellConfig, Cell]]:
-    """The cell: a real one where it is named, else a simulated one."""
+    """The cell: a real one where it is named, else a simulated one, of UR or on a track."""
     given = request.config.getoption("--hardware")
+    if given is not None and request.param != "ur10e":
+        pytest.skip("simulated arms of other makers")
     if given is not None:
         config = load_config(Path(given))
         yield config, cell_from_config(config, Path(given).absolute().parent)
         return
-    base_dir = configs_dir() / "cells"
-    config = load_config(base_dir / "demo_ur10e.toml")
+    base_dir = tmp_path_factory.mktemp("robot")
+    rows = (configs_dir() / "robots" / "ur10e.toml").read_text()
+    (base_dir / "track.toml").write_text(TRACK + rows[rows.index("[[joints]]") :])
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     simulation = config.simulation.model_copy(update={"clock": 1.0})
-    config = config.model_copy(update={"simulation": simulation})
-    cell = cell_from_config(config)
+    robot = config.robot.model_copy(update={"model": request.param})
+    limits = config.limits.model_copy(update={"workspace_min_m": (-3.0, -3.0, 0.05)})
+    config = config.model_copy(update={"simulation": simulation, "robot": robot, "limits": limits})
+    cell = cell_from_config(config, base_dir)
     plan = spread_plan(cell, config, 4, np.random.default_rng(0))
-    secret = case_of_plan(config, plan, "nothing", 3)
+    secret = case_of_plan(config, plan, "nothing", 3, base_dir=base_dir)
     with simulated_cell(secret, 3, base_dir, tmp_path_factory.mktemp("cell")) as running:
         yield running.config, secret.cell
 

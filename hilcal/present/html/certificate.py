@@ -67,15 +67,15 @@ def _conditions(m: ReportContent) -> Iterator[Block]:
     gross = f"; {set_aside} set aside as gross errors" if set_aside else ""
     yield f"{count}{gross}. Loads (readings): {loads}."
     yield from (*prior_lines(m.fit), _choice(m))
-    q = np.degrees(r.states.q)
+    q, units = r.states.q, m.fit.model.cell.arm.units
     joints = range(q.shape[1])
     yield table(
         "joint",
         *(str(j + 1) for j in joints),
         caption="Joint angles that were measured",
         rows=(
-            ("from", *(f"{q[:, j].min():.0f}°" for j in joints)),
-            ("to", *(f"{q[:, j].max():.0f}°" for j in joints)),
+            ("from", *(numbers.joint_value(q[:, j].min(), units[j], 0) for j in joints)),
+            ("to", *(numbers.joint_value(q[:, j].max(), units[j], 0) for j in joints)),
         ),
     )
     if m.tested is None:

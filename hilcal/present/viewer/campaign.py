@@ -386,7 +386,7 @@ def pose_cards(story: Story) -> list[str]:
     r = story.revisions[-1]
     length, sigma, level = r.size_m.tolist(), r.sigma.tolist(), r.level.tolist()
     rms = np.sqrt(np.bincount(story.row, r.size_m**2) / np.bincount(story.row)).tolist()
-    degrees = np.rad2deg(story.q[story.first]).tolist()
+    joints, units = story.q[story.first].tolist(), story.arm.units
     order = np.argsort(story.row, kind="stable")
     ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
     out = []
@@ -404,7 +404,7 @@ def pose_cards(story: Story) -> list[str]:
             heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(rms[k])} rms"),
             f"With the model of revision {r.revision}: {r.name}.",
             table("load", "residual", "in σ", "", rows=cells, left=(0, 3)),
-            f"Joints {', '.join(f'{a:.1f}' for a in degrees[k])} deg.",
+            f"Joints {', '.join(map(numbers.joint_value, joints[k], units))}.",
         ]
         out.append(style.markdown(card))
     return out

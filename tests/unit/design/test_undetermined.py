@@ -70,6 +70,8 @@ def test_a_cell_that_determines_nothing_is_refused() -> None:
 
 def test_other_parameters_have_plain_words() -> None:
     assert "changes with it" in Undetermined("tracker_scale.s", "1", 0.0).remark
+    slide = Undetermined("joint_compliance.j1", "m/N", 0.0, (), "joint 1").remark
+    assert "joint 1 needs a pull along it" in slide
 
 
 def test_the_plan_goes_on_without_and_states_it() -> None:

@@ -9,9 +9,11 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.protocol import Response
 from hilcal.model.model import Model
 from tests.support.effect_cases import (
+    ALL_NAMES,
     CELLS,
     NAMES,
     VARIANTS,
+    effect_class,
     make,
     numeric_slopes,
     options_of,
@@ -51,7 +53,8 @@ def assert_slope(model, states, theta, m, directions=None):
 
 
 @pytest.mark.parametrize(
-    ("arm", "m", "elastic"), [("ur10e", 6, 1.0), ("ur10e", 3, 5.0), ("odd", 3, 1.0)]
+    ("arm", "m", "elastic"),
+    [("ur10e", 6, 1.0), ("ur10e", 3, 5.0), ("odd", 3, 1.0), ("rails", 6, 1.0)],
 )
 def test_model_jacobian_is_the_derivative_of_the_prediction(arm, m, elastic):
     """All effects at once, also where joints are five times as soft as usual.
@@ -61,7 +64,8 @@ def test_model_jacobian_is_the_derivative_of_the_prediction(arm, m, elastic):
     """
     cell = CELLS[arm]
     states = some_states(cell, 4)
-    model = Model(cell, tuple(make(n, cell, states, SHORT.get(n, options_of(n, m))) for n in NAMES))
+    names = ALL_NAMES if arm == "rails" else NAMES
+    model = Model(cell, tuple(make(n, cell, states, SHORT.get(n, options_of(n, m))) for n in names))
     rng = np.random.default_rng(4)
     theta = random_theta(model.effects, rng, elastic)
     scale = np.array([p.scale for e in model.effects for p in e.parameters])
@@ -73,12 +77,15 @@ def test_model_jacobian_is_the_derivative_of_the_prediction(arm, m, elastic):
     assert_slope(model, states, theta, m, signs * even / np.sqrt(model.size))
 
 
-USUAL = tuple((name, SHORT.get(name, options_of(name))) for name in NAMES)
+USUAL = tuple((name, SHORT.get(name, options_of(name))) for name in ALL_NAMES)
 
 
 @pytest.mark.parametrize(("name", "options"), USUAL + VARIANTS)
-def test_each_effect_with_compliant_joints(name, options):
-    cell = CELLS["odd"]
+@pytest.mark.parametrize("arm", ["odd", "rails"])
+def test_each_effect_with_compliant_joints(name, options, arm):
+    cell = CELLS[arm]
+    if not effect_class(name).applies(cell):
+        pytest.skip("of arms with slides")
     states = some_states(cell, 4)
     joints = () if name == "joint_compliance" else (make("joint_compliance", cell, states),)
     model = Model(cell, (*joints, make(name, cell, states, options)))

@@ -12,7 +12,9 @@ from hypothesis import strategies as st
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import configs_dir, load_arm, robot_names
+from hilcal.robot.chain import evaluate
 from hilcal.robot.pinocchio_model import pinocchio_model
+from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.types import Floats
 
@@ -77,7 +79,107 @@ def gravity_torques(arm: Arm, q: Floats) -> Floats:
 
 
 def test_catalogue_is_complete() -> None:
-    assert set(robot_names()) == set(PUBLISHED)
+    assert set(robot_names()) == set(PUBLISHED) | set(OTHER_MAKERS)
+
+
+def drawn(x: float, y: float, z: float, roll: float, pitch: float, yaw: float) -> Floats:
+    """The <origin> of a URDF."""
+    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), np.array([x, y, z])).homogeneous
+
+
+def upright(*joints: tuple[float, float, float, str]) -> list[tuple[Floats, list[float]]]:
+    """Joints whose frames are all parallel to the base, as industrial arms are drawn: axes x y z"""
+    axes = {"z": [0, 0, 1], "y": [0, 1, 0], "x": [1, 0, 0]}
+    return [
+        (drawn(x, y, z, 0, 0, 0), [(-1.0 if a[0] == "-" else 1.0) * c for c in axes[a[-1]]])
+        for x, y, z, a in joints
+    ]
+
+
+def about_z(*origins: tuple[float, ...]) -> list[tuple[Floats, list[float]]]:
+    return [(drawn(*origin), [0.0, 0.0, 1.0]) for origin in origins]
+
+
+H, PI = PI2, math.pi
+# Joint origins and axes, and the flange, as the published URDFs have them; see each file's source.
+OTHER_MAKERS = {
+    "fr3": (
+        about_z((0, 0, 0.333, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0, -0.316, 0, H, 0, 0),
+                (0.0825, 0, 0, H, 0, 0), (-0.0825, 0.384, 0, -H, 0, 0), (0, 0, 0, H, 0, 0),
+                (0.088, 0, 0, H, 0, 0)),
+        drawn(0, 0, 0.107, 0, 0, 0),
+    ),
+    "iiwa7": (
+        about_z((0, 0, 0.15, 0, 0, 0), (0, 0, 0.19, H, 0, PI), (0, 0.21, 0, H, 0, PI),
+                (0, 0, 0.19, H, 0, 0), (0, 0.21, 0, -H, PI, 0), (0, 0.0607, 0.19, H, 0, 0),
+                (0, 0.081, 0.0607, -H, PI, 0)),
+        drawn(0, 0, 0.045, 0, 0, 0),
+    ),
+    "iiwa14": (
+        about_z((0, 0, 0.1575, 0, 0, 0), (0, 0, 0.2025, H, 0, PI), (0, 0.2045, 0, H, 0, PI),
+                (0, 0, 0.2155, H, 0, 0), (0, 0.1845, 0, -H, PI, 0), (0, 0, 0.2155, H, 0, 0),
+                (0, 0.081, 0, -H, PI, 0)),
+        drawn(0, 0, 0.045, 0, 0, 0),
+    ),
+    "xarm6": (
+        about_z((0, 0, 0.267, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0.0535, -0.2845, 0, 0, 0, 0),
+                (0.0775, 0.3425, 0, -H, 0, 0), (0, 0, 0, H, 0, 0), (0.076, 0.097, 0, -H, 0, 0)),
+        np.eye(4),
+    ),
+    "xarm7": (
+        about_z((0, 0, 0.267, 0, 0, 0), (0, 0, 0, -H, 0, 0), (0, -0.293, 0, H, 0, 0),
+                (0.0525, 0, 0, H, 0, 0), (0.0775, -0.3425, 0, H, 0, 0), (0, 0, 0, H, 0, 0),
+                (0.076, 0.097, 0, -H, 0, 0)),
+        np.eye(4),
+    ),
+    "kr10_r1100_2": (
+        upright((0, 0, 0.4, "-z"), (0.025, 0, 0, "y"), (0.56, 0, 0, "y"), (0.515, 0, 0.025, "-x"),
+                (0, 0, 0, "y"), (0.09, 0, 0, "-x")),
+        drawn(0, 0, 0, 0, H, 0),
+    ),
+    "irb120": (
+        upright((0, 0, 0, "z"), (0, 0, 0.29, "y"), (0, 0, 0.27, "y"), (0, 0, 0.07, "x"),
+                (0.302, 0, 0, "y"), (0.072, 0, 0, "x")),
+        drawn(0, 0, 0, 0, H, 0),
+    ),
+    "irb1600_10_145": (
+        upright((0, 0, 0, "z"), (0.15, 0, 0.4865, "y"), (0, 0, 0.7, "y"), (0.3, 0, 0, "x"),
+                (0.3, 0, 0, "y"), (0.065, 0, 0, "x")),
+        drawn(0, 0, 0, 0, H, 0),
+    ),
+    "m10ia": (
+        upright((0, 0, 0.45, "z"), (0.15, 0, 0, "y"), (0, 0, 0.6, "-y"), (0, 0, 0.2, "-x"),
+                (0.64, 0, 0, "-y"), (0.1, 0, 0, "-x")),
+        drawn(0, 0, 0, PI, -H, 0),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", OTHER_MAKERS)
+def test_arms_of_other_makers_are_those_of_their_urdfs(name: str) -> None:
+    """The rows of the catalogue against the joints of the published URDF."""
+    arm, (joints, tool) = load_arm(name), OTHER_MAKERS[name]
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, (20, len(joints)))
+    found = evaluate(arm, q)
+    angles = q.copy()
+    if name == "m10ia":  # its controller counts joint 3 from the horizontal, the URDF does not
+        angles[:, 2] += angles[:, 1]
+    for i, row in enumerate(angles):
+        pose = np.eye(4)
+        for (origin, axis), angle in zip(joints, row, strict=True):
+            turn = pin.SE3(pin.AngleAxis(angle, np.array(axis)).matrix(), np.zeros(3)).homogeneous
+            pose = pose @ origin @ turn
+        pose = pose @ tool
+        np.testing.assert_allclose(found.rotation[-1, i], pose[:3, :3], rtol=0, atol=1e-9)
+        np.testing.assert_allclose(found.position[-1, i], pose[:3, 3], rtol=0, atol=1e-9)
+    assert arm.source
+    assert np.isfinite(arm.payload)
+    assert np.all((arm.q_max - arm.q_min > 1.0) & (arm.q_max - arm.q_min < 15.0))
+    if np.isfinite(arm.torque_max).all() and arm.masses.any():
+        # it holds itself in every posture, with the torques that it has
+        weight = np.array([0.0, 0.0, -9.81])
+        load = Load(np.zeros((20, 6)), np.zeros(3), 0.0, np.zeros(3), weight)
+        assert np.all(np.abs(arm.along(slot_wrenches(arm, found, load))) < arm.torque_max)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
@@ -309,9 +411,24 @@ def test_branching_urdf_lists_its_leaves(tmp_path: Path) -> None:
         arm_from_urdf(write(tmp_path))
 
 
-def test_prismatic_joint_in_the_arm_is_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r'joint "slide" is not revolute'):
-        arm_from_urdf(write(tmp_path, FINGER), tip_link="finger")
+def test_prismatic_joint_in_the_arm_slides(tmp_path: Path) -> None:
+    arm = arm_from_urdf(write(tmp_path, FINGER), tip_link="finger")
+    assert arm.slides.tolist() == [False] * 6 + [True]
+    assert (arm.q_min[-1], arm.q_max[-1]) == (0.0, 0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (('type="prismatic"', 'type="planar"'), r'joint "slide" has more than one degree of free'),
+        (('lower="0" upper="0.1"', 'lower="0" upper="0"'), r'prismatic joint "slide" has no <lim'),
+    ],
+)
+def test_what_neither_turns_nor_slides_is_named(
+    tmp_path: Path, change: tuple[str, str], message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        arm_from_urdf(write(tmp_path, FINGER.replace(*change)), tip_link="finger")
 
 
 @pytest.mark.parametrize(

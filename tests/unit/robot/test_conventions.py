@@ -146,6 +146,6 @@ def test_a_urdf_says_what_it_lacks(tmp_path):
     np.testing.assert_allclose(arm.q_max, [2 * np.pi, 1.0])
 
 
-def test_rails_are_refused_by_name(tmp_path):
-    with pytest.raises(InputError, match=r'"j1" is not revolute.*set base_link to the link after'):
+def test_a_rail_without_ends_is_refused_by_name(tmp_path):
+    with pytest.raises(InputError, match=r'prismatic joint "j1" has no <limit'):
         arm_from_urdf(urdf(tmp_path, "prismatic"))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.injected_effects import EFFECTS, nothing_hidden
+from drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
 from drivers.simulated.own_law import OwnLaw, own_law, own_names
 from drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
 from drivers.simulated.world_server import read_world, write_world
@@ -96,8 +96,8 @@ def test_what_the_simulated_cell_does_not_measure_is_named(file):
 
 
 def test_only_effects_of_ones_own_are_added_to_the_choices(law):
-    assert own_names(law.catalogue, EFFECTS) == ("mine",)
-    assert own_names(installed(), EFFECTS) == ()  # all that ship have mechanics of their own
+    assert own_names(law.catalogue, ALL_EFFECTS) == ("mine",)
+    assert own_names(installed(), ALL_EFFECTS) == ()  # all that ship have mechanics of their own
     check_choice("mine", law.catalogue)
     with pytest.raises(InputError, match="hide 'mine'"):
         check_choice("mine", installed())

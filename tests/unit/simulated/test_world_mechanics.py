@@ -44,7 +44,11 @@ def test_energy_is_stationary_and_virtual_work_of_the_moment_balances():
         def work(delta, i=i):
             give = {k: delta[dofs] for k, dofs in zip(tree.beam_link, tree.beam, strict=True)}
             bodies, _, flange = frames(
-                ARM, Q[i] + delta[tree.drive], delta[tree.base], delta[tree.tilt], give
+                ARM,
+                Q[i] + delta[tree.drive],
+                delta[tree.base],
+                delta[tree.tilt].reshape(-1, 2),
+                give,
             )
             out = 0.0
             for body, mass, com in zip(bodies, ARM.masses, ARM.coms, strict=True):

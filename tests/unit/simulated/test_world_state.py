@@ -280,5 +280,5 @@ def test_an_arm_of_seven_joints_is_refused(tmp_path):
         joint_std=np.zeros(7),
     )
     board = Blackboard.create(tmp_path / "world.bin", 1.0)
-    with pytest.raises(InputError, match="arm odd has 7 joints; valid: arms of 6 joints"):
+    with pytest.raises(InputError, match="arm odd has 7 joints, the shared world one of 6"):
         WorldState(odd, made, board, 1)

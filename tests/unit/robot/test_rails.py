@@ -1,0 +1,408 @@
+"""Arms on rails, columns and gantries: description, tables, exports, and what fits tell of them.
+
+Chain, statics and all effects are compared with Pinocchio, with differences and with the simulated
+world on an arm of three slides in test_chain.py, test_statics.py, tests/unit/effects.
+"""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+import hilcal as hc
+from drivers.simulated.rehearsal import Rehearsal, case_of_plan, read_plan
+from hilcal.calibration.dh_table import dh_rows, flange_poses, to_toml
+from hilcal.calibration.handover import urdf
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig
+from hilcal.effects.catalogue import installed
+from hilcal.errors import InputError
+from hilcal.model.model import Model
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import configs_dir, load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.robot.urdf import arm_from_urdf
+from hilcal.store.plan import Plan, Step
+from hilcal.tables.table import read_table, write_table
+from tests.support.cli_cases import Capsys, ok, refused
+
+TRACK = """title = "UR10e on a track"
+payload_kg = 12.5
+base_m_rad = [0.0, 0.0, 0.3, 0.0, 1.5707963267948966, 0.0]
+
+[[joints]]
+name = "track"
+type = "prismatic"
+a_m = 0.0
+d_m = 0.0
+alpha_deg = -90.0
+offset_deg = 90.0
+mass_kg = 40.0
+q_min_m = 0.0
+q_max_m = 3.0
+force_max_N = 2000.0
+
+"""
+"""A track along x of the base, 0.3 m above it; the arm stands upright on it."""
+GANTRY = """<robot name="gantry"><link name="base_link"/>
+<joint name="x" type="prismatic"><origin xyz="0 0 2.5"/><parent link="base_link"/>
+<child link="bridge"/><axis xyz="1 0 0"/><limit lower="-2" upper="2" effort="3000" velocity="1"/>
+</joint><link name="bridge"/>
+<joint name="y" type="prismatic"><parent link="bridge"/><child link="carriage"/>
+<axis xyz="0 1 0"/><limit lower="-1" upper="1" effort="2000" velocity="1"/></joint>
+<link name="carriage"/>
+<joint name="z" type="prismatic"><parent link="carriage"/><child link="column"/>
+<axis xyz="0 0 -1"/><limit lower="0" upper="1.2" effort="2000" velocity="1"/></joint>
+<link name="column"><inertial><origin xyz="0 0 -0.4"/><mass value="30"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="c" type="revolute"><origin xyz="0.1 0 -0.8"/><parent link="column"/>
+<child link="head"/><axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="80" velocity="1"/>
+</joint><link name="head"/>
+<joint name="a" type="revolute"><origin xyz="0 0 -0.2" rpy="1.2 0.3 0"/><parent link="head"/>
+<child link="wrist"/><axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="60" velocity="1"/>
+</joint><link name="wrist"/>
+<joint name="f" type="fixed"><origin xyz="0 0.05 -0.15"/><parent link="wrist"/>
+<child link="tool0"/></joint><link name="tool0"/></robot>
+"""
+LIFT = """<robot name="lift"><link name="base_link"/>
+<joint name="first" type="prismatic"><parent link="base_link"/><child link="a"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.5" effort="900" velocity="1"/></joint><link name="a"/>
+<joint name="second" type="prismatic"><origin xyz="0 0 0.4"/><parent link="a"/><child link="b"/>
+<axis xyz="0 0 1"/><limit lower="0" upper="0.6" effort="900" velocity="1"/>
+<mimic joint="first" multiplier="1.0" offset="0.1"/></joint><link name="b"/>
+<joint name="turn" type="revolute"><origin xyz="0.2 0 0"/><parent link="b"/><child link="c"/>
+<axis xyz="0 1 0"/><limit lower="-2" upper="2" effort="90" velocity="1"/></joint>
+<link name="c"/><joint name="f" type="fixed"><origin xyz="0.3 0 0"/><parent link="c"/>
+<child link="tool0"/></joint><link name="tool0"/></robot>
+"""
+"""A column of two stages, of which the upper one is taken along."""
+
+
+def track(folder: Path, change: tuple[str, str] = ("", "")) -> Arm:
+    rows = (configs_dir() / "robots" / "ur10e.toml").read_text()
+    text = TRACK + rows[rows.index("[[joints]]") :]
+    (folder / "track.toml").write_text(text.replace(*change, 1) if change[0] else text)
+    return load_arm("track.toml", folder)
+
+
+def from_urdf(folder: Path, text: str) -> Arm:
+    (folder / "arm.urdf").write_text(text)
+    return arm_from_urdf(folder / "arm.urdf")
+
+
+def test_a_track_carries_the_arm_along(tmp_path: Path) -> None:
+    arm, alone = track(tmp_path), load_arm("ur10e")
+    assert arm.units == ("m", *("rad",) * 6)
+    q = np.random.default_rng(1).uniform(-2.0, 2.0, (10, 7))
+    carried, stands = evaluate(arm, q), evaluate(alone, q[:, 1:])
+    turned = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # about z, by offset
+    shift = np.column_stack([q[:, 0], np.zeros(10), np.full(10, 0.3)])
+    expected = stands.position[-1] @ turned.T + shift
+    np.testing.assert_allclose(carried.position[-1], expected, rtol=0, atol=1e-12)
+    assert arm.reach == pytest.approx(alone.reach + 3.0 + 0.3)
+
+
+def test_a_gantry_is_that_of_its_urdf(tmp_path: Path) -> None:
+    arm = from_urdf(tmp_path, GANTRY)
+    assert arm.slides.tolist() == [True, True, True, False, False]
+    assert arm.torque_max.tolist() == [3000, 2000, 2000, 80, 60]
+    model = pin.buildModelFromXML(GANTRY)
+    data = model.createData()
+    q = np.random.default_rng(2).uniform(-1.0, 1.0, (10, 5))
+    found = evaluate(arm, q)
+    for i in range(10):
+        pin.framesForwardKinematics(model, data, q[i])
+        tool = data.oMf[model.getFrameId("tool0")]
+        np.testing.assert_allclose(found.position[-1, i], tool.translation, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(found.rotation[-1, i], tool.rotation, rtol=0, atol=1e-12)
+
+
+def test_a_column_of_two_stages_moves_by_both(tmp_path: Path) -> None:
+    arm = from_urdf(tmp_path, LIFT)
+    assert arm.own.tolist() == [True, False, True]
+    q = arm.complete(np.array([[0.2, np.nan, 0.0], [0.5, np.nan, 0.0]]))
+    np.testing.assert_allclose(q[:, 1], [0.3, 0.6])
+    np.testing.assert_allclose(evaluate(arm, q).position[-1][:, 2], [0.9, 1.5], atol=1e-12)
+    # one drive lifts both stages, and bears what hangs on them twice
+    np.testing.assert_allclose(arm.drive_torques(np.array([[-10.0, -10.0, 0.0]]))[0, 0], -20.0)
+
+
+@pytest.mark.parametrize("kind", ["track", "gantry"])
+def test_exports_are_the_arm_again(tmp_path: Path, kind: str) -> None:
+    arm = track(tmp_path) if kind == "track" else from_urdf(tmp_path, GANTRY)
+    q = np.random.default_rng(3).uniform(-1.0, 1.0, (8, arm.n))
+    there = evaluate(arm, q)
+    (tmp_path / "out.urdf").write_text(urdf(arm))
+    back = arm_from_urdf(tmp_path / "out.urdf")
+    assert back.slides.tolist() == arm.slides.tolist()
+    np.testing.assert_allclose(back.q_max, arm.q_max)
+    np.testing.assert_allclose(evaluate(back, q).position[-1], there.position[-1], atol=1e-12)
+    for convention in ("standard", "modified"):
+        rows = dh_rows(arm, convention)  # type: ignore[arg-type]
+        poses = flange_poses(rows, q)
+        np.testing.assert_allclose(poses[:, :3, 3], there.position[-1], rtol=0, atol=1e-9)
+        (tmp_path / "rows.toml").write_text(to_toml(rows, arm, "again"))
+        again = load_arm("rows.toml", tmp_path)
+        assert again.units == arm.units
+        np.testing.assert_allclose(evaluate(again, q).position[-1], there.position[-1], atol=1e-9)
+        np.testing.assert_allclose(again.torque_max, arm.torque_max)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("q_max_m = 3.0\n", ""), "q_min_m and q_max_m are missing; a prismatic joint needs both"),
+        (("q_max_m = 3.0", "q_max_m = -1.0"), "q_min_m = 0.0 must be less than q_max_m = -1.0"),
+        (("force_max_N", "torque_max_Nm"), "torque_max_Nm of a prismatic joint; valid: q_min_m"),
+        (('type = "prismatic"\n', ""), "q_min_m of a revolute joint; valid: q_min_deg"),
+        (('"prismatic"', '"sliding"'), "type"),
+        (("payload", "joint_offset_deg = [5, 0, 0, 0, 0, 0, 0]\npayload"), "of joint 1, which sl"),
+        (
+            ("payload", "joint_coupling = [{ joint = 2, follows = 1 }]\npayload"),
+            "of joints 2 and 1 one slides and one turns",
+        ),
+    ],
+)
+def test_a_wrong_slide_is_refused(tmp_path: Path, change: tuple[str, str], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        track(tmp_path, change)
+
+
+def test_an_effect_of_slides_needs_one() -> None:
+    cell = cell_from_config(CellConfig.model_validate({"robot": {"model": "ur10e"}}))
+    states = hc.States(q=np.zeros((2, 6)), wrench=np.zeros((2, 6)))
+    with pytest.raises(InputError, match="guide_error: no joint of ur10e slides"):
+        installed().make("guide_error", cell, states)
+
+
+def test_joints_that_turn_and_slide_share_no_compliance(tmp_path: Path) -> None:
+    cell = cell_from_config(track_config(), tmp_path) if track(tmp_path) else None
+    assert cell is not None
+    states = hc.States(q=np.zeros((2, 7)), wrench=np.zeros((2, 6)))
+    units = [p.unit for p in installed().make("joint_compliance", cell, states).parameters]
+    assert units == ["m/N", *("rad/(N·m)",) * 6]
+    with pytest.raises(InputError, match="joints 1-2 turn and slide, and share a parameter in rad"):
+        _ = installed().make("joint_compliance", cell, states, {"joints": "1-2"}).parameters
+
+
+# --- campaigns ------------------------------------------------------------------------------
+
+
+def track_config(**more: object) -> CellConfig:
+    return CellConfig.model_validate(
+        {
+            "robot": {"model": "track.toml"},
+            "tool": {
+                "target_m": [0.06, 0.02, 0.12], "load_point_m": [0.06, 0.0, 0.1],
+                "mass_kg": 0.3, "com_m": [0.01, 0.0, 0.04],
+            },
+            "repeatability": {"joint_std_rad": 1e-5},
+            "loads": [{"name": "10kg", "mass_kg": 10.0},
+                      {"name": "pull", "force_N": [300.0, 60.0, 0.0]}],
+            "planning": {"readings": "absolute"},
+            **more,
+        }
+    )  # fmt: skip
+
+
+def spread_plan(arm: Arm, poses: int) -> Plan:
+    """Poses spread over the travel and over what the joints turn."""
+    rng = np.random.default_rng(8)
+    low, high = arm.usual_range
+    q = rng.uniform(0.6 * low, 0.6 * high, (poses, arm.n))
+    q[:, 0] = rng.permutation(np.linspace(low[0], high[0], poses))
+    names = tuple(f"p{k}" for k in range(poses))
+    steps = tuple(Step(p, load, 0) for load in ("none", "10kg", "pull") for p in names)
+    return Plan(names, q, steps)
+
+
+def campaign(folder: Path, hidden: str, seed: int, poses: int = 36) -> tuple[Rehearsal, Cell]:
+    arm = track(folder)
+    config = track_config(simulation={"strength_sigma": 3.0})
+    plan = spread_plan(arm, poses)
+    case = case_of_plan(config, plan, hidden, seed, installed(), folder)
+    return read_plan(case, plan, [seed, 1]), cell_from_config(config, folder)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path: Path, seed: int) -> None:
+    r, cell = campaign(tmp_path, "guide_error", seed)
+    path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
+    assert path.verdict == "adequate"
+    assert path.fit.model.named == ("base_frame", "joint_compliance", "guide_error")
+    assert path.fit.variance_factor == pytest.approx(1.0, abs=0.25)
+    guide = [p for p in path.fit.parameters if p.name.startswith("guide_error.j1.")]
+    assert len(guide) == 19
+    assert {p.unit for p in guide} == {"m", "rad"}
+    off = np.array([(p.value - r.world.truth[p.name]) / p.std for p in guide])
+    # 19 standard normal numbers: chi² beyond 43.8, or any beyond 4.2, is rarer than 1 in 1000
+    assert np.sum(off**2) < 43.8
+    assert np.abs(off).max() < 4.2
+    # poses left out are predicted as well as the noise allows
+    assert path.fit.holdout.rms_sigma < 1.3
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_a_good_rail_nothing_is_named(tmp_path: Path, seed: int) -> None:
+    r, cell = campaign(tmp_path, "nothing", seed)
+    path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
+    assert path.verdict == "adequate"
+    assert path.fit.model.named == ("base_frame", "joint_compliance")
+    slide = next(p for p in path.fit.parameters if p.name == "joint_compliance.j1")
+    assert slide.unit == "m/N"
+    true = r.world.truth["joint_compliance.j1"]
+    assert abs(slide.value - true) < 4 * slide.std
+    assert slide.std < true  # a pull of 300 N along a drive of 25 N/µm
+
+
+def test_a_table_of_a_rail_comes_back_and_is_checked(tmp_path: Path) -> None:
+    r, cell = campaign(tmp_path, "nothing", 1, 6)
+    write_table(r.readings, tmp_path / "t.csv", units=cell.arm.units)
+    with (tmp_path / "t.csv").open() as file:
+        header = next(csv.reader(file))
+    assert header[3:10] == ["q1_m", *(f"q{k}_rad" for k in range(2, 8))]
+    back = read_table(tmp_path / "t.csv", cell.arm, None)
+    np.testing.assert_array_equal(back.states.q, r.readings.states.q)
+    text = (tmp_path / "t.csv").read_text()
+    (tmp_path / "rad.csv").write_text(text.replace("q1_m", "q1_rad"))
+    with pytest.raises(InputError, match="unknown column 'q1_rad'; this joint slides: 'q1_m'"):
+        read_table(tmp_path / "rad.csv", cell.arm, None)
+    q = r.readings.states.q * np.array([1000.0, *[1.0] * 6])
+    far = replace(r.readings, states=replace(r.readings.states, q=q))
+    write_table(far, tmp_path / "mm.csv", units=cell.arm.units)
+    with pytest.raises(InputError, match=r"m is beyond the limits of track .* 0 to 3 m \(looks li"):
+        read_table(tmp_path / "mm.csv", cell.arm, None)
+
+
+def test_a_foreign_table_with_a_rail_goes_through_the_commands(
+    tmp_path: Path, capsys: Capsys
+) -> None:
+    """From a table in mm and degrees to corrected joint values, by the commands alone."""
+    r, _ = campaign(tmp_path, "guide_error", 5, 30)
+    s = r.readings
+    rows = [["name", "E1 mm", *(f"A{k}" for k in range(1, 7)), "X", "Y", "Z", "weight"]]
+    for k in range(len(s)):
+        if s.load_names[s.load[k]] == "pull":
+            continue
+        q = s.states.q[k]
+        joints = [1e3 * q[0], *np.degrees(q[1:])]
+        kg = 10.0 if s.load[k] else 0.0
+        figures = [*joints, *(1e3 * s.value[k]), kg]
+        rows.append([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
+    with (tmp_path / "theirs.csv").open("w", newline="") as file:
+        csv.writer(file).writerows(rows)
+    (tmp_path / "map.toml").write_text(
+        """pose.column = "name"
+[joints]
+columns = ["E1 mm", "A1", "A2", "A3", "A4", "A5", "A6"]
+unit = "deg"
+slide_unit = "mm"
+[position]
+columns = ["X", "Y", "Z"]
+unit = "mm"
+[hung_mass]
+column = "weight"
+"""
+    )
+    (tmp_path / "cell.toml").write_text(
+        """[robot]
+model = "track.toml"
+[tool]
+target_m = [0.06, 0.02, 0.12]
+load_point_m = [0.06, 0.0, 0.1]
+mass_kg = 0.3
+com_m = [0.01, 0.0, 0.04]
+[repeatability]
+joint_std_rad = 1e-5
+"""
+    )
+    run = tmp_path / "run.hilcal"
+    ok(capsys, "import", tmp_path / "theirs.csv", "--config", tmp_path / "cell.toml",
+       "--format", tmp_path / "map.toml", "-o", run)  # fmt: skip
+    found = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
+    assert found["verdict"] == "adequate"
+    assert "guide_error" in found["revisions"][-1]["model"]
+    points = tmp_path / "points.csv"
+    points.write_text(
+        "pose,q1_mm,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,q7_deg\na,1500,0,-60,80,-90,-70,5\n"
+    )
+    out = ok(capsys, "compensate", run, points, "-o", tmp_path / "q.csv", "--json").document
+    (point,) = out["points"]
+    assert abs(point["q_corrected"][0] - 1.5) < 5e-3
+    header = (tmp_path / "q.csv").read_text().splitlines()[0]
+    assert header.startswith("pose,q1_m,q2_rad")
+    ok(capsys, "report", run, "-o", tmp_path / "r.html")
+    page = (tmp_path / "r.html").read_text()
+    assert "joint 1 travel" in page
+    ok(capsys, "export", run, "--urdf", tmp_path / "corrected.urdf")
+    assert arm_from_urdf(tmp_path / "corrected.urdf").slides[0]
+    points.write_text("pose,q1_m,q2_rad\na,1,0\n")
+    said = refused(capsys, 2, "compensate", run, points)
+    assert "column 'q3_rad' is missing beside its group" in said
+
+
+def test_the_jacobian_of_a_fitted_rail_is_the_difference_of_predictions(tmp_path: Path) -> None:
+    r, cell = campaign(tmp_path, "guide_error", 1, 6)
+    states = r.readings.states
+    names = ("joint_compliance", "joint_tilt_compliance", "guide_error", "transmission_error")
+    model = Model(cell, tuple(installed().make(n, cell, states) for n in names))
+    scale = np.array([p.scale for e in model.effects for p in e.parameters])
+    theta = scale * np.random.default_rng(4).normal(size=model.size)
+    theta[:7] = np.abs(theta[:7])
+    derived = model.jacobian(model.predict(states, theta), theta, 3) * scale
+    for k in range(model.size):
+        h = np.zeros(model.size)
+        h[k] = 0.1 * scale[k]
+        ends = [model.predict(states, theta + s * h).observation.position for s in (1, -1)]
+        numeric = (ends[0] - ends[1]) / 0.2
+        np.testing.assert_allclose(
+            derived[:, :, k], numeric, rtol=0, atol=1e-6 * np.abs(derived).max()
+        )
+
+
+def plain_table(folder: Path, header: list[str], mirrored: bool = False) -> Path:
+    """Unloaded positions in mm, joints in degrees, the travel in mm; perhaps counted backwards."""
+    r, _ = campaign(folder, "nothing", 2, 24)
+    s = r.readings
+    with (folder / "theirs.csv").open("w", newline="") as file:
+        out = csv.writer(file)
+        out.writerow(["pose", *header, "X", "Y", "Z"])
+        for k in np.flatnonzero(s.load == 0):
+            q = s.states.q[k]
+            travel = 3.0 - q[0] if mirrored else q[0]
+            joints = [1e3 * travel, *np.degrees(q[1:])]
+            figures = [*joints, *(1e3 * s.value[k])]
+            out.writerow([s.pose_names[s.pose[k]], *(f"{x:.6f}" for x in figures)])
+    cell = '[robot]\nmodel = "track.toml"\n[tool]\ntarget_m = [0.06, 0.02, 0.12]\n'
+    (folder / "cell.toml").write_text(cell)
+    return folder / "theirs.csv"
+
+
+@pytest.mark.parametrize(
+    "header", [["E1", *(f"A{k}" for k in range(1, 7))], [f"J{k}" for k in range(1, 8)]]
+)
+def test_a_preview_sees_the_travel_in_mm(tmp_path: Path, capsys: Capsys, header: list[str]) -> None:
+    """Also that of an external axis, which controllers name apart from the arm's."""
+    table = plain_table(tmp_path, header)
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
+    assert 'slide_unit = "mm"' in mapping.read_text()
+    ok(capsys, "import", table, "--config", cell, "--format", mapping, "-o", run)
+    with hc.Campaign.open(run) as campaign_:
+        q = campaign_.readings.states.q
+    assert 2.9 < np.ptp(q[:, 0]) <= 3.0
+    assert np.abs(q[:, 1:]).max() < 2 * np.pi
+
+
+def test_a_travel_that_is_counted_backwards_is_named(tmp_path: Path, capsys: Capsys) -> None:
+    table = plain_table(tmp_path, [f"J{k}" for k in range(1, 8)], mirrored=True)
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    mapping = tmp_path / "m.toml"
+    ok(capsys, "import", table, "--config", cell, "--preview", "-o", mapping)
+    said = ok(capsys, "import", table, "--config", cell, "--format", mapping, "-o", run)
+    words = " ".join((said.out + said.err).split())
+    assert "joint_sign = [-1, 1, 1, 1, 1, 1, 1]" in words
