@@ -32,6 +32,8 @@ class Cell:
         config: the configuration that the cell was made from: instruments, loads, limits; None
             for a cell that was made from numbers alone.
         base_dir: directory that relative paths in `config` refer to.
+        measured_torques: whether effects take the joint torques that were measured, where readings
+            have them, in place of those of the described masses and loads.
         targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
             `target` is the first of them. None where the tool carries one.
         target_names: their names.
@@ -49,6 +51,7 @@ class Cell:
     target_known: bool
     config: CellConfig | None = None
     base_dir: Path = Path()
+    measured_torques: bool = False
     targets: Floats | None = None
     target_names: tuple[str, ...] = ()
     targets_known: tuple[bool, ...] = ()
@@ -154,6 +157,7 @@ def cell_from_config(
         target_known=all(known),
         config=config,
         base_dir=base_dir or Path(),
+        measured_torques=robot.torques == "measured",
         targets=poses if len(poses) > 1 else None,
         target_names=tuple(t.name for t in tool.targets),
         targets_known=known if len(poses) > 1 else (),

@@ -74,7 +74,8 @@ class Learnt:
         check_numbers("prior", self.prior, (model.size,), least=0.0)
         check_numbers("noise", self.noise, least=0.0)
         check_numbers("factor", self.factor, least=0.0)
-        widths = {"q": n, "wrench": 6, "joint_temperature": n, "approach": n, "q_actual": n}
+        widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
+        widths |= {"wrench": 6}
         for f in fields(States):
             values = getattr(r.states, f.name)
             if values is not None:

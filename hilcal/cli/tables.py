@@ -13,12 +13,14 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import Registration, register
 from hilcal.identification.table_preview import preview_table
+from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import target_words
 from hilcal.present.preparing import import_preview
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, other_arm_line, registration_lines
+from hilcal.present.torques import torque_lines
 from hilcal.readings.readings import Readings
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file
@@ -77,6 +79,8 @@ def import_(
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
     t.show(Words(note, indent=2) for note in notes)
+    torques = check_torques(cell, readings)
+    t.show(Words(line, indent=2) for line in torque_lines(torques))
     registered = _registered(cell, readings)
     wrong = None if registered is None else examine(registered, readings)
     if registered is not None and not (wrong is not None and wrong.refused):
@@ -103,6 +107,7 @@ def import_(
             "notes": list(notes),
             "description": None if wrong is None else wrong.to_json(cell, readings),
             "other_arm": None if other is None else other.to_json(),
+            "torques": None if torques is None else torques.to_json(),
             "frames": None if registered is None else registered.to_json(),
         }
     )

@@ -68,6 +68,11 @@ class Robot(Conventions):
         examples=["192.168.56.101"],
     )
     options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
+    torques: Literal["modelled", "measured"] = Field(
+        "modelled",
+        description='"modelled" or "measured": the joint torques that twist the drives, those of '
+        "the described masses and loads, or the columns tau1_Nm, ... of the readings",
+    )
     base_link: str | None = Field(
         None, description="the name of a link of the URDF", examples=["base_link"]
     )

@@ -87,8 +87,18 @@ class Situation:
         return self.states.q if self.states.q_actual is None else self.states.q_actual
 
     @property
+    def torque_measured(self) -> bool:
+        """Whether the torques are those that were measured, which no change of a load changes."""
+        return self.cell.measured_torques and self.states.torque is not None
+
+    @property
     def torque(self) -> Floats:
-        """(N, n) static torques that the drives carry, N·m; about the axes unless coupled."""
+        """(N, n) static torques that the drives carry, N·m; about the axes unless coupled.
+
+        As measured where the cell says so (`Cell.measured_torques`) and they were.
+        """
+        if self.torque_measured and self.states.torque is not None:
+            return -self.states.torque
         return self.cell.arm.drive_torques(self.wrench[:, :-1, 5])
 
 

@@ -13,6 +13,7 @@ from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.misdescription import refuse_misdescribed
 from hilcal.identification.registration import register
 from hilcal.identification.rigid_frames import TARGET_M, TELL
+from hilcal.identification.torques import require_torques
 from hilcal.identification.weight import loads_differ, weight_missing
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -93,6 +94,7 @@ def with_effects(
     if prior is not None:
         check_prior(prior, cell.arm, readings)
         learnt = {e.name: e.options for e in prior.posterior.effects}
+    require_torques(cell, readings)
     registered = register(cell, readings)
     refuse_misdescribed(registered, readings)
     model = Model(registered.cell, (), known, readings, prior)

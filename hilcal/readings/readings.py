@@ -27,6 +27,8 @@ class States:
         joint_temperature: (N, n) °C.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
+        torque: (N, n) static torques that the drives were measured to exert, N·m: those of load
+            and weight about the drives' axes (`Situation.torque`) with the other sign.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
     """
@@ -39,6 +41,7 @@ class States:
     joint_temperature: Floats | None = None
     approach: Floats | None = None
     q_actual: Floats | None = None
+    torque: Floats | None = None
     target: Ints | None = None
 
     def __len__(self) -> int:

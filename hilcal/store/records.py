@@ -23,6 +23,7 @@ _STATE = {
     "joint_temperature": 2,
     "approach": 2,
     "q_actual": 2,
+    "torque": 2,
     "target": 1,
 }
 

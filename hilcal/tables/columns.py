@@ -45,6 +45,11 @@ def approach_columns(n: int) -> tuple[str, ...]:
     return tuple(f"approach{i}" for i in range(1, n + 1))
 
 
+def torque_columns(n: int) -> tuple[str, ...]:
+    """Columns of the static torques that the drives were measured to exert, N·m."""
+    return tuple(f"tau{i}_Nm" for i in range(1, n + 1))
+
+
 def covariance_columns(m: int) -> tuple[str, ...]:
     """Columns of the upper triangle of an (m, m) covariance, row by row."""
     return tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i in range(m) for j in range(i, m))
@@ -57,7 +62,8 @@ def required_columns(n: int) -> tuple[str, ...]:
 
 def groups(n: int) -> tuple[tuple[str, ...], ...]:
     """Optional columns of which a table has all or none."""
-    return ROTATION, temperature_columns(n), approach_columns(n), actual_columns(n)
+    own = (temperature_columns, approach_columns, actual_columns, torque_columns)
+    return ROTATION, *(of(n) for of in own)
 
 
 def known_columns(n: int) -> tuple[str, ...]:

@@ -25,6 +25,8 @@ FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
+LARGEST_NM = 1e5
+"""No joint of an arm carries as much, N·m."""
 FORM = FileFormat(encoding="utf-8")
 
 
@@ -270,6 +272,7 @@ def _states(table: Table, arm: Arm) -> States:
     temperature = _group(table, columns.temperature_columns(n))
     approach = _group(table, columns.approach_columns(n))
     actual = _group(table, columns.actual_columns(n))
+    torque = _group(table, columns.torque_columns(n))
     if approach is not None:
         names = columns.approach_columns(n)
         table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
@@ -277,6 +280,8 @@ def _states(table: Table, arm: Arm) -> States:
         checks.check_actual_joints(table, columns.actual_columns(n), actual, q)
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
+    if torque is not None:
+        _in_range(table, columns.torque_columns(n), -LARGEST_NM, LARGEST_NM, "N·m")
     if "air_degC" in number:
         _in_range(table, ("air_degC",), -50, 80, "°C")
     if "time_s" in number:
@@ -292,6 +297,7 @@ def _states(table: Table, arm: Arm) -> States:
         joint_temperature=temperature,
         approach=approach,
         q_actual=actual,
+        torque=torque,
     )
 
 
@@ -421,6 +427,7 @@ def _number_columns(readings: Readings) -> tuple[list[str], list[Floats | Ints]]
         (columns.temperature_columns(n), s.joint_temperature),
         (columns.approach_columns(n), s.approach),
         (columns.actual_columns(n), s.q_actual),
+        (columns.torque_columns(n), s.torque),
     ]
     header: list[str] = []
     numbers: list[Floats | Ints] = []
