@@ -8,6 +8,7 @@ from pydantic import Field, Strict, model_validator
 
 from hilcal.config.joints import Conventions
 from hilcal.config.loads import Limits, Load
+from hilcal.config.observers import Gauge, Point
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
     OPTIONS,
@@ -325,6 +326,16 @@ class CellConfig(Section):
         (), description="sections [[obstacles]], one per thing that stands in the arm's way"
     )
     sight: Sight = Field(default_factory=Sight, description="a section [sight]")
+    points: dict[str, Point] = Field(
+        default_factory=dict,
+        description="sections [points.NAME], one per point that distances are measured from",
+        examples=[{"P1": {"position_m": [1.2, 0.4, 0.0]}}],
+    )
+    gauges: dict[str, Gauge] = Field(
+        default_factory=dict,
+        description="sections [gauges.NAME], one per dial gauge or plane that is touched",
+        examples=[{"G1": {"direction": [0.0, 0.0, 1.0]}}],
+    )
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
     ordinary: dict[str, Positive] = Field(
         default_factory=dict,

@@ -27,9 +27,9 @@ from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
-Field = Literal["dq", "twist", "base", "station", "target", "scale"]
-Role = Literal["registration", "target", "baseline", "effect"]
-FRAME_ROLES: tuple[Role, ...] = ("registration", "target")
+Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
+Role = Literal["registration", "target", "observer", "baseline", "effect"]
+FRAME_ROLES: tuple[Role, ...] = ("registration", "target", "observer")
 OWN_SPREAD = 0.7
 """Of the logarithm of a pool's standard deviation, beside what is shared; a choice."""
 
@@ -111,7 +111,8 @@ class Columns:
         parameter: (P,) indices of the parameters within the effect; one that moves several
             elements occurs several times.
         element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
-        values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
+        values: (N, P) for dq and scale, (N, P, 7) for observer, (N, P, 6) for the others; N may
+            be 1 (constant).
     """
 
     field: Field
@@ -180,10 +181,11 @@ class Effect(ABC):
                 six parameters are a twist of the base, in base axes.
             "target": every model while the target's place on the flange is unknown; its first
                 three parameters are a displacement of the target, flange axes.
+            "observer": every model while the place of one of several observers is unknown.
             "baseline": every starting model where a load acts.
             "effect": none; it is added by name, or where a diagnosis finds it missing.
             An effect that is not of the last role is never removed by a diagnosis. Those of the
-            first two take the options `prior_m` and `prior_rad`.
+            first three take the options `prior_m` and `prior_rad`.
         for_missing_weight: whether a starting model has the effect where the arm is described
             without masses and the readings tell what its weight does.
         plausible: standard deviation of the parameters over arms and cells as they are, in their

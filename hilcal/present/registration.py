@@ -1,6 +1,7 @@
 """Where base and target are, what the poses could not tell, and what a covariance consists of."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -83,6 +84,11 @@ def undetermined_lines(found: Registration) -> Iterator[str]:
 
 def _told(u: Undetermined, names: tuple[str, ...]) -> str:
     own = "" if u.target is None or not names else f" {names[u.target]}"
+    moved = " and ".join(u.observers)
+    if moved:
+        others = _told(replace(u, observers=()), names)
+        alone = not np.any(u.base_shift) and not np.any(u.base_turn) and u.target is None
+        return f"the place of {moved}" if alone else f"the place of {moved} from {others}"
     moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
     base = _moves(u.base_shift, u.base_turn, "the base's", "its")
     if not moved:

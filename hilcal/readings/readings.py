@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 
@@ -9,6 +10,7 @@ from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.types import Bools, Floats, Ints
 
+ObserverKind = Literal["station", "point", "gauge"]
 SAME_POSE = 1e-6
 """Commanded joints of one pose agree to this, rad."""
 
@@ -31,6 +33,8 @@ class States:
             and weight about the drives' axes (`Situation.torque`) with the other sign.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
+        observer: (N,) number of what observes, in the order of `Readings.observers`; None where one
+            tracker reads all.
     """
 
     q: Floats
@@ -43,6 +47,7 @@ class States:
     q_actual: Floats | None = None
     torque: Floats | None = None
     target: Ints | None = None
+    observer: Ints | None = None
 
     def __len__(self) -> int:
         """Return the number of states N."""
@@ -61,9 +66,30 @@ class States:
         return replace(parts[0], **columns)
 
 
+@dataclass(frozen=True, slots=True)
+class ObserverName:
+    """What observes the target.
+
+    Attributes:
+        kind: "station" reads positions or poses, "point" the distance from a point, "gauge" the
+            height over a plane.
+        name: of it.
+    """
+
+    kind: ObserverKind
+    name: str
+
+    def __str__(self) -> str:
+        """Return both."""
+        return f"{self.kind} {self.name}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
     """N readings of the target's position (m = 3) or pose (m = 6), one per state.
+
+    A distance or a height is one number: the first element of a reading of m = 3, whose others are
+    0 and have no variance, so that whitening leaves them out (`whitening.inverse_root`).
 
     Attributes:
         states: the N states.
@@ -76,6 +102,7 @@ class Readings:
         load_names: names of the loads.
         pose_names: names of the poses, as in the table.
         target_names: names of the targets that `states.target` numbers; empty where it is None.
+        observers: what `states.observer` numbers; empty where it is None.
         common: (N, m, n) factors F of the error that all readings of one arrival have in common:
             Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
             is part of `covariance`. None where no such error is known.
@@ -100,6 +127,7 @@ class Readings:
     load_names: tuple[str, ...]
     pose_names: tuple[str, ...]
     target_names: tuple[str, ...] = ()
+    observers: tuple[ObserverName, ...] = ()
     common: Floats | None = None
     scatter_stated: bool = True
     noise_stated: bool = True
@@ -178,14 +206,33 @@ class Readings:
         return np.zeros(len(self), dtype=np.int64) if given is None else given
 
     @property
+    def observer(self) -> Ints:
+        """(N,) number of what observes; 0 where one tracker reads all."""
+        given = self.states.observer
+        return np.zeros(len(self), dtype=np.int64) if given is None else given
+
+    @property
+    def scalar(self) -> Bools:
+        """(N,) which readings are one number: a distance or a height."""
+        one = [k for k, o in enumerate(self.observers) if o.kind != "station"]
+        return np.isin(self.observer, one) & (len(one) > 0)
+
+    @property
+    def line(self) -> Ints:
+        """(N,) number of the pair of target and observer, of which deflections are taken."""
+        if self.states.observer is None:
+            return self.target
+        return self.target * max(len(self.observers), 1) + self.observer
+
+    @property
     def arrivals(self) -> Ints:
         """(N,) number of the arrival of the arm in which each reading was taken.
 
-        Readings of different targets at one pose, under one load, in one cycle are of one arrival:
-        the arm did not move between them. A target that was read several times there was read in
-        as many arrivals, in the order of the readings.
+        Readings of different targets, or by different observers, at one pose, under one load, in
+        one cycle are of one arrival: the arm did not move between them. A target that was read
+        several times there was read in as many arrivals, in the order of the readings.
         """
-        keys = np.stack([self.pose, self.load, self.cycle, self.target], axis=1)
+        keys = np.stack([self.pose, self.load, self.cycle, self.line], axis=1)
         _, of = np.unique(keys, axis=0, return_inverse=True)
         of = of.reshape(-1)
         order = np.argsort(of, kind="stable")

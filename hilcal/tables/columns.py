@@ -18,6 +18,9 @@ TEXT = ("pose", "load")
 TARGET = "target"
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 COVERS = "covers"
+STATION = "station"
+ONE = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
+"""Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
 AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
@@ -60,6 +63,14 @@ def required_columns(n: int) -> tuple[str, ...]:
     return (*TEXT, *joint_columns(n), *POSITION)
 
 
+def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
+    """Columns of numbers that rows may leave empty: readings, where a table has several kinds."""
+    one = [c for kind in ONE.values() for c in (kind[0], kind[2])]
+    if not any(kind[0] in header for kind in ONE.values()):
+        return ()
+    return (*POSITION, *ROTATION, *covariance_columns(6), *one)
+
+
 def groups(n: int) -> tuple[tuple[str, ...], ...]:
     """Optional columns of which a table has all or none."""
     own = (temperature_columns, approach_columns, actual_columns, torque_columns)
@@ -72,6 +83,8 @@ def known_columns(n: int) -> tuple[str, ...]:
         *required_columns(n),
         TARGET,
         COVERS,
+        STATION,
+        *(name for kind in ONE.values() for name in kind),
         *covariance_columns(6),
         *WRENCH,
         *("cycle", "time_s", "load_time_s", "air_degC"),
@@ -105,7 +118,11 @@ def check_header(
         if count > 1:
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     known = known_columns(n)
-    missing = [c for c in required_columns(n) if c not in header and c not in spare]
+    needed = required_columns(n)
+    if sparse_columns(header):
+        needed = needed if POSITION[0] in header else needed[:-3]
+        _check_one(path, header)
+    missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
@@ -122,6 +139,21 @@ def check_header(
                 f"{path}: column '{lacking[0]}' is missing; give all of "
                 f"{', '.join(group)} or none of them"
             )
+
+
+def _check_one(path: str, header: Sequence[str]) -> None:
+    """Refuse distances and heights without the name of what they are of, or beside orientations."""
+    for value, name, variance in ONE.values():
+        for other in (name, variance):
+            if other in header and value not in header:
+                raise InputError(f"{path}: column '{other}' without column '{value}'")
+        if value in header and name not in header:
+            raise InputError(f"{path}: column '{name}' is missing; it names what '{value}' is of")
+    if ROTATION[0] in header:
+        raise InputError(
+            f"{path}: column '{ROTATION[0]}': a table of distances or heights has positions beside "
+            "them, no orientations; give those in a table of their own"
+        )
 
 
 def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> str:

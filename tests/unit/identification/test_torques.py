@@ -1,4 +1,4 @@
-"""Measured joint torques: columns, compliances fitted to them, and the check of loads and masses."""
+"""Measured joint torques: columns, compliances by them, and the check of loads and masses."""
 
 import json
 import re
