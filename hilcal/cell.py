@@ -24,7 +24,8 @@ class Observer:
     Attributes:
         name: kind and name. A station reads p, a point |p| + offset, a gauge p_x.
         frame: (4, 4) T_observer_sensor.
-        free: what is estimated: 0 to 5 of the twist of the frame, observer's axes; 6, the offset.
+        free: what is estimated: elements of the twist of the frame, observer's axes; of a point,
+            which no turn concerns, 3 is the offset (see `Deviation.observer`).
         offset: of a distance, m.
     """
 
@@ -36,7 +37,9 @@ class Observer:
     @property
     def tied(self) -> bool:
         """Whether its place is described, so that it has axes in common with others."""
-        return not set(self.free) - {6} or (self.name.kind == "gauge" and self.free == (0,))
+        return (
+            not self.free or self.free == (3,) or (self.name.kind == "gauge" and self.free == (0,))
+        )
 
 
 def plane_frame(direction: Floats, origin: Floats) -> Floats:
@@ -147,7 +150,7 @@ class Cell:
             free = (0, 1, 2) if point.position_m is None else ()
             if point.position_m is not None:
                 frame[:3, 3] = np.negative(point.position_m)
-            return Observer(name, frame, free + (6,) * point.estimate_offset, point.offset_m)
+            return Observer(name, frame, free + (3,) * point.estimate_offset, point.offset_m)
         gauge = (self.config.gauges if self.config else {}).get(name.name, Gauge())
         if gauge.direction is None:
             return Observer(name, frame, (0, 4, 5))

@@ -277,7 +277,11 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """
     asked = config.planning.against
     if asked == "catalogue":
-        names = tuple(kind.name for kind in model.catalogue.effects if not kind.needs)
+        names = tuple(
+            kind.name
+            for kind in model.catalogue.effects
+            if not kind.needs and kind.role != "observer"
+        )
     else:
         names = checked(asked, "against", model.catalogue)
     return tuple(name for name in names if name not in model.names)

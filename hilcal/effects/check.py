@@ -41,7 +41,6 @@ NEEDS = (
     "joint_temperature",
     "approach",
     "q_actual",
-    "observer",
 )
 """Columns of `States` that readings may lack."""
 AGREES = 1e-3
@@ -205,8 +204,7 @@ def _columns(effect: Effect, s: Situation) -> None:
             _need(good, f"columns has {key} = {index!r}; expected an array (P,) of whole numbers")
             good = bool(np.all((a >= 0) & (a < most)))
             _need(good, f"columns has {key} = {a.tolist()}; valid: 0 to {most - 1}")
-        wide = {"dq": (), "scale": (), "observer": (7,)}.get(c.field, (6,))
-        per = (len(c.parameter), *wide)
+        per = (len(c.parameter),) if c.field in ("dq", "scale") else (len(c.parameter), 6)
         _array(f"columns has {c.field} values", c.values, (count, *per), (1, *per))
 
 

@@ -9,7 +9,7 @@ from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-_OF = ("x", "y", "z", "rx", "ry", "rz", "offset")
+_OF = ("x", "y", "z", "rx", "ry", "rz")
 
 
 class ObserverFrame(Effect):
@@ -24,7 +24,6 @@ class ObserverFrame(Effect):
     plausible = 20.0
     """20 mm, 20 mrad, as of `base_frame`. A choice."""
     of_setup = True
-    needs = ("observer",)
     option_help: ClassVar = PRIOR_HELP
     role = "observer"
 
@@ -38,22 +37,27 @@ class ObserverFrame(Effect):
             for element in (o.free if unknown else told[o.name.kind])
         ]
 
+    @classmethod
+    def computable(cls, states: States) -> bool:
+        """Whether several observe; a prediction without them needs none of it."""
+        return states.observer is not None
+
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """Shift, turn and offset, as far as they are unknown."""
         out = []
         for k, element in self.free:
-            o, what = self.cell.observers[k].name, _OF[element]
-            unit = "rad" if what.startswith("r") else "m"
-            kind = "offset" if element == 6 else "turn about" if unit == "rad" else "shift along"
-            meaning = f"{o}: {kind}{'' if element == 6 else f' {what[-1]}'}"
-            out.append(Parameter(f"{o.name}.{what}", unit, 1e-3, meaning))
+            o, what, unit = self.cell.observers[k].name, _OF[element], "m" if element < 3 else "rad"
+            meaning = f"turn about {what[-1]}" if element > 2 else f"shift along {what}"
+            if o.kind == "point" and element == 3:
+                what, unit, meaning = "offset", "m", "offset of the distance"
+            out.append(Parameter(f"{o.name}.{what}", unit, 1e-3, f"{o}: {meaning}"))
         return tuple(out)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
         """Unit twists of each observer, in its readings."""
         index = np.arange(len(self.free))
-        values = np.zeros((len(s.angle), len(index), 7))
+        values = np.zeros((len(s.angle), len(index), 6))
         if s.states.observer is not None:
             for p, (k, element) in enumerate(self.free):
                 away = self.cell.observers[k].name.kind == "point" and element < 3
@@ -63,4 +67,7 @@ class ObserverFrame(Effect):
     def prior_std(self) -> Floats | None:
         """Prior of shifts and turns, where given."""
         six = prior_of_lengths_and_turns(self.name, self.options, 6)
-        return None if six is None else np.append(six, six[0])[[e for _, e in self.free]]
+        if six is None:
+            return None
+        units = [p.unit for p in self.parameters]
+        return np.where([unit == "m" for unit in units], six[0], six[3])

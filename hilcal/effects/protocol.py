@@ -111,8 +111,7 @@ class Columns:
         parameter: (P,) indices of the parameters within the effect; one that moves several
             elements occurs several times.
         element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
-        values: (N, P) for dq and scale, (N, P, 7) for observer, (N, P, 6) for the others; N may
-            be 1 (constant).
+        values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
     """
 
     field: Field

@@ -18,7 +18,7 @@ def total(
 ) -> Deviation:
     """Return the deviation Σ columns_p θ_p of N states, added to one of them where it is given."""
     count, n = s.angle.shape
-    width = {"dq": (n,), "twist": (n + 1, 6), "scale": (), "observer": (7,)}
+    width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
     fields: dict[str, Floats] = {}
     for c in columns:
         field = fields.get(c.field)

@@ -41,8 +41,6 @@ GOOD, STEPS, TRIED = 10.0, 15, 5
 HOLD = 1e-3
 """Weight of an ordinary size in whitened rows: keeps what the readings do not tell where it began;
 a choice, far below what they tell."""
-OFFSET_M = 1.0
-"""Ordinary length of a bar; a choice."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,8 +94,7 @@ class Sightings:
     def sizes(self) -> Floats:
         """(K,) ordinary sizes of what is unknown: base, targets, observers."""
         base = [] if self.cell.registration_known else [BASE_M] * 3 + [1.0] * 3
-        own = {0: BASE_M, 1: BASE_M, 2: BASE_M, 6: OFFSET_M}
-        by = [own.get(e, 1.0) for o in self.cell.observers for e in o.free]
+        by = [BASE_M if e < 3 else 1.0 for o in self.cell.observers for e in o.free]
         return np.array([*base, *[TARGET_M] * 3 * int(self.targets.sum()), *by])
 
     def sensor(self, cell: Cell) -> Floats:
@@ -134,10 +131,12 @@ class Sightings:
         observers = []
         for o in cell.observers:
             own, at = x[at : at + len(o.free)], at + len(o.free)
-            seven = np.zeros(7)
-            seven[list(o.free)] = own
-            frame = se3.matrix(*se3.exp(seven[:6])) @ o.frame
-            observers.append(replace(o, frame=frame, offset=o.offset + seven[6]))
+            six = np.zeros(6)
+            six[list(o.free)] = own
+            more = six[3] if o.name.kind == "point" else 0.0
+            six[3] -= more
+            frame = se3.matrix(*se3.exp(six)) @ o.frame
+            observers.append(replace(o, frame=frame, offset=o.offset + more))
         return replace(cell.with_targets(poses), observers=tuple(observers))
 
     def white(self, cell: Cell) -> Floats:
@@ -222,14 +221,14 @@ def _point(o: Observer, p: Floats, value: Floats) -> Observer:
     """|p|² − d² = 2 p·c − |c|², d the reading less its offset, which is linear in it, too."""
     if not set(o.free) & {0, 1, 2}:
         return o
-    d = value[:, 0] - (0.0 if 6 in o.free else o.offset)
+    d = value[:, 0] - (0.0 if 3 in o.free else o.offset)
     middle = p.mean(axis=0)
     x = p - middle
-    columns = [2 * x, np.ones((len(p), 1))] + ([-2 * d[:, None]] if 6 in o.free else [])
+    columns = [2 * x, np.ones((len(p), 1))] + ([-2 * d[:, None]] if 3 in o.free else [])
     found = np.linalg.lstsq(np.hstack(columns), np.sum(x**2, axis=1) - d**2, rcond=1e-6)[0]
     frame = np.eye(4)
     frame[:3, 3] = -(found[:3] + middle)
-    return replace(o, frame=frame, offset=-float(found[4]) if 6 in o.free else o.offset)
+    return replace(o, frame=frame, offset=-float(found[4]) if 3 in o.free else o.offset)
 
 
 def _gauge(o: Observer, p: Floats, value: Floats) -> Observer:

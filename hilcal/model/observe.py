@@ -19,7 +19,7 @@ from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 ALL = slice(0, 6)
 """All elements of a twist."""
@@ -109,9 +109,10 @@ def _observed(
     """Read what is seen in sensor axes by the observers (N,)."""
     turn, own, offset = _in_own_axes(cell.observers, observer, sensor)
     if deviation.observer is not None:
-        moved_r, moved_p = se3.exp(deviation.observer[:, :6])
+        twist, more = _apart(deviation.observer, _distances(cell.observers, observer))
+        moved_r, moved_p = se3.exp(twist)
         own, turn = moved_p + se3.apply(moved_r, own), se3.product(moved_r, turn)
-        offset = offset + deviation.observer[:, 6]
+        offset = offset + more
     value, read, distance = _sensed(cell.observers, observer, own, offset)
     by_sensor = se3.product(read, turn)
     rotation, axes = se3.product(turn, rotation), se3.product(by_sensor, axes)
@@ -136,12 +137,24 @@ def _in_own_axes(
     return frame[:, :3, :3], own, np.array([o.offset for o in observers])[number]
 
 
+def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
+    """(N,) whether distances are read."""
+    return np.array([o.name.kind == "point" for o in observers])[number]
+
+
+def _apart(moved: Floats, far: Bools) -> tuple[Floats, Floats]:
+    """Twists (N, 6) and offsets (N,) of what observes, see `Deviation.observer`."""
+    twist = moved.copy()
+    twist[far, 3:] = 0.0
+    return twist, np.where(far, moved[:, 3], 0.0)
+
+
 def _sensed(
     observers: Sequence[Observer], number: Ints, own: Floats, offset: Floats
 ) -> tuple[Floats, Floats, Floats]:
     """What is read (N, 3) of positions in own axes, its derivative, and where it is a distance."""
     kind = np.array([o.name.kind for o in observers])[number]
-    far, flat = kind == "point", kind == "gauge"
+    far, flat = _distances(observers, number), kind == "gauge"
     length = np.linalg.norm(own, axis=1)
     read, value = np.tile(np.eye(3), (len(own), 1, 1)), own.copy()
     read[far | flat], value[far | flat, 1:] = 0.0, 0.0
@@ -244,15 +257,16 @@ class Motion:
         return self._as_read(moved)
 
     def by_observer(self) -> Floats:
-        """Motion (N, m, 7) by the twist of the observer's frame, and by a distance's offset."""
-        moved = zeros(len(self.dq), self.m, 7)
+        """Motion (N, m, 6) by the twist of the observer's frame, see `Deviation.observer`."""
+        moved = zeros(len(self.dq), self.m, 6)
         at, twist = self.observation, self.deviation.observer
         if at.own is not None and at.read is not None:
-            back = None if twist is None else -twist[:, :6]
+            far = np.asarray(at.distance, dtype=float)
+            back = None if twist is None else -_apart(twist, far > 0)[0]
             by = twist_jacobian(np.eye(3)[None], at.own, back)
-            moved[:, :3, :6] = at.read @ by[:, :3]
-            moved[:, 3:, :6] = by[:, 3 : self.m]
-            moved[:, 0, 6] = at.distance
+            moved[:, :3] = at.read @ by[:, :3]
+            moved[:, 3:] = by[:, 3 : self.m]
+            moved[far > 0, 0, 3:] = [1.0, 0.0, 0.0]
         return moved
 
     def _as_read(self, moved: Floats) -> Floats:
