@@ -19,7 +19,12 @@ from hilcal.present.document import Words, heading
 from hilcal.present.fit import target_words
 from hilcal.present.preparing import import_preview
 from hilcal.present.progress import working
-from hilcal.present.registration import covariance_words, other_arm_line, registration_lines
+from hilcal.present.registration import (
+    covariance_words,
+    observed_words,
+    other_arm_line,
+    registration_lines,
+)
 from hilcal.present.torques import torque_lines
 from hilcal.readings.readings import Readings
 from hilcal.tables.guessing.proposal import Proposal
@@ -70,11 +75,7 @@ def import_(
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(
-        f"  robot {settings.robot.model}; each reading is a "
-        f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
-        f"  loads: {', '.join(loads)}"
-    )
+    t.show(f"  robot {settings.robot.model}; {_kind(readings)}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
@@ -102,6 +103,7 @@ def import_(
             "elements": readings.m,
             "loads": loads,
             "targets": targets,
+            "observers": [str(name) for name in readings.observers],
             "covariance": found.parts,
             "noise": None if noise is None else asdict(noise),
             "notes": list(notes),
@@ -111,6 +113,12 @@ def import_(
             "frames": None if registered is None else registered.to_json(),
         }
     )
+
+
+def _kind(readings: Readings) -> str:
+    if readings.observers:
+        return observed_words(readings)
+    return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
 
 
 def _registered(cell: Cell, readings: Readings) -> Registration | None:

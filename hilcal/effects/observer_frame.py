@@ -69,5 +69,4 @@ class ObserverFrame(Effect):
         six = prior_of_lengths_and_turns(self.name, self.options, 6)
         if six is None:
             return None
-        units = [p.unit for p in self.parameters]
-        return np.where([unit == "m" for unit in units], six[0], six[3])
+        return np.array([six[0 if p.unit == "m" else 3] for p in self.parameters], dtype=float)

@@ -45,6 +45,8 @@ DISTURBED = 3e-3
 less. A choice, a third of what is fitted at least (`misdescription.GATE_M`)."""
 BEYOND = 10.0
 """Times the median misfit from which on a reading of several observers is far off; a choice."""
+LEAST_FAR = 1e-4
+"""Misfit that is never far off, m; a choice."""
 SEED = 0
 """Of the random subsets, so that equal readings give equal frames."""
 ROUNDS = 5
@@ -202,12 +204,12 @@ def _of_several(cell: Cell, readings: Readings) -> Registration:
             )
     found, off, null = placed(cell, readings)
     size = np.linalg.norm(off[:, :3], axis=1)
-    far = size > max(DISTURBED, BEYOND * float(np.median(size)))
+    far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
     if 0 < far.mean() <= MOST:
         found, _, null = placed(cell, readings[~far])
         off = Sightings.of(cell, readings).off(found)
         size = np.linalg.norm(off[:, :3], axis=1)
-        far = size > max(DISTURBED, BEYOND * float(np.median(size)))
+        far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
     near = off[~far]
     targets = ~np.array(cell.known_targets)
     count, base = len(targets), not cell.registration_known

@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from hilcal.errors import InputError
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.types import Bools, Floats, Ints
@@ -210,6 +211,24 @@ class Readings:
         """(N,) number of what observes; 0 where one tracker reads all."""
         given = self.states.observer
         return np.zeros(len(self), dtype=np.int64) if given is None else given
+
+    def seen_by(self, observers: Sequence[ObserverName]) -> "Readings":
+        """Return the readings with observers numbered as those of others; as they are without any.
+
+        Raises:
+            InputError: one that is not among these.
+        """
+        if self.states.observer is None or self.observers == tuple(observers):
+            return self
+        for name in self.observers:
+            if name not in observers:
+                known = ", ".join(map(str, observers)) or "one tracker"
+                raise InputError(
+                    f"{name} observed these readings, but not those that were fitted: {known}"
+                )
+        number = np.array([list(observers).index(name) for name in self.observers])
+        states = replace(self.states, observer=number[self.observer])
+        return replace(self, states=states, observers=tuple(observers))
 
     @property
     def scalar(self) -> Bools:

@@ -119,9 +119,10 @@ def check_header(
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     known = known_columns(n)
     needed = required_columns(n)
+    if any(name in header for kind in ONE.values() for name in kind):
+        _check_one(path, header)
     if sparse_columns(header):
         needed = needed if POSITION[0] in header else needed[:-3]
-        _check_one(path, header)
     missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
