@@ -61,11 +61,11 @@ class ReadingModel:
     @cached_property
     def enough(self) -> int:
         """Number of readings whose elements are as many as the coordinates without a prior."""
-        elements = max(int(np.median(self._read)), 1)
+        elements = max(int(np.median(self.read)), 1)
         return -(-int(np.count_nonzero(self.precision == 0)) // elements)
 
     @cached_property
-    def _read(self) -> Ints:
+    def read(self) -> Ints:
         """(N,) elements of each reading that were read."""
         return np.asarray(np.count_nonzero(np.any(self.root != 0, axis=2), axis=1))
 
@@ -75,7 +75,7 @@ class ReadingModel:
         Of a reading with fewer, as a distance has, χ² of the same probability; far beyond, where
         that is rounding, as much more.
         """
-        read = self._read
+        read = self.read
         less = (read > 0) & (read < self.m)
         if not less.any():
             return t2
