@@ -200,6 +200,11 @@ class Tracker(Section):
     frame: Literal["tracker", "base"] = Field(
         "tracker", description='"tracker" or "base": the axes in which positions are given'
     )
+    observes: Literal["position", "distance", "height"] = Field(
+        "position",
+        description='"position", "distance" (from all [points.NAME]) or "height" (of all '
+        "[gauges.NAME]): what `hilcal plan` plans readings of; devices read positions",
+    )
     base_xyz_m: Vector3 | None = Field(
         None,
         description=VECTOR_M + ": the arm's base in the tracker frame",
@@ -249,6 +254,11 @@ class Tracker(Section):
             raise ValueError(
                 'station_m together with frame = "tracker"; there the tracker is the origin, '
                 'and station_m is given only with frame = "base"'
+            )
+        if self.observes != "position" and self.driver is not None:
+            raise ValueError(
+                f'observes = "{self.observes}" together with driver = "{self.driver}", which reads '
+                "positions; leave one of them out"
             )
         for key in ("range_std_m", "transverse_std_m"):
             if getattr(self, key) > 0.1:
