@@ -32,8 +32,8 @@ from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 
-FEW = 100
-"""Readings that the starts are tried on; a choice."""
+FEW = 50
+"""Readings of each observer that the starts are tried on; a choice."""
 STARTS = 6
 """Starts that are followed to the end, of the rotations of a cube; a choice."""
 GOOD, STEPS, TRIED = 10.0, 15, 5
@@ -170,8 +170,10 @@ def placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
     """
     seen = Sightings.of(cell, readings)
     part = np.zeros(len(readings), dtype=bool)
-    part[np.unique(np.linspace(0, len(readings) - 1, FEW).astype(int))] = True
-    few = seen[part] if len(readings) > FEW else seen
+    for k in range(len(cell.observers)):
+        own = np.flatnonzero(readings.observer == k)
+        part[own[np.unique(np.linspace(0, len(own) - 1, FEW).astype(int))] if len(own) else own] = 1
+    few = seen if part.all() else seen[part]
     begun = [_observed(few, start) for start in _starts(cell, readings)]
     begun.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
     tried = [few.settled(c, 50) for c in begun[:STARTS]]
@@ -207,7 +209,8 @@ def _observed(seen: Sightings, cell: Cell) -> Cell:
     for k, o in enumerate(cell.observers):
         mine = seen.readings.observer == k
         begin = _BEGIN[o.name.kind]
-        out.append(begin(o, p[mine], seen.readings.value[mine, :3]) if o.free else o)
+        begun = o.free and mine.any()
+        out.append(begin(o, p[mine], seen.readings.value[mine, :3]) if begun else o)
     return replace(cell, observers=tuple(out))
 
 
