@@ -133,12 +133,13 @@ class Cell:
             return self
         stations = [name for name in names if name.kind == "station"]
         observers = tuple(self._observer(name, name in stations[:1]) for name in names)
-        tied = bool(stations) or any(o.tied for o in observers)
-        return replace(
-            self,
-            observers=observers,
-            registration_known=self.registration_known or not tied,
-        )
+        seen = replace(self, observers=observers)
+        return replace(seen, registration_known=self.registration_known or not seen.tied)
+
+    @property
+    def tied(self) -> bool:
+        """Whether what observes fixes the axes of the positions, apart from the base's."""
+        return not self.observers or any(o.tied for o in self.observers)
 
     def _observer(self, name: ObserverName, first: bool) -> Observer:
         """Return an observer as it is described."""

@@ -243,7 +243,7 @@ def setting(
             now = now.with_targets(cell.all_targets, cell.known_targets)
     if readings.states.observer is not None:  # they are set up anew for every campaign
         now = replace(now, observers=()).observed_by(readings.observers)
-        flat += ["observer"]
+        flat = [*(role for role in flat if role != "registration" or now.tied), "observer"]
     now, rms = _placed(fit, now, flat, readings)
     scatter = fit.readings.arm_scatter
     if scatter is not None and readings.arm_scatter is None:
