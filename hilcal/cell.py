@@ -7,12 +7,50 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
+from hilcal.config.observers import Gauge, Point
 from hilcal.errors import InputError
+from hilcal.readings.readings import ObserverName
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import as_counted
 from hilcal.robot.se3 import rotation
 from hilcal.types import Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Observer:
+    """One of several that observe the target: what is read is of its position p in their axes.
+
+    Attributes:
+        name: kind and name. A station reads p, a point |p| + offset, a gauge p_x.
+        frame: (4, 4) T_observer_sensor.
+        free: what is estimated: elements of the twist of the frame, observer's axes; of a point,
+            which no turn concerns, 3 is the offset (see `Deviation.observer`).
+        offset: of a distance, m.
+    """
+
+    name: ObserverName
+    frame: Floats
+    free: tuple[int, ...]
+    offset: float = 0.0
+
+    @property
+    def tied(self) -> bool:
+        """Whether its place is described, so that it has axes in common with others."""
+        return (
+            not self.free or self.free == (3,) or (self.name.kind == "gauge" and self.free == (0,))
+        )
+
+
+def plane_frame(direction: Floats, origin: Floats) -> Floats:
+    """(4, 4) frame whose x axis is the direction (3,), which need not be of unit length."""
+    x = direction / np.linalg.norm(direction)
+    y = np.cross(np.eye(3)[int(np.argmin(np.abs(x)))], x)
+    y /= np.linalg.norm(y)
+    frame = np.eye(4)
+    frame[:3, :3] = np.stack([x, y, np.cross(x, y)])
+    frame[:3, 3] = -frame[:3, :3] @ origin
+    return frame
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,9 +70,13 @@ class Cell:
         config: the configuration that the cell was made from: instruments, loads, limits; None
             for a cell that was made from numbers alone.
         base_dir: directory that relative paths in `config` refer to.
+        measured_torques: whether effects take the joint torques that were measured, where readings
+            have them, in place of those of the described masses and loads.
         targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
             `target` is the first of them. None where the tool carries one.
         target_names: their names.
+        observers: what observes the target, in the order of `Readings.observers`; empty where one
+            tracker reads all.
         targets_known: which of their offsets are known; `target_known` where all are.
     """
 
@@ -49,9 +91,11 @@ class Cell:
     target_known: bool
     config: CellConfig | None = None
     base_dir: Path = Path()
+    measured_torques: bool = False
     targets: Floats | None = None
     target_names: tuple[str, ...] = ()
     targets_known: tuple[bool, ...] = ()
+    observers: tuple[Observer, ...] = ()
 
     @property
     def all_targets(self) -> Floats:
@@ -78,6 +122,41 @@ class Cell:
             targets=poses if several else None,
             targets_known=found if several else (),
         )
+
+    def observed_by(self, names: Sequence[ObserverName]) -> "Cell":
+        """Return the cell with the observers of readings, as far as it describes them.
+
+        The first station's axes are those of the positions; where the cell states the place of no
+        point and of no gauge, and nothing reads positions, these are the axes of the base.
+        """
+        if not names or tuple(o.name for o in self.observers) == tuple(names):
+            return self
+        stations = [name for name in names if name.kind == "station"]
+        observers = tuple(self._observer(name, name in stations[:1]) for name in names)
+        seen = replace(self, observers=observers)
+        return replace(seen, registration_known=self.registration_known or not seen.tied)
+
+    @property
+    def tied(self) -> bool:
+        """Whether what observes fixes the axes of the positions, apart from the base's."""
+        return not self.observers or any(o.tied for o in self.observers)
+
+    def _observer(self, name: ObserverName, first: bool) -> Observer:
+        """Return an observer as it is described."""
+        frame = np.eye(4)
+        if name.kind == "station":
+            return Observer(name, frame, () if first else tuple(range(6)))
+        if name.kind == "point":
+            point = (self.config.points if self.config else {}).get(name.name, Point())
+            free = (0, 1, 2) if point.position_m is None else ()
+            if point.position_m is not None:
+                frame[:3, 3] = np.negative(point.position_m)
+            return Observer(name, frame, free + (3,) * point.estimate_offset, point.offset_m)
+        gauge = (self.config.gauges if self.config else {}).get(name.name, Gauge())
+        if gauge.direction is None:
+            return Observer(name, frame, (0, 4, 5))
+        frame = plane_frame(np.array(gauge.direction), np.array(gauge.origin_m or (0.0, 0.0, 0.0)))
+        return Observer(name, frame, (0,) if gauge.origin_m is None else ())
 
     @classmethod
     def load(cls, path: str | Path) -> "Cell":
@@ -154,6 +233,7 @@ def cell_from_config(
         target_known=all(known),
         config=config,
         base_dir=base_dir or Path(),
+        measured_torques=robot.torques == "measured",
         targets=poses if len(poses) > 1 else None,
         target_names=tuple(t.name for t in tool.targets),
         targets_known=known if len(poses) > 1 else (),

@@ -34,6 +34,7 @@ from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import Tool, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
@@ -329,7 +330,7 @@ class Calibration:
             columns[name] = np.broadcast_to(mean, (len(q), *mean.shape)).copy()
         states = States(q, **columns)
         for e in self.model.effects:
-            if not e.computable(states):
+            if e.role not in FRAME_ROLES and not e.computable(states):
                 raise InputError(
                     f"the model has {e.name}, which needs {', '.join(e.needs)}; give it"
                 )

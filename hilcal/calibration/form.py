@@ -250,7 +250,7 @@ def repeated(s: Situation, count: int) -> Situation:
 
 def _only(d: Deviation) -> bool:
     """Whether nothing but joints and slots moves."""
-    return d.base is None and d.station is None and d.target is None and d.scale is None
+    return all(f is None for f in (d.base, d.station, d.target, d.scale, d.observer))
 
 
 def _same(d: Deviation, dq: Floats, twist: Floats | None) -> bool:

@@ -23,7 +23,7 @@ from hilcal import limits
 from hilcal.calibration.check_stored import check_numbers
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.model.model import Model
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
@@ -74,7 +74,8 @@ class Learnt:
         check_numbers("prior", self.prior, (model.size,), least=0.0)
         check_numbers("noise", self.noise, least=0.0)
         check_numbers("factor", self.factor, least=0.0)
-        widths = {"q": n, "wrench": 6, "joint_temperature": n, "approach": n, "q_actual": n}
+        widths = dict.fromkeys(("q", "joint_temperature", "approach", "q_actual", "torque"), n)
+        widths |= {"wrench": 6}
         for f in fields(States):
             values = getattr(r.states, f.name)
             if values is not None:
@@ -90,6 +91,10 @@ class Learnt:
             (r.states.target < 0) | (r.states.target >= max(len(r.target_names), 1))
         ):
             raise ValueError("readings without a target")
+        if r.states.observer is not None and np.any(
+            (r.states.observer < 0) | (r.states.observer >= len(r.observers))
+        ):
+            raise ValueError("readings without an observer")
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON; numbers of the readings with 7 digits."""
@@ -108,6 +113,7 @@ class Learnt:
             "load_names": list(r.load_names),
             "poses": len(r.pose_names),
             "target_names": list(r.target_names),
+            "observers": [[o.kind, o.name] for o in r.observers],
             "prior": self.prior.tolist(),
             "noise": self.noise,
             "factor": self.factor,
@@ -145,6 +151,7 @@ class Learnt:
             load_names=tuple(content["load_names"]),
             pose_names=tuple(f"p{k + 1}" for k in range(min(int(content["poses"]), len(states)))),
             target_names=tuple(content["target_names"]),
+            observers=tuple(ObserverName(*o) for o in content.get("observers", ())),
             common=None if common is None else _unpacked(common),
             stated=square(content.get("stated")),
             serial=None if serial is None else SerialNoise.from_json(serial),

@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -29,12 +29,13 @@ from hilcal.calibration.learnt import Learnt
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.sensed import SensorMount
-from hilcal.cell import Cell
+from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.robot_frames import one_of_each
 from hilcal.model.model import Model
 from hilcal.names import check_names
+from hilcal.readings.readings import ObserverKind, ObserverName
 from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
 from hilcal.toml import parse_json
@@ -101,6 +102,17 @@ def to_json(c: Calibration) -> dict[str, object]:
             "target_names": list(cell.target_names),
             "known_targets": list(cell.known_targets),
             "registration_known": cell.registration_known,
+            "measured_torques": cell.measured_torques,
+            "observers": [
+                {
+                    "kind": o.name.kind,
+                    "name": o.name.name,
+                    "free": list(o.free),
+                    "offset_m": o.offset,
+                    "frame": o.frame.tolist(),
+                }
+                for o in cell.observers
+            ],
         },
         "effects": [{"name": e.name, "options": _plain(dict(e.options))} for e in c.model.effects],
         "parameters": [f"{e.name}.{p.name}" for e in c.model.effects for p in e.parameters],
@@ -230,6 +242,8 @@ def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
         registration=_array(content["registration"]),
         registration_known=bool(content["registration_known"]),
         target_known=all(content["known_targets"]),
+        measured_torques=bool(content.get("measured_torques", False)),
+        observers=tuple(map(_observer, content.get("observers", ()))),
     )
     if content["targets"] is None:
         return cell
@@ -237,6 +251,14 @@ def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
         cell, targets=_array(content["targets"]), target_names=tuple(content["target_names"])
     )
     return several.with_targets(_array(content["targets"]), content["known_targets"])
+
+
+def _observer(content: Mapping[str, Any]) -> Observer:
+    kind, frame = content["kind"], _array(content["frame"])
+    if kind not in get_args(ObserverKind) or frame.shape != (4, 4):
+        raise ValueError("an observer that is none")
+    name = ObserverName(kind, str(content["name"]))
+    return Observer(name, frame, tuple(map(int, content["free"])), float(content["offset_m"]))
 
 
 def _array(value: object) -> Floats:

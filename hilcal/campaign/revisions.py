@@ -1,7 +1,7 @@
 """Fits as revisions of a campaign file: what is stored, and how the fit comes back."""
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -90,6 +90,7 @@ def to_record(
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
+            **({"observers": _observers_json(cell)} if cell.observers else {}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
             **({} if serial is None else {SERIAL: serial.to_json()}),
@@ -98,6 +99,20 @@ def to_record(
         },
         result_json=result,
     )
+
+
+def _observers_json(cell: Cell) -> list[dict[str, object]]:
+    return [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
+
+
+def _placed(cell: Cell, stored: Sequence[Mapping[str, Any]]) -> Cell:
+    """Return a cell with its observers where a revision has them."""
+    frames = [np.array(o["frame"], dtype=float) for o in stored]
+    if not all(f.shape == (4, 4) and _is_frame(f) for f in frames):
+        raise ValueError("frames that are none")
+    pairs = zip(cell.observers, frames, stored, strict=True)
+    found = [replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in pairs]
+    return replace(cell, observers=tuple(found))
 
 
 def is_again(new: RevisionRecord, stored: RevisionRecord) -> bool:
@@ -238,6 +253,9 @@ def _restored(
             f"{len(cell.known_targets)}; run hilcal identify again"
         )
     cell = replace(cell.with_targets(targets), registration=registration)
+    cell = cell.observed_by(readings.observers)
+    if cell.observers:
+        cell = _placed(cell, stored["observers"])
     options, known = record.options["effects"], catalogue or installed()
     of_random = stored.get(RANDOM, {"effects": record.effects, "std": {}})
     names = tuple(of_random["effects"])

@@ -5,21 +5,25 @@ from pathlib import Path
 from typing import Annotated
 
 from hilcal.campaign.campaign import estimated_noise
+from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, Record, Run, Scheduler, Workers, argument, option
 from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
+from hilcal.identification.torques import check_torques
 from hilcal.names import quoted
 from hilcal.present.campaign import info_report
 from hilcal.present.fit import model_name
 from hilcal.present.progress import counting
 from hilcal.present.registration import covariance_words
+from hilcal.present.torques import torque_lines
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.robot_file import ROBOT_FILE
 
 
 def info(run: Run, as_json: Json = False) -> None:
@@ -29,8 +33,12 @@ def info(run: Run, as_json: Json = False) -> None:
         found = overview(file)
         parts = covariance_parts(file.about(COVERS), found.config)
         noise = estimated_noise(file)
+        cell = cell_from_config(found.config, None, file.about(ROBOT_FILE))
+    torques = None if found.readings is None else check_torques(cell, found.readings)
     t.show(info_report(found, run.name, covariance_words(parts, noise)))
-    t.document(to_json(found, str(run), parts))
+    t.show(torque_lines(torques))
+    more = {} if torques is None else {"torques": torques.to_json()}
+    t.document({**to_json(found, str(run), parts), **more})
 
 
 def accept(

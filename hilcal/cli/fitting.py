@@ -51,10 +51,12 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.misdescription import other_arm_of
+from hilcal.identification.torques import check_torques
 from hilcal.present.bootstrap import bootstrap_remarks, bootstrap_report
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
 from hilcal.present.progress import counting, working
 from hilcal.present.registration import covariance_words, other_arm_line
+from hilcal.present.torques import torque_lines
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
@@ -143,11 +145,15 @@ def identify(
     if details or o.noise:
         t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))
     t.show(options_line(kept))
+    torques = check_torques(kept.model.cell, kept.readings)
+    t.show(torque_lines(torques))
     other = other_arm_of(o.cell, o.readings)
     if other is not None:
         t.show(other_arm_line(other))
     document = {"revision": number, **to_json(kept), "options": options_json(kept)}
     document["covariance"] = o.covariance_parts
+    if torques is not None:
+        document["torques"] = torques.to_json()
     document["other_arm"] = None if other is None else other.to_json()
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])

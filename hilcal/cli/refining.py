@@ -53,6 +53,7 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
+from hilcal.identification.torques import check_torques
 from hilcal.identification.weight import weight_note
 from hilcal.present.diagnosis import (
     addition_lines,
@@ -69,6 +70,7 @@ from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
 from hilcal.present.story import Chapter
+from hilcal.present.torques import torque_lines
 from hilcal.present.verdict import message
 from hilcal.refinement import Step as RefinementStep
 from hilcal.refinement import refine as refine_model
@@ -116,6 +118,7 @@ def diagnose(
         d = judge(found, o.history(number), say)
         finish(found, say)
     t.show(diagnosis_report(d))
+    t.show(torque_lines(check_torques(found.model.cell, found.readings)))
     t.document({"revision": number, **to_json(d)})
 
 

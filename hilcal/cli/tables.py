@@ -13,12 +13,19 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine, other_arm
 from hilcal.identification.registration import Registration, register
 from hilcal.identification.table_preview import preview_table
+from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import target_words
 from hilcal.present.preparing import import_preview
 from hilcal.present.progress import working
-from hilcal.present.registration import covariance_words, other_arm_line, registration_lines
+from hilcal.present.registration import (
+    covariance_words,
+    observed_words,
+    other_arm_line,
+    registration_lines,
+)
+from hilcal.present.torques import torque_lines
 from hilcal.readings.readings import Readings
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file
@@ -68,15 +75,13 @@ def import_(
     loads = [readings.load_names[k] for k in np.unique(readings.load)]
     poses = len(np.unique(readings.pose))
     t.show(heading(f"{len(readings)} readings of {poses} poses"))
-    t.show(
-        f"  robot {settings.robot.model}; each reading is a "
-        f"{'position' if readings.m == 3 else 'position and an orientation'}\n"
-        f"  loads: {', '.join(loads)}"
-    )
+    t.show(f"  robot {settings.robot.model}; {_kind(readings)}\n  loads: {', '.join(loads)}")
     targets = _targets(cell, readings)
     if targets:
         t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
     t.show(Words(note, indent=2) for note in notes)
+    torques = check_torques(cell, readings)
+    t.show(Words(line, indent=2) for line in torque_lines(torques))
     registered = _registered(cell, readings)
     wrong = None if registered is None else examine(registered, readings)
     if registered is not None and not (wrong is not None and wrong.refused):
@@ -98,14 +103,22 @@ def import_(
             "elements": readings.m,
             "loads": loads,
             "targets": targets,
+            "observers": [str(name) for name in readings.observers],
             "covariance": found.parts,
             "noise": None if noise is None else asdict(noise),
             "notes": list(notes),
             "description": None if wrong is None else wrong.to_json(cell, readings),
             "other_arm": None if other is None else other.to_json(),
+            "torques": None if torques is None else torques.to_json(),
             "frames": None if registered is None else registered.to_json(),
         }
     )
+
+
+def _kind(readings: Readings) -> str:
+    if readings.observers:
+        return observed_words(readings)
+    return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
 
 
 def _registered(cell: Cell, readings: Readings) -> Registration | None:

@@ -8,6 +8,7 @@ from pydantic import Field, Strict, model_validator
 
 from hilcal.config.joints import Conventions
 from hilcal.config.loads import Limits, Load
+from hilcal.config.observers import Gauge, Point
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
     OPTIONS,
@@ -68,6 +69,11 @@ class Robot(Conventions):
         examples=["192.168.56.101"],
     )
     options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
+    torques: Literal["modelled", "measured"] = Field(
+        "modelled",
+        description='"modelled" or "measured": the joint torques that twist the drives, those of '
+        "the described masses and loads, or the columns tau1_Nm, ... of the readings",
+    )
     base_link: str | None = Field(
         None, description="the name of a link of the URDF", examples=["base_link"]
     )
@@ -194,6 +200,11 @@ class Tracker(Section):
     frame: Literal["tracker", "base"] = Field(
         "tracker", description='"tracker" or "base": the axes in which positions are given'
     )
+    observes: Literal["position", "distance", "height"] = Field(
+        "position",
+        description='"position", "distance" (from all [points.NAME]) or "height" (of all '
+        "[gauges.NAME]): what `hilcal plan` plans readings of; devices read positions",
+    )
     base_xyz_m: Vector3 | None = Field(
         None,
         description=VECTOR_M + ": the arm's base in the tracker frame",
@@ -243,6 +254,11 @@ class Tracker(Section):
             raise ValueError(
                 'station_m together with frame = "tracker"; there the tracker is the origin, '
                 'and station_m is given only with frame = "base"'
+            )
+        if self.observes != "position" and self.driver is not None:
+            raise ValueError(
+                f'observes = "{self.observes}" together with driver = "{self.driver}", which reads '
+                "positions; leave one of them out"
             )
         for key in ("range_std_m", "transverse_std_m"):
             if getattr(self, key) > 0.1:
@@ -320,6 +336,16 @@ class CellConfig(Section):
         (), description="sections [[obstacles]], one per thing that stands in the arm's way"
     )
     sight: Sight = Field(default_factory=Sight, description="a section [sight]")
+    points: dict[str, Point] = Field(
+        default_factory=dict,
+        description="sections [points.NAME], one per point that distances are measured from",
+        examples=[{"P1": {"position_m": [1.2, 0.4, 0.0]}}],
+    )
+    gauges: dict[str, Gauge] = Field(
+        default_factory=dict,
+        description="sections [gauges.NAME], one per dial gauge or plane that is touched",
+        examples=[{"G1": {"direction": [0.0, 0.0, 1.0]}}],
+    )
     simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
     ordinary: dict[str, Positive] = Field(
         default_factory=dict,

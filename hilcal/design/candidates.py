@@ -1,7 +1,7 @@
 """Candidate states: derivative and covariance of their readings."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -101,10 +101,7 @@ def reading_derivatives(
         scale: (P,) what one unit of each parameter is, SI.
     """
     model, m, loads = nominal.model, nominal.elements, len(of.loads)
-    states, each = of.states(), len(nominal.cell.all_targets)
-    if each > 1:
-        number = np.tile(np.arange(each), len(states))
-        states = replace(states[np.repeat(np.arange(len(states)), each)], target=number)
+    states, each = nominal.arrivals(of.states()), nominal.each
     live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
     step = max(CHUNK // (loads * each), 1)
     for start in range(0, len(of), step):

@@ -17,7 +17,7 @@ from hilcal.types import Floats
 
 
 def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
-    """Covariance of all that is read in one arrival of the arm: of its T targets together.
+    """Covariance of all that is read in one arrival of the arm: of its targets together.
 
     They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with
     F = R J Σ_q^½ (see `reading_covariance`).
@@ -25,13 +25,13 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     Args:
         nominal: the model, with the tracker in its place.
         config: `[tracker]`, `[acquire]` and `[repeatability]`.
-        predicted: N·T states, the T targets of one arrival in succession.
+        predicted: N·T states, the T readings of one arrival in succession.
 
     Returns:
         (N, T·m, T·m) covariances.
     """
     single = reading_covariance(nominal, config, predicted)
-    count, m = len(nominal.cell.all_targets), nominal.m
+    count, m = nominal.each, nominal.m
     if count == 1:
         return single
     o = predicted.observation
@@ -63,7 +63,7 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
         (N, m, m) covariances in sensor axes; m², m·rad, rad².
     """
     a, o, m = config.acquire, predicted.observation, nominal.m
-    stated = tracker_covariance(o.position, tracker_noise(config.tracker), nominal.station, m)
+    stated = _instrument(nominal, config, predicted)
     out = expected_share_of_mean(a.samples, a.systematic_share) * stated
     joint_std = config.repeatability.per_joint(nominal.cell.arm.n)
     if np.any(joint_std):
@@ -71,4 +71,26 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
             predicted.situation.cell.arm, predicted.situation.chain, o.base_position
         )
         out = out + joint_scatter(jac, joint_std, o.axes, m)
-    return np.asarray(out)
+    unread = np.diagonal(out, axis1=1, axis2=2) == 0  # of readings of one number; any noise does
+    return np.asarray(out + unread[:, :, None] * np.eye(m))
+
+
+def _instrument(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
+    """(N, m, m) covariance that the instrument states; zero in elements that are not read."""
+    o, m, t = predicted.observation, nominal.m, config.tracker
+    number, by = predicted.situation.states.observer, nominal.cell.observers
+    if number is None or not by:
+        return tracker_covariance(o.position, tracker_noise(t), nominal.station, m)
+    out = np.zeros((len(o.position), m, m))
+    for k, one in enumerate(by):
+        mine = number == k
+        if one.name.kind == "station":
+            place = np.zeros(3) if k else nominal.station
+            out[mine] = tracker_covariance(o.position[mine], tracker_noise(t), place, m)
+            continue
+        far = one.name.kind == "point"
+        section = (config.points if far else config.gauges).get(one.name.name)
+        std = None if section is None else section.std_m
+        length = t.range_std_m + t.range_std_per_m * np.abs(o.position[mine, 0])
+        out[mine, 0, 0] = np.square(length if std is None else std)
+    return out

@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.cell import Cell, tracker_place
+from hilcal.cell import Cell, plane_frame, tracker_place
 from hilcal.config import CellConfig
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
 from hilcal.identification.carried import CarriedPrior, check_arm
@@ -17,7 +17,8 @@ from hilcal.identification.drift import least
 from hilcal.identification.fit import Fit
 from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
-from hilcal.readings.readings import States
+from hilcal.readings.readings import ObserverKind, ObserverName, States
+from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
 DISTANCE = 2.0
@@ -61,8 +62,24 @@ class NominalModel:
 
     @property
     def elements(self) -> int:
-        """Elements that are read in one arrival: m of each target."""
-        return self.m * len(self.cell.all_targets)
+        """Elements that are read in one arrival: m of each target by each observer."""
+        return self.m * self.each
+
+    @property
+    def each(self) -> int:
+        """Readings in one arrival: of each target by each observer."""
+        return len(self.cell.all_targets) * max(len(self.cell.observers), 1)
+
+    def arrivals(self, states: States) -> States:
+        """Return N states, each as often as it is read in one arrival, in succession."""
+        targets, observers = len(self.cell.all_targets), len(self.cell.observers)
+        if targets == 1 and not observers:
+            return states
+        several = states[np.repeat(np.arange(len(states)), self.each)]
+        number = np.arange(len(several)) % self.each
+        if targets > 1:
+            several = replace(several, target=number % targets)
+        return replace(several, observer=number // targets) if observers else several
 
     @property
     def cell(self) -> Cell:
@@ -97,13 +114,14 @@ def nominal_model(
     known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
     notes = []
-    if not given:
+    cell = _observed(cell, config, place)
+    if not given and not (cell.observers and all(o.tied for o in cell.observers)):
         notes.append(
             f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
             "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, config, place)
-    frames = known.unknown_frames(cell)
+    frames = known.unknown_frames(registered)
     wanted = {name: dict[str, object]() for name in frames} | planned_effects(config, known)
     learnt = {} if prior is None else _learnt(prior, registered, known, m)
     wanted = {name: options or learnt.get(name, {}) for name, options in wanted.items()}
@@ -202,7 +220,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
     """
     known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
     for e in effects:
-        if not type(e).computable(known):
+        if e.role not in FRAME_ROLES and not type(e).computable(known):
             raise InputError(
                 f"effect {e.name} needs {', '.join(e.needs)}, which a plan does not fix; leave "
                 "it out"
@@ -277,8 +295,11 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """
     asked = config.planning.against
     if asked == "catalogue":
-        kinds = (kind for kind in model.catalogue.effects if kind.applies(model.cell))
-        names = tuple(kind.name for kind in kinds if not kind.needs)
+        names = tuple(
+            kind.name
+            for kind in model.catalogue.effects
+            if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
+        )
     else:
         names = checked(asked, "against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
@@ -316,11 +337,34 @@ def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Fl
     """Cell with a registration, and the beam's start (3,) in sensor axes."""
     if config.tracker.frame == "base":
         return cell, place
-    if cell.registration_known:
+    if cell.registration_known or cell.observers:
         return cell, np.zeros(3)
     registration = np.eye(4)
     registration[:3, 3] = -place
     return replace(cell, registration=registration), np.zeros(3)
+
+
+def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
+    """Return the cell with what `[tracker] observes` plans for; a point of unknown place is there.
+
+    A plane of unknown place is level, at the height of the tracker.
+    """
+    kind: ObserverKind = "point" if config.tracker.observes == "distance" else "gauge"
+    if config.tracker.observes == "position":
+        return cell
+    listed = tuple(config.points if kind == "point" else config.gauges) or ("tracker",)
+    seen = cell.observed_by([ObserverName(kind, name) for name in listed])
+    found = []
+    for k, o in enumerate(seen.observers):
+        if o.tied:
+            found.append(o)
+            continue
+        turn = se3.rotation(np.array([0.0, 0.0, 2.0 * np.pi * k / len(listed)]))
+        frame = plane_frame(np.array([0.0, 0.0, 1.0]), place)
+        if kind == "point":
+            frame = se3.matrix(np.eye(3), -turn @ place)
+        found.append(replace(o, frame=frame))
+    return replace(seen, observers=tuple(found))
 
 
 def _prior_std(model: Model) -> Floats:

@@ -194,6 +194,8 @@ def _axes(p: Linearisation) -> list[MisfitShare]:
     fit, w = p.fit, p.fit.whitening
     if fit.readings.serial is not None:
         return []  # what readings have in common counts as one, not as many
+    if fit.readings.scalar.any():
+        return []  # a distance has no direction to choose
     o = fit.solution.prediction.observation
     x = o.base_position[w.reading]
     across = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)

@@ -23,6 +23,7 @@ from hilcal.effects.link_compliance import LinkCompliance
 from hilcal.effects.link_geometry import LinkGeometry
 from hilcal.effects.link_mass import LinkMass
 from hilcal.effects.load_point import LoadPoint
+from hilcal.effects.observer_frame import ObserverFrame
 from hilcal.effects.options import Options
 from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
 from hilcal.effects.protocol import Effect, Role
@@ -70,6 +71,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     SensorMisalignment,
     TrackerDrift,
     TrackerScale,
+    ObserverFrame,
 )
 
 
@@ -128,7 +130,11 @@ class Catalogue:
 
     def unknown_frames(self, cell: Cell) -> tuple[str, ...]:
         """Return the names of the effects of those frames that a cell leaves unknown."""
-        unknown = {"registration": not cell.registration_known, "target": not cell.target_known}
+        unknown = {
+            "registration": not cell.registration_known,
+            "target": not cell.target_known,
+            "observer": any(o.free for o in cell.observers),
+        }
         return tuple(kind.name for kind in self.effects if unknown.get(kind.role))
 
     def with_effects(self, *kinds: type[Effect]) -> "Catalogue":

@@ -8,7 +8,7 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Robot
 from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Situation
-from hilcal.readings.readings import States
+from hilcal.readings.readings import ObserverName, States
 from hilcal.robot import chain as chains
 from hilcal.robot.statics import Load, slot_wrenches
 
@@ -34,7 +34,10 @@ def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
         prismatic=np.arange(len(rows)) == 0 if slides else None,
         joint_names=tuple(f"joint {k + 1}" for k in range(len(rows))),
     )
-    return replace(cell, arm=longer, load_point=np.array([0.02, -0.01, 0.1]))
+    names = [ObserverName("station", "S1"), ObserverName("station", "S2")]
+    names += [ObserverName("point", "P"), ObserverName("gauge", "G")]
+    longer_cell = replace(cell, arm=longer, load_point=np.array([0.02, -0.01, 0.1]))
+    return longer_cell.observed_by(names)
 
 
 def example_states(cell: Cell, count: int = 30) -> States:
@@ -57,6 +60,7 @@ def example_states(cell: Cell, count: int = 30) -> States:
         joint_temperature=22.0 + rng.uniform(5, 15, n) * warm,
         approach=rng.choice([-1.0, 1.0], (count, n)),
         q_actual=q + 1e-5 * rng.normal(size=q.shape),
+        observer=np.arange(count) % 4,
     )
     for field in fields(states):
         if (given := getattr(states, field.name)) is not None:

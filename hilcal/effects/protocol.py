@@ -27,9 +27,9 @@ from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
-Field = Literal["dq", "twist", "base", "station", "target", "scale"]
-Role = Literal["registration", "target", "baseline", "effect"]
-FRAME_ROLES: tuple[Role, ...] = ("registration", "target")
+Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
+Role = Literal["registration", "target", "observer", "baseline", "effect"]
+FRAME_ROLES: tuple[Role, ...] = ("registration", "target", "observer")
 OWN_SPREAD = 0.7
 """Of the logarithm of a pool's standard deviation, beside what is shared; a choice."""
 
@@ -88,11 +88,19 @@ class Situation:
         return self.states.q if self.states.q_actual is None else self.states.q_actual
 
     @property
+    def torque_measured(self) -> bool:
+        """Whether the torques are those that were measured, which no change of a load changes."""
+        return self.cell.measured_torques and self.states.torque is not None
+
+    @property
     def torque(self) -> Floats:
         """(N, n) static torques that the drives carry, N·m; about the axes unless coupled.
 
-        Of a joint that slides the force along it, N.
+        Of a joint that slides the force along it, N. As measured where the cell says so
+        (`Cell.measured_torques`) and they were.
         """
+        if self.torque_measured and self.states.torque is not None:
+            return -self.states.torque
         return self.cell.arm.drive_torques(self.along(self.wrench))
 
     def along(self, change: Floats) -> Floats:
@@ -178,10 +186,11 @@ class Effect(ABC):
                 six parameters are a twist of the base, in base axes.
             "target": every model while the target's place on the flange is unknown; its first
                 three parameters are a displacement of the target, flange axes.
+            "observer": every model while the place of one of several observers is unknown.
             "baseline": every starting model where a load acts.
             "effect": none; it is added by name, or where a diagnosis finds it missing.
             An effect that is not of the last role is never removed by a diagnosis. Those of the
-            first two take the options `prior_m` and `prior_rad`.
+            first three take the options `prior_m` and `prior_rad`.
         for_missing_weight: whether a starting model has the effect where the arm is described
             without masses and the readings tell what its weight does.
         plausible: standard deviation of the parameters over arms and cells as they are, in their

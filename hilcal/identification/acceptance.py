@@ -158,7 +158,9 @@ def acceptance(
     """
     r, rows = found.readings, found.whitening.reading
     error = np.linalg.norm(found.raw[:, :3], axis=1)
-    inside = beyond.z**2 * found.whitening.m <= chi2.ppf(BAND, found.whitening.m)
+    variance = np.diagonal(found.whitening.covariance, axis1=1, axis2=2)
+    read = np.maximum(np.count_nonzero(variance > 0, axis=1), 1)
+    inside = beyond.z**2 * read <= chi2.ppf(BAND, read)
     load, pose = r.load[rows], r.pose[rows]
 
     def shares(

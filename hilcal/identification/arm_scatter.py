@@ -51,7 +51,9 @@ def factors(cell: Cell, readings: Readings, kind: ScatterKind) -> tuple[Floats, 
     """
     m = readings.m
     if kind == "isotropic":
-        return (np.tile(np.eye(m)[:, :3], (len(readings), 1, 1)),)
+        out = np.tile(np.eye(m)[:, :3], (len(readings), 1, 1))
+        out[readings.scalar, 1:] = 0.0  # a distance scatters as any other direction
+        return (out,)
     f = joint_factors(cell, readings, np.ones(cell.arm.n))
     return (f,) if kind == "joints" else tuple(f[:, :, [j]] for j in range(f.shape[2]))
 

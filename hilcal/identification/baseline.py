@@ -8,11 +8,13 @@ from hilcal import limits
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
+from hilcal.effects.protocol import Role
 from hilcal.effects.spec import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.registration import register
+from hilcal.identification.registration import Registration, register
 from hilcal.identification.rigid_frames import TARGET_M, TELL
+from hilcal.identification.torques import require_torques
 from hilcal.identification.weight import loads_differ, weight_missing
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
@@ -58,6 +60,11 @@ def baseline(
     return with_effects(cell, readings, mode, names, catalogue=known, prior=prior)
 
 
+def _held(role: Role, found: Registration) -> bool:
+    """Whether frames of a role get a prior where the readings do not determine all of them."""
+    return role == "target" or bool(found.cell.observers)
+
+
 def with_effects(
     cell: Cell,
     readings: Readings,
@@ -93,16 +100,17 @@ def with_effects(
     if prior is not None:
         check_prior(prior, cell.arm, readings)
         learnt = {e.name: e.options for e in prior.posterior.effects}
+    require_torques(cell, readings)
     registered = register(cell, readings)
     refuse_misdescribed(registered, readings)
     model = Model(registered.cell, (), known, readings, prior)
-    frames = known.unknown_frames(cell)
+    frames = known.unknown_frames(registered.cell)
     for name in dict.fromkeys((*frames, *names)):
         begun: Options = {}
         if name in frames and mode == "deflection":
             length = max(registered.rms, 1e-6)
             begun = {"prior_m": length, "prior_rad": length / ARM}
-        elif name in frames and known[name].role == "target" and registered.undetermined:
+        elif name in frames and registered.undetermined and _held(known[name].role, registered):
             begun = {"prior_m": TARGET_M, "prior_rad": TELL}
         chosen = given.get(name) or learnt.get(name, {})
         model = model + EffectSpec(name, {**begun, **chosen})

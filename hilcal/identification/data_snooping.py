@@ -166,7 +166,7 @@ class Snooping:
             shift = (np.linalg.pinv(of.root[off]) @ white)[:, :, 0]
             axes = self.model.predict(self.readings.states[off], self.solution.theta).observation
             alike = off_alike(self.readings, of.tested, off, shift[:, :3], axes.rotation)
-            rest = ~np.isin(off, alike)
+            rest = ~np.isin(off, alike) & ~self.readings.scalar[off]  # no direction to tell
             unit = _units(self.readings.covariance[off[rest]])
             sites = at.sites[off[rest]] / unit[:, :, None]
             law = off[rest][
@@ -256,7 +256,7 @@ class _Linearised:
     def with_nuisance(self, misfit: float) -> ReadingModel:
         """Return the linear model with smooth nuisance columns of some variance above the noise."""
         of, readings = self.of, self.of.readings
-        rank = readings.m * int(np.count_nonzero(self.linear.tested))
+        rank = int(self.linear.read[self.linear.tested].sum())
         columns = smooth_nuisance_columns(of.model, self.prediction, readings, rank)
         for k in range(0, len(columns), WHITENED):  # in place: they are the largest array of a fit
             rows = slice(k, k + WHITENED)

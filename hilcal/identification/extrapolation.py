@@ -132,12 +132,14 @@ def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapo
         most = float(leverage.max() - limit)
         beyond_any.append(Beyond("leverage", "1", 0.0, limit, int(far.sum()), most))
     outside |= far
-    white = np.einsum("dij,dj->di", inverse_root(total), found.raw)
+    root = inverse_root(total)
+    white = np.einsum("dij,dj->di", root, found.raw)
+    read = np.maximum(np.count_nonzero(np.any(root != 0, axis=2), axis=1), 1)
     return Extrapolation(
         outside=outside,
         variables=tuple(sorted(beyond_any, key=lambda v: -v.count)),
         stated_m=np.sqrt(np.trace(total[:, :3, :3], axis1=1, axis2=2)),
-        z=np.sqrt(np.mean(white**2, axis=1)),
+        z=np.sqrt(np.sum(white**2, axis=1) / read),
         inside_error=_error(found.raw, w, ~outside),
         outside_error=_error(found.raw, w, outside),
     )
@@ -147,5 +149,6 @@ def _error(raw: Floats, w: Whitening, mine: Bools) -> ErrorBlock | None:
     """Errors of some measurements, each whitened by itself."""
     if not mine.any():
         return None
-    white = np.einsum("dij,dj->di", inverse_root(w.covariance[mine]), raw[mine])
-    return ErrorBlock.of(raw[mine], white, white.size)
+    root = inverse_root(w.covariance[mine])
+    white = np.einsum("dij,dj->di", root, raw[mine])
+    return ErrorBlock.of(raw[mine], white, int(np.count_nonzero(np.any(root != 0, axis=2))))

@@ -9,6 +9,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig, Tracker
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.registration import register
+from hilcal.model.model import Model
 from hilcal.readings.covariance import (
     INSTRUMENT,
     WHOLE,
@@ -66,9 +67,13 @@ def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
     Raises:
         InputError: a reading lies at the tracker's station.
     """
-    position, station = readings.value[:, :3], tracker.station_m or (0.0, 0.0, 0.0)
+    whole, station = ~readings.scalar, tracker.station_m or (0.0, 0.0, 0.0)
+    if not whole.any():
+        return readings
+    position, out = readings.value[whole, :3], readings.covariance.copy()
     cov = tracker_covariance(position, tracker_noise(tracker), station, readings.m)
-    return replace(readings, covariance=with_rounding(cov, rounding_variance(position, 1.0))[0])
+    out[whole] = with_rounding(cov, rounding_variance(position, 1.0))[0]
+    return replace(readings, covariance=out)
 
 
 def covariance_parts(covers: str | None, config: CellConfig) -> CovarianceParts:
@@ -115,7 +120,7 @@ def with_common_scatter(cell: Cell, readings: Readings, joint_std: Floats) -> Re
         joint_std: (n,) standard deviations from one arrival to the next, rad.
     """
     factor = None
-    if readings.states.target is not None:
+    if readings.states.target is not None or readings.states.observer is not None:
         factor = _scatter(cell, readings, joint_std)
     if factor is None:
         return readings
@@ -143,4 +148,9 @@ def joint_factors(cell: Cell, readings: Readings, joint_std: Floats) -> Floats:
         joint_std: (n,) standard deviations, rad.
     """
     offset = cell.target_of(readings.states.target)[..., :3, 3]
-    return arrival_factors(cell.arm, readings, offset, cell.registration[:3, :3], joint_std)
+    turn = cell.registration[:3, :3]
+    if readings.states.observer is not None:
+        cell = cell if cell.observers else register(cell, readings).cell
+        seen = Model(cell, ()).predict(readings.states, np.zeros(0)).observation
+        turn = seen.axes
+    return arrival_factors(cell.arm, readings, offset, turn, joint_std)

@@ -25,7 +25,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config.cell import Tool
-from hilcal.effects.protocol import Effect, Role
+from hilcal.effects.protocol import FRAME_ROLES, Effect, Role
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
@@ -227,7 +227,7 @@ def setting(
     """
     fit = earlier.fit
     for effect in fit.model.effects:
-        if not effect.computable(readings.states):
+        if effect.role not in FRAME_ROLES and not effect.computable(readings.states):
             raise InputError(
                 f"effect {effect.name} needs {', '.join(effect.needs)}, which the later readings "
                 "do not have"
@@ -241,6 +241,9 @@ def setting(
         if other_target(fit.model.cell, cell):
             flat.append("target")
             now = now.with_targets(cell.all_targets, cell.known_targets)
+    if readings.states.observer is not None:  # they are set up anew for every campaign
+        now = replace(now, observers=()).observed_by(readings.observers)
+        flat = [*(role for role in flat if role != "registration" or now.tied), "observer"]
     now, rms = _placed(fit, now, flat, readings)
     scatter = fit.readings.arm_scatter
     if scatter is not None and readings.arm_scatter is None:
@@ -320,7 +323,7 @@ def _placed(fit: Fit, now: Cell, flat: Sequence[Role], readings: Readings) -> tu
     held = now.with_targets(targets, known)
     held = replace(held, registration_known="registration" not in flat)
     found = register(held, readings)
-    placed = replace(now, registration=found.cell.registration)
+    placed = replace(now, registration=found.cell.registration, observers=found.cell.observers)
     if "target" in flat:
         placed = placed.with_targets(found.cell.all_targets)
     return placed, max(found.rms, 1e-6)

@@ -234,6 +234,9 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
     far, rms, noise = registered.far, _size(registered.off), noise_floor(readings.covariance)
     nothing = np.zeros_like(far)
+    if cell.observers:  # what else the arm may be is told by positions in one frame
+        rest = _size(registered.off[~far])
+        return Finding(rest, gate, (), far, (), 0) if far.any() or rest > gate else None
     if far.any():
         others = _size(registered.off[~far])
         search = _Search(cell, readings, max(3.0 * noise, others))
@@ -510,7 +513,7 @@ def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
         readings: the readings.
     """
     cell = registered.cell
-    if registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
+    if cell.observers or registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None
     spread = np.unique(np.linspace(0, len(readings) - 1, ARM_ROWS).astype(int))
     tried = [(_left(cell, arm, readings[spread]), arm) for arm in _others(cell)]

@@ -231,7 +231,7 @@ class _Components:
 
 def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Components | None:
     """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
-    if len(np.unique(readings.pose)) < FEWEST_POSES:
+    if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
     stated = config.repeatability.per_joint(cell.arm.n)
     try:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.stats import chi2
 
 from hilcal.readings.whitening import inverse_root
 from hilcal.types import Bools, Floats, Ints
@@ -21,6 +22,8 @@ SINGULAR = 1e-9
 some columns none; a choice between rounding and what readings tell."""
 AT_A_TIME = 4096
 """Readings whose covariance is formed at a time."""
+FAR = 100.0
+"""χ² from which on its probability is not looked at; a choice."""
 LEVERAGE = 1e-6
 """Share of a reading's information that the others must leave for a test; a choice."""
 
@@ -58,7 +61,27 @@ class ReadingModel:
     @cached_property
     def enough(self) -> int:
         """Number of readings whose elements are as many as the coordinates without a prior."""
-        return -(-int(np.count_nonzero(self.precision == 0)) // self.m)
+        elements = max(int(np.median(self.read)), 1)
+        return -(-int(np.count_nonzero(self.precision == 0)) // elements)
+
+    @cached_property
+    def read(self) -> Ints:
+        """(N,) elements of each reading that were read."""
+        return np.asarray(np.count_nonzero(np.any(self.root != 0, axis=2), axis=1))
+
+    def _comparable(self, t2: Floats) -> Floats:
+        """(N,) squared distances as of readings of m elements.
+
+        Of a reading with fewer, as a distance has, χ² of the same probability; far beyond, where
+        that is rounding, as much more.
+        """
+        read = self.read
+        less = (read > 0) & (read < self.m)
+        if not less.any():
+            return t2
+        near, out = np.minimum(t2[less], FAR), t2.copy()
+        out[less] = chi2.isf(chi2.sf(near, read[less]), self.m) + t2[less] - near
+        return out
 
     @cached_property
     def group(self) -> Ints:
@@ -128,7 +151,8 @@ class ReadingModel:
         values, vectors = np.linalg.eigh(a)
         c = np.einsum("nij,ni->nj", vectors, r)
         kept = values > LEVERAGE
-        return np.asarray(np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1))
+        t2 = np.sum(np.where(kept, c**2 / np.where(kept, values, 1.0), 0.0), axis=1)
+        return self._comparable(np.asarray(t2))
 
     def near(self, delta: Floats) -> tuple[Floats, Bools]:
         """Squared distances (N,) from the model with δ (K,), and which readings are centres (N,).
@@ -146,7 +170,7 @@ class ReadingModel:
             g, s = np.nonzero(there)
             d2[self.members[g, s]] = apart[each, best][g, s]
             centre[self.members[each, best]] = True
-        return d2, centre
+        return self._comparable(d2), centre
 
     def with_lone_centres(self, used: Bools, centre: Bools) -> Bools:
         """Return the used readings (N,), and the centre of each group that has none."""

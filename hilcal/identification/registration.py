@@ -5,15 +5,16 @@ arm from several starts (`rigid_frames`); readings that are centimetres off are 
 start, and left out. What the poses cannot tell stays near the cell's target and is listed.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.cell import Cell
+from hilcal.cell import Cell, Observer
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.common_cause import off_alike
 from hilcal.identification.least_trimmed_squares import MOST, limit, robust_start, variance
+from hilcal.identification.observers import Sightings, placed
 from hilcal.identification.rigid_frames import (
     Frames,
     Placement,
@@ -42,6 +43,10 @@ STEPS, TRIED = 15, 5
 DISTURBED = 3e-3
 """Rms misfit, m, from which on readings that are far off are looked for: nominal arms are off by
 less. A choice, a third of what is fitted at least (`misdescription.GATE_M`)."""
+BEYOND = 10.0
+"""Times the median misfit from which on a reading of several observers is far off; a choice."""
+LEAST_FAR = 1e-4
+"""Misfit that is never far off, m; a choice."""
 SEED = 0
 """Of the random subsets, so that equal readings give equal frames."""
 ROUNDS = 5
@@ -63,6 +68,7 @@ class Undetermined:
         base_shift: (3,) shift of the base that goes with it, base axes, m; at the middle of the
             flange's positions.
         base_turn: (3,) turn of the base, base axes, rad.
+        observers: what of several observers moves with it, as "point P" .
     """
 
     target: int | None
@@ -70,6 +76,7 @@ class Undetermined:
     target_turn: Floats
     base_shift: Floats
     base_turn: Floats
+    observers: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, object]:
         """Return its JSON."""
@@ -79,6 +86,7 @@ class Undetermined:
             "target_turn_rad": self.target_turn.tolist(),
             "base_shift_m": self.base_shift.tolist(),
             "base_turn_rad": self.base_turn.tolist(),
+            **({"observers": list(self.observers)} if self.observers else {}),
         }
 
 
@@ -142,6 +150,8 @@ def register(cell: Cell, readings: Readings) -> Registration:
         CannotAnswerError: where the poses do not determine it (fewer than four distinct positions,
             or all on one line).
     """
+    if readings.states.observer is not None:
+        return _of_several(cell.observed_by(readings.observers), readings)
     angle, seen = angles(readings), Seen.of(cell.arm, readings)
     given, free = given_and_free(cell, seen.m == 6)
     known = cell.registration_known and cell.target_known
@@ -175,6 +185,65 @@ def register(cell: Cell, readings: Readings) -> Registration:
         still=np.ptp(angle, axis=0) < TURNED,
         estimated=not known,
     )
+
+
+def _of_several(cell: Cell, readings: Readings) -> Registration:
+    """Register readings of several observers.
+
+    Raises:
+        CannotAnswerError: fewer readings of an observer than what is unknown of it.
+    """
+    angle = angles(readings)
+    for k, o in enumerate(cell.observers):
+        mine = readings.observer == k
+        count = len(np.unique(angle[mine], axis=0)) * (3 if o.name.kind == "station" else 1)
+        if 0 < count < len(o.free):
+            raise CannotAnswerError(
+                f"registration: {o.name} has readings of {mine.sum()} poses, too few for the "
+                f"{len(o.free)} unknowns of its place; measure more, or state its place"
+            )
+    found, off, null = placed(cell, readings)
+    size = np.linalg.norm(off[:, :3], axis=1)
+    far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
+    if 0 < far.mean() <= MOST:
+        found, _, null = placed(cell, readings[~far])
+        off = Sightings.of(cell, readings).off(found)
+        size = np.linalg.norm(off[:, :3], axis=1)
+        far = size > max(LEAST_FAR, BEYOND * float(np.median(size)))
+    near = off[~far]
+    targets = ~np.array(cell.known_targets)
+    count, base = len(targets), not cell.registration_known
+    whole = np.zeros((6 + 6 * count, null.shape[1]))
+    at = 6 * base
+    whole[:at] = null[:at]
+    for k in np.flatnonzero(targets).tolist():
+        whole[6 + 6 * k : 9 + 6 * k] = null[at : at + 3]
+        at += 3
+    moved = [tuple[str, ...](str(o.name) for o, v in _parts(cell, null[at:, u]) if v)
+             for u in range(null.shape[1])]  # fmt: skip
+    told = []
+    for u, names in enumerate(moved):
+        one = _direction(whole[:, u] / np.abs(whole[:, u]).max(initial=TOLD))
+        told.append(replace(one, observers=names))
+    turn = near[:, 3:]
+    return Registration(
+        cell=found,
+        off=off,
+        rms=float(np.sqrt(np.mean(np.sum(near[:, :3] ** 2, axis=1)))),
+        turn_rms=float(np.sqrt(np.mean(np.sum(turn**2, axis=1)))) if readings.m == 6 else None,
+        far=far if far.mean() <= MOST else np.zeros_like(far),
+        undetermined=tuple(told),
+        still=np.ptp(angle, axis=0) < TURNED,
+        estimated=base or bool(targets.any()) or any(o.free for o in cell.observers),
+    )
+
+
+def _parts(cell: Cell, v: Floats) -> Iterator[tuple[Observer, bool]]:
+    """Yield each observer, and whether a direction (E,) of all moves it."""
+    at = 0
+    for o in cell.observers:
+        yield o, bool(np.any(np.abs(v[at : at + len(o.free)]) > TOLD))
+        at += len(o.free)
 
 
 def _fitted(seen: Seen, given: Frames, free: Bools) -> tuple[Placement, Floats]:

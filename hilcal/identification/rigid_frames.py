@@ -324,7 +324,7 @@ def best_placement(
         return found[-1].square <= good**2 * len(seen)
 
     if not any(map(reached, _closed_forms(seen, given, free))) and rotated and free[:6].any():
-        turns = (_with_translations(seen, given, turn, free) for turn in _cube())
+        turns = (_with_translations(seen, given, turn, free) for turn in cube())
         begun = sorted((Placement(seen, f, free) for f in turns), key=lambda p: p.square)
         for placement in begun[:rotated]:
             reached(placement.frames)
@@ -384,7 +384,7 @@ def _closed_forms(seen: Seen, given: Frames, free: Bools) -> Iterator[Frames]:
     yield _alternated(seen, given, free)
 
 
-def _cube() -> Floats:
+def cube() -> Floats:
     """(24, 3, 3) the rotations that take a cube to itself."""
     from scipy.spatial.transform import Rotation  # slow to import
 

@@ -188,7 +188,7 @@ def _constant(model: Model, theta: Floats) -> tuple[Floats, tuple[str, ...], tup
         if e.role in FRAME_ROLES:
             continue
         d = e.deviation(theta[mine], situation)
-        fields = [d.base, d.station, d.target, d.scale]
+        fields = [d.base, d.station, d.target, d.scale, d.observer]
         constant = not e.elastic and _same(d.dq) and _same(d.twist)
         if not constant or any(f is not None for f in fields) or d.dq is d.twist:
             beyond.append(e.name)

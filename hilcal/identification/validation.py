@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.effects.protocol import Effect
+from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.registration import register
@@ -71,8 +71,14 @@ def validate(
         InputError: an effect of the model needs a column that the other readings lack.
         CannotAnswerError: the registration does not converge.
     """
+    other = other.seen_by(fitted.observers)
+    if registered and other.states.observer is not None:
+        raise InputError(
+            "several observers: where they stand is told by the readings that were fitted; valid: "
+            "readings by them, without a registration anew, or by one tracker"
+        )
     for effect in model.effects:
-        if not effect.computable(other.states):
+        if effect.role not in FRAME_ROLES and not effect.computable(other.states):
             raise InputError(
                 f"effect {effect.name} needs {', '.join(effect.needs)}, which the other readings "
                 "do not have"

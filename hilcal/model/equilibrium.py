@@ -241,7 +241,8 @@ def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
             slot = to if effect.local_response else group[0]
             if r.twist is not None:
                 yield Block(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
-            if r.dq is not None and to < r.dq.shape[2]:
+            follows = r.dq is not None and not s.torque_measured  # measured torques stay
+            if r.dq is not None and follows and to < r.dq.shape[2]:
                 yield Block(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
 
 

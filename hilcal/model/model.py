@@ -210,7 +210,9 @@ class Model:
                 "poses and loads that determine them, or leave an effect out"
             )
         s = replace(s, chain=chain)
-        return Prediction(s, deviation, observe(cell, chain, deviation, states.target))
+        return Prediction(
+            s, deviation, observe(cell, chain, deviation, states.target, states.observer)
+        )
 
     def jacobian(
         self,

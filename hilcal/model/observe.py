@@ -2,19 +2,24 @@
 
 T_sensor_target = exp(station) T_sensor_base exp(base) T_base_flange T_flange_target'
 position read   = (1 + scale) · position
+
+Where there are several observers, each reads the position p = exp(observer) T_observer_sensor p_s
+in its own axes: a station p, a point |p| + offset, a gauge p_x (the last two as the first of three
+elements, the others zero; see `Readings`).
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilcal.cell import Cell
+from hilcal.cell import Cell, Observer
 from hilcal.robot import se3
 from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 ALL = slice(0, 6)
 """All elements of a twist."""
@@ -25,22 +30,46 @@ class Observation:
     """What the sensor would read without noise.
 
     Attributes:
-        position: (N, 3) target position, sensor axes, m.
+        position: (N, 3) what is read of the target: its position, sensor axes, m; or see above.
         rotation: (N, 3, 3) target axes in sensor axes.
         base_position: (N, 3) target position in the base axes of the chain, m.
-        axes: (N, 3, 3) orientation of the chain's base axes in sensor axes.
+        axes: (N, 3, 3) orientation of the chain's base axes in sensor axes: the derivative of
+            `position` by displacements of the target, base axes.
+        sensor: (N, 3) target position, sensor axes, m; this and the rest only where there are
+            several observers.
+        own: (N, 3) the same in the axes of the observer.
+        read: (N, 3, 3) derivative of `position` by `own`.
+        by_sensor: (N, 3, 3) derivative of `position` by `sensor`.
+        distance: (N,) 1 where a distance is read, which has an offset; else 0.
     """
 
     position: Floats
     rotation: Floats
     base_position: Floats
     axes: Floats
+    sensor: Floats | None = None
+    own: Floats | None = None
+    read: Floats | None = None
+    by_sensor: Floats | None = None
+    distance: Floats | None = None
 
 
 def observe(
-    cell: Cell, chain: Chain, deviation: Deviation, target: Ints | None = None
+    cell: Cell,
+    chain: Chain,
+    deviation: Deviation,
+    target: Ints | None = None,
+    observer: Ints | None = None,
 ) -> Observation:
-    """Read the target of a deviated chain; `target` (N,) numbers it where there are several."""
+    """Read the target of a deviated chain.
+
+    Args:
+        cell: registration, targets and observers.
+        chain: the deviated chain.
+        deviation: what it is deviated by.
+        target: (N,) number of the target, where there are several.
+        observer: (N,) number of what observes it, where there are several.
+    """
     pose = cell.target_of(target)
     offset, turn = pose[..., :3, 3], pose[..., :3, :3]
     axes, origin = cell.registration[:3, :3], cell.registration[:3, 3]
@@ -63,7 +92,76 @@ def observe(
     if deviation.scale is not None:
         position = position * (1 + deviation.scale[:, None])
     axes = np.broadcast_to(axes, rotation.shape)
+    if observer is not None and cell.observers:
+        return _observed(cell, deviation, observer, position, rotation, base_position, axes)
     return Observation(position, rotation, base_position, axes)
+
+
+def _observed(
+    cell: Cell,
+    deviation: Deviation,
+    observer: Ints,
+    sensor: Floats,
+    rotation: Floats,
+    base_position: Floats,
+    axes: Floats,
+) -> Observation:
+    """Read what is seen in sensor axes by the observers (N,)."""
+    turn, own, offset = _in_own_axes(cell.observers, observer, sensor)
+    if deviation.observer is not None:
+        twist, more = _apart(deviation.observer, _distances(cell.observers, observer))
+        moved_r, moved_p = se3.exp(twist)
+        own, turn = moved_p + se3.apply(moved_r, own), se3.product(moved_r, turn)
+        offset = offset + more
+    value, read, distance = _sensed(cell.observers, observer, own, offset)
+    by_sensor = se3.product(read, turn)
+    rotation, axes = se3.product(turn, rotation), se3.product(by_sensor, axes)
+    told = (sensor, own, read, by_sensor, distance)
+    return Observation(value, rotation, base_position, axes, *told)
+
+
+def read_by(
+    observers: Sequence[Observer], number: Ints, sensor: Floats, rotation: Floats
+) -> tuple[Floats, Floats]:
+    """Return what observers (N,) read of positions (N, 3) and attitudes, sensor axes."""
+    turn, own, offset = _in_own_axes(observers, number, sensor)
+    return _sensed(observers, number, own, offset)[0], turn @ rotation
+
+
+def _in_own_axes(
+    observers: Sequence[Observer], number: Ints, sensor: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """Orientation (N, 3, 3) of the observers, positions (N, 3) in their axes, offsets (N,)."""
+    frame = np.stack([o.frame for o in observers])[number]
+    own = frame[:, :3, 3] + se3.apply(frame[:, :3, :3], sensor)
+    return frame[:, :3, :3], own, np.array([o.offset for o in observers])[number]
+
+
+def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
+    """(N,) whether distances are read."""
+    return np.array([o.name.kind == "point" for o in observers])[number]
+
+
+def _apart(moved: Floats, far: Bools) -> tuple[Floats, Floats]:
+    """Twists (N, 6) and offsets (N,) of what observes, see `Deviation.observer`."""
+    twist = moved.copy()
+    twist[far, 3:] = 0.0
+    return twist, np.where(far, moved[:, 3], 0.0)
+
+
+def _sensed(
+    observers: Sequence[Observer], number: Ints, own: Floats, offset: Floats
+) -> tuple[Floats, Floats, Floats]:
+    """What is read (N, 3) of positions in own axes, its derivative, and where it is a distance."""
+    kind = np.array([o.name.kind for o in observers])[number]
+    far, flat = _distances(observers, number), kind == "gauge"
+    length = np.linalg.norm(own, axis=1)
+    read, value = np.tile(np.eye(3), (len(own), 1, 1)), own.copy()
+    read[far | flat], value[far | flat, 1:] = 0.0, 0.0
+    read[far, 0] = own[far] / np.maximum(length[far], 1e-12)[:, None]
+    read[flat, 0, 0] = 1.0
+    value[far, 0] = length[far] + offset[far]
+    return value, read, far.astype(float)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,7 +235,7 @@ class Motion:
         moved = twist_jacobian(np.eye(3)[None], self._unscaled(), back)
         if scale is not None:
             moved[:, :3] *= 1 + scale[:, None, None]
-        return moved[:, : self.m]
+        return self._as_read(moved[:, : self.m])
 
     def by_target(self) -> Floats:
         """Motion (N, m, 6) by the displacement of the target."""
@@ -156,12 +254,33 @@ class Motion:
         """Motion (N, m, 1) by the scale error."""
         moved = zeros(len(self.dq), self.m, 1)
         moved[:, :3, 0] = self._unscaled()
+        return self._as_read(moved)
+
+    def by_observer(self) -> Floats:
+        """Motion (N, m, 6) by the twist of the observer's frame, see `Deviation.observer`."""
+        moved = zeros(len(self.dq), self.m, 6)
+        at, twist = self.observation, self.deviation.observer
+        if at.own is not None and at.read is not None:
+            far = np.asarray(at.distance, dtype=float)
+            back = None if twist is None else -_apart(twist, far > 0)[0]
+            by = twist_jacobian(np.eye(3)[None], at.own, back)
+            moved[:, :3] = at.read @ by[:, :3]
+            moved[:, 3:] = by[:, 3 : self.m]
+            moved[far > 0, 0, 3:] = [1.0, 0.0, 0.0]
         return moved
+
+    def _as_read(self, moved: Floats) -> Floats:
+        """Motion (N, m, E) of the reading by that of the target in sensor axes."""
+        by = self.observation.by_sensor
+        if by is None:
+            return moved
+        blocks = [by @ moved[:, k : k + 3] for k in range(0, self.m, 3)]
+        return np.concatenate(blocks, axis=1)
 
     def _unscaled(self) -> Floats:
         """Position (N, 3) before the scale error, sensor axes."""
-        scale = self.deviation.scale
-        position = self.observation.position
+        scale, at = self.deviation.scale, self.observation
+        position = at.position if at.sensor is None else at.sensor
         return position if scale is None else position / (1 + scale[:, None])
 
 

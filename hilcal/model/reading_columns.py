@@ -114,7 +114,12 @@ class ReadingColumns:
             for c, to in some:
                 sums.add(moved * along_states(c.values)[:, None], to)
             return
-        sides = {"base": moves.by_base, "station": moves.by_station, "target": moves.by_target}
+        sides = {
+            "base": moves.by_base,
+            "station": moves.by_station,
+            "target": moves.by_target,
+            "observer": moves.by_observer,
+        }
         moved = sides[field]()
         for c, to in some:
             sums.add(_times(moved, c.values), to)

@@ -12,6 +12,7 @@ from hilcal.identification.fit import Fit
 from hilcal.measuring.repeatability import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, heading, note, pairs, table
 from hilcal.present.fit import model_name
+from hilcal.present.registration import observed_words
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
 
@@ -72,6 +73,8 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     if o.targets:
         yield "targets", ", ".join(f"{name} {n}" for name, n in o.targets.items())
     kind = "positions" if o.readings.m == 3 else "positions and orientations"
+    if o.readings.observers:
+        kind = observed_words(o.readings)
     yield "readings", f"{kind}; {covariance}"
 
 

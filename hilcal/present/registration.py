@@ -1,17 +1,19 @@
 """Where base and target are, what the poses could not tell, and what a covariance consists of."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from hilcal import numbers
-from hilcal.cell import Cell
+from hilcal.cell import Cell, Observer
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.misdescription import OtherArm
 from hilcal.identification.noise_estimate import NoiseEstimate
 from hilcal.identification.registration import Registration, Undetermined, register
 from hilcal.identification.robot_frames import RobotFrames
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
@@ -26,11 +28,35 @@ def registration_lines(found: Registration) -> Iterator[str]:
     """Yield where the nominal arm's base and target are, and how well the readings fit."""
     if found.estimated:
         turn = "" if found.turn_rms is None else f" and {np.degrees(found.turn_rms):.3g}°"
+        cell = found.cell
+        base = _base(cell.registration)
+        if cell.observers and np.array_equal(cell.registration, np.eye(4)):
+            base = "positions are in the axes of the base, which nothing else fixes"
+        places = "".join(f"; {_observer(o)}" for o in cell.observers if o.free)
         yield (
-            f"Registered: {_base(found.cell.registration)}; {_targets(found.cell)}. "
+            f"Registered: {base}; {_targets(cell)}{places}. "
             f"The nominal arm leaves {numbers.length(found.rms)}{turn} rms."
         )
     yield from undetermined_lines(found)
+
+
+def observed_words(readings: Readings) -> str:
+    """Return how many readings each observer made of what."""
+    what = {"station": "positions by", "point": "distances from", "gauge": "heights of"}
+    count = np.bincount(readings.observer, minlength=len(readings.observers)).tolist()
+    pairs = zip(readings.observers, count, strict=True)
+    return ", ".join(f"{n} {what[o.kind]} {o.name}" for o, n in pairs)
+
+
+def _observer(o: Observer) -> str:
+    inverse = se3.inverse(o.frame)
+    if o.name.kind == "point":
+        offset = f", offset {1e3 * o.offset:.3f} mm" if 3 in o.free else ""
+        return f"{o.name} is at {_place(se3.matrix(np.eye(3), inverse[:3, 3]))}{offset}"
+    if o.name.kind == "gauge":
+        unit = ", ".join(f"{x:.4f}" for x in o.frame[0, :3])
+        return f"{o.name} has the direction ({unit}) and reads 0 {-o.frame[0, 3]:.5f} m along it"
+    return f"{o.name} stands at {_place(inverse)}"
 
 
 def other_arm_line(found: OtherArm) -> str:
@@ -83,6 +109,11 @@ def undetermined_lines(found: Registration) -> Iterator[str]:
 
 def _told(u: Undetermined, names: tuple[str, ...]) -> str:
     own = "" if u.target is None or not names else f" {names[u.target]}"
+    moved = " and ".join(u.observers)
+    if moved:
+        others = _told(replace(u, observers=()), names)
+        alone = not np.any(u.base_shift) and not np.any(u.base_turn) and u.target is None
+        return f"the place of {moved}" if alone else f"the place of {moved} from {others}"
     moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
     base = _moves(u.base_shift, u.base_turn, "the base's", "its")
     if not moved:

@@ -226,7 +226,8 @@ def scatter_alone(readings: Readings, factor: Floats) -> Readings:
 
 
 def _of_arrival(readings: Readings, factor: Floats) -> Floats | None:
-    return None if readings.states.target is None else factor
+    s = readings.states
+    return None if s.target is None and s.observer is None else factor
 
 
 def symmetric_root(covariance: Floats) -> Floats:

@@ -37,7 +37,7 @@ def arrival_groups(readings: Readings) -> list[Group]:
 
 
 def deflection_groups(readings: Readings) -> list[Group]:
-    """Group loaded readings with the unloaded ones of their pose, cycle and target.
+    """Group loaded readings with the unloaded ones of their pose, cycle, target and observer.
 
     Targets that share the scatter of an arrival are in one group. A loaded reading whose target,
     of several, was not read unloaded in its pose and cycle makes no deflection.
@@ -50,10 +50,10 @@ def deflection_groups(readings: Readings) -> list[Group]:
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
     _refuse_without_unloaded(readings)
     keys = [readings.pose, readings.cycle]
-    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.target]))
-    unloaded, target = readings.unloaded[rows], readings.target[rows]
+    rows = np.flatnonzero(_has_unloaded(readings, [*keys, readings.line]))
+    unloaded, target = readings.unloaded[rows], readings.line[rows]
     if readings.common is None:
-        keys.append(readings.target)
+        keys.append(readings.line)
     group = _numbered([k[rows] for k in keys])
     order = np.lexsort((target, ~unloaded, group))
     starts = np.flatnonzero(np.diff(group[order], prepend=-1))

@@ -2,13 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 
+from hilcal.errors import InputError
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.types import Bools, Floats, Ints
 
+ObserverKind = Literal["station", "point", "gauge"]
 SAME_POSE = 1e-6
 """Commanded joints of one pose agree to this, rad."""
 
@@ -27,8 +30,12 @@ class States:
         joint_temperature: (N, n) °C.
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
+        torque: (N, n) static torques that the drives were measured to exert, N·m: those of load
+            and weight about the drives' axes (`Situation.torque`) with the other sign.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
+        observer: (N,) number of what observes, in the order of `Readings.observers`; None where one
+            tracker reads all.
     """
 
     q: Floats
@@ -39,7 +46,9 @@ class States:
     joint_temperature: Floats | None = None
     approach: Floats | None = None
     q_actual: Floats | None = None
+    torque: Floats | None = None
     target: Ints | None = None
+    observer: Ints | None = None
 
     def __len__(self) -> int:
         """Return the number of states N."""
@@ -58,9 +67,30 @@ class States:
         return replace(parts[0], **columns)
 
 
+@dataclass(frozen=True, slots=True)
+class ObserverName:
+    """What observes the target.
+
+    Attributes:
+        kind: "station" reads positions or poses, "point" the distance from a point, "gauge" the
+            height over a plane.
+        name: of it.
+    """
+
+    kind: ObserverKind
+    name: str
+
+    def __str__(self) -> str:
+        """Return both."""
+        return f"{self.kind} {self.name}"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Readings:
     """N readings of the target's position (m = 3) or pose (m = 6), one per state.
+
+    A distance or a height is one number: the first element of a reading of m = 3, whose others are
+    0 and have no variance, so that whitening leaves them out (`whitening.inverse_root`).
 
     Attributes:
         states: the N states.
@@ -73,6 +103,7 @@ class Readings:
         load_names: names of the loads.
         pose_names: names of the poses, as in the table.
         target_names: names of the targets that `states.target` numbers; empty where it is None.
+        observers: what `states.observer` numbers; empty where it is None.
         common: (N, m, n) factors F of the error that all readings of one arrival have in common:
             Cov(i, j) = F_i F_jᵀ for two readings i, j of one arrival (see `arrivals`); F_i F_iᵀ
             is part of `covariance`. None where no such error is known.
@@ -97,6 +128,7 @@ class Readings:
     load_names: tuple[str, ...]
     pose_names: tuple[str, ...]
     target_names: tuple[str, ...] = ()
+    observers: tuple[ObserverName, ...] = ()
     common: Floats | None = None
     scatter_stated: bool = True
     noise_stated: bool = True
@@ -175,14 +207,51 @@ class Readings:
         return np.zeros(len(self), dtype=np.int64) if given is None else given
 
     @property
+    def observer(self) -> Ints:
+        """(N,) number of what observes; 0 where one tracker reads all."""
+        given = self.states.observer
+        return np.zeros(len(self), dtype=np.int64) if given is None else given
+
+    def seen_by(self, observers: Sequence[ObserverName]) -> "Readings":
+        """Return the readings with observers numbered as those of others; as they are without any.
+
+        Raises:
+            InputError: one that is not among these.
+        """
+        if self.states.observer is None or self.observers == tuple(observers):
+            return self
+        for name in self.observers:
+            if name not in observers:
+                known = ", ".join(map(str, observers)) or "one tracker"
+                raise InputError(
+                    f"{name} observed these readings, but not those that were fitted: {known}"
+                )
+        number = np.array([list(observers).index(name) for name in self.observers])
+        states = replace(self.states, observer=number[self.observer])
+        return replace(self, states=states, observers=tuple(observers))
+
+    @property
+    def scalar(self) -> Bools:
+        """(N,) which readings are one number: a distance or a height."""
+        one = [k for k, o in enumerate(self.observers) if o.kind != "station"]
+        return np.isin(self.observer, one) & (len(one) > 0)
+
+    @property
+    def line(self) -> Ints:
+        """(N,) number of the pair of target and observer, of which deflections are taken."""
+        if self.states.observer is None:
+            return self.target
+        return self.target * max(len(self.observers), 1) + self.observer
+
+    @property
     def arrivals(self) -> Ints:
         """(N,) number of the arrival of the arm in which each reading was taken.
 
-        Readings of different targets at one pose, under one load, in one cycle are of one arrival:
-        the arm did not move between them. A target that was read several times there was read in
-        as many arrivals, in the order of the readings.
+        Readings of different targets, or by different observers, at one pose, under one load, in
+        one cycle are of one arrival: the arm did not move between them. A target that was read
+        several times there was read in as many arrivals, in the order of the readings.
         """
-        keys = np.stack([self.pose, self.load, self.cycle, self.target], axis=1)
+        keys = np.stack([self.pose, self.load, self.cycle, self.line], axis=1)
         _, of = np.unique(keys, axis=0, return_inverse=True)
         of = of.reshape(-1)
         order = np.argsort(of, kind="stable")

@@ -207,6 +207,9 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
         limits.check_shared(loaded.shape[1], m, len(loaded))
         covariance = measurement_covariance(readings, loaded, reference, weights)
         factor = _innovations(covariance) if serial else inverse_root(covariance, scaling)
+        if scaling == "none" and readings.scalar.any():  # what is not read is no residual
+            read = np.diagonal(covariance, axis1=1, axis2=2) > 0
+            factor = factor * read[:, :, None]
         rank += int(np.count_nonzero(factor.any(axis=-1)))
         buckets.append(Bucket(loaded, reference, np.ascontiguousarray(factor), weights))
     reading = np.concatenate([b.loaded.ravel() for b in buckets])

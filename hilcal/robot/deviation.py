@@ -23,6 +23,8 @@ class Deviation:
         station: (N, 6) twist of the readings about the sensor's origin, sensor axes.
         target: (N, 6) displacement of the tracked target, flange axes.
         scale: (N,) relative scale error of the sensor's ranges.
+        observer: (N, 6) twist of the position in the axes of what observes it, where there are
+            several; of a distance, which no turn changes, element 3 is the offset, m.
     """
 
     dq: Floats | None = None
@@ -31,6 +33,7 @@ class Deviation:
     station: Floats | None = None
     target: Floats | None = None
     scale: Floats | None = None
+    observer: Floats | None = None
 
     def __add__(self, other: "Deviation") -> "Deviation":
         """Add two deviations element by element."""

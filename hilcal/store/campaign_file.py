@@ -12,14 +12,14 @@ from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Self, get_args
 
 import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.names import quoted
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
 from hilcal.store.new_campaign import new_campaign
@@ -29,7 +29,7 @@ from hilcal.store.robot_file import robot_file_of
 from hilcal.store.stored_priors import join, split
 from hilcal.whole_file import replacing
 
-_TARGETS = "targets"
+_TARGETS, _OBSERVERS = "targets", "observers"
 ACCEPTED = "accepted {}"
 """Keys of the acceptances, numbered from 1; the last one holds."""
 _MEANWHILE = 1000
@@ -249,6 +249,7 @@ class CampaignFile:
         if len(readings):
             self._claim_layout(layout_of(readings))
             readings = self._numbered_targets(readings)
+            self._claim_observers(readings)
             limits.check_fitted(self.n_readings + len(readings), readings.m, f"{self.path}: ")
         rows.check_poses(self._connection, self.path, readings)
         return rows.insert_readings(self._connection, readings)
@@ -263,8 +264,8 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names = self._target_names()
-            return rows.fetch_readings(self._connection, self.path, layout, names)
+            names, by = self._target_names(), self._observers()
+            return rows.fetch_readings(self._connection, self.path, layout, names, by)
 
     def data_hash(self, count: int | None = None) -> str:
         """SHA-256 of the readings, or of the first ones; see `content_hash`."""
@@ -433,6 +434,29 @@ class CampaignFile:
                 f"{self.path}: the readings differ from those before in {', '.join(differ)}; "
                 f"a campaign holds one kind of reading, start another for these"
             )
+
+    def _observers(self) -> list[ObserverName]:
+        found = rows.stored_json(self.path, self._read_meta().get(_OBSERVERS, "[]"))
+        kinds = get_args(ObserverKind)
+        try:
+            by = [ObserverName(kind, str(name)) for kind, name in found]
+        except (TypeError, ValueError):
+            by = [ObserverName("station", "")]
+        if not all(o.kind in kinds and o.name for o in by):
+            raise InputError(f"{self.path}: the campaign file is damaged (its observers)")
+        return by
+
+    def _claim_observers(self, readings: Readings) -> None:
+        """Name the observers with the first readings; refuse others later."""
+        if readings.states.torque is not None or readings.states.observer is not None:
+            schema.require(self._connection, schema.MORE_COLUMNS)
+        if readings.states.observer is None:
+            return
+        if self._read_meta().get(_OBSERVERS) is None:
+            text = json.dumps([[o.kind, o.name] for o in readings.observers])
+            rows.insert_meta(self._connection, _OBSERVERS, text)
+        if tuple(self._observers()) != readings.observers:
+            raise InputError(f"{self.path}: the readings are by other observers than those before")
 
     def _numbered_targets(self, readings: Readings) -> Readings:
         """Return the readings with targets numbered as in the file; the first ones name them."""

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.toml import parse_json
 from hilcal.types import Floats, Ints
 
@@ -23,7 +23,9 @@ _STATE = {
     "joint_temperature": 2,
     "approach": 2,
     "q_actual": 2,
+    "torque": 2,
     "target": 1,
+    "observer": 1,
 }
 
 
@@ -85,6 +87,7 @@ def unpack(
     pose_names: Sequence[str],
     load_names: Sequence[str],
     target_names: Sequence[str] = (),
+    observers: Sequence[ObserverName] = (),
 ) -> Readings:
     """Readings from (N, K) records and (N, 3) indices of pose, load and cycle."""
     count, at = len(records), 0
@@ -96,9 +99,11 @@ def unpack(
     value, covariance = fields.pop("value"), fields.pop("covariance")
     m = value.shape[1]
     target = fields.pop("target", None)
+    observer = fields.pop("observer", None)
     number = None if target is None else target.astype(np.int64)
+    by = None if observer is None else observer.astype(np.int64)
     return Readings(
-        states=States(**fields, target=number),
+        states=States(**fields, target=number, observer=by),
         pose=index[:, 0].copy(),
         load=index[:, 1].copy(),
         cycle=index[:, 2].copy(),
@@ -107,6 +112,7 @@ def unpack(
         load_names=tuple(load_names),
         pose_names=tuple(pose_names),
         target_names=() if target is None else tuple(target_names),
+        observers=() if observer is None else tuple(observers),
     )
 
 
@@ -124,6 +130,9 @@ def content_hash(readings: Readings) -> str:
     if readings.states.target is not None:
         named.append((readings.target, readings.target_names))
         readings = replace(readings, states=replace(readings.states, target=None))
+    if readings.states.observer is not None:
+        named.append((readings.observer, tuple(map(str, readings.observers))))
+        readings = replace(readings, states=replace(readings.states, observer=None))
     for index, names in named:
         used = list(dict.fromkeys(index.tolist()))
         order = {k: i for i, k in enumerate(dict.fromkeys(names[k] for k in used))}

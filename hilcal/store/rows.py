@@ -12,7 +12,7 @@ from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import is_covariance
-from hilcal.readings.readings import SAME_POSE, Readings
+from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.store.records import Layout, pack, unpack
 from hilcal.toml import parse_json
 from hilcal.types import Ints
@@ -107,7 +107,11 @@ def insert_readings(connection: sqlite3.Connection, readings: Readings) -> int:
 
 
 def fetch_readings(
-    connection: sqlite3.Connection, path: Path, layout: Layout, target_names: Sequence[str] = ()
+    connection: sqlite3.Connection,
+    path: Path,
+    layout: Layout,
+    target_names: Sequence[str] = (),
+    observers: Sequence[ObserverName] = (),
 ) -> Readings:
     """All readings, in order.
 
@@ -120,7 +124,7 @@ def fetch_readings(
     width = sum(width for _, width in layout)
     limits.check_fitted(count, dict(layout)["value"], f"{path}: ")
     with limits.memory(str(path)):
-        return _fetched(connection, path, layout, target_names, count, width)
+        return _fetched(connection, path, layout, target_names, observers, count, width)
 
 
 def _fetched(
@@ -128,12 +132,13 @@ def _fetched(
     path: Path,
     layout: Layout,
     target_names: Sequence[str],
+    observers: Sequence[ObserverName],
     count: int,
     width: int,
 ) -> Readings:
     """Return the first `count` readings of records of `width` numbers."""
     names = [fetch_names(connection, table) for table in ("poses", "loads")]
-    check_names([*names, target_names], f"{path}: name")
+    check_names([*names, target_names, [o.name for o in observers]], f"{path}: name")
     rows = connection.execute(
         "SELECT id, pose, load, cycle, record, crc FROM readings ORDER BY id LIMIT ?", (count,)
     )
@@ -152,7 +157,7 @@ def _fetched(
         raise InputError(f"{path}: the campaign file is damaged at reading {bad[0] + 1}")
     if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
         raise InputError(f"{path}: the campaign file is damaged (names are missing)")
-    readings = unpack(records, layout, index, names[0], names[1], target_names)
+    readings = unpack(records, layout, index, names[0], names[1], target_names, observers)
     if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
         raise InputError(
             f"{path}: the campaign file is damaged at reading {bad[0] + 1}: its covariance is not "
@@ -161,6 +166,9 @@ def _fetched(
     target = readings.states.target
     if target is not None and not 0 <= target.min() <= target.max() < len(target_names):
         raise InputError(f"{path}: the campaign file is damaged (targets are missing)")
+    by = readings.states.observer
+    if by is not None and not 0 <= by.min() <= by.max() < len(observers):
+        raise InputError(f"{path}: the campaign file is damaged (observers are missing)")
     return readings
 
 

@@ -20,7 +20,10 @@ from hilcal import limits
 from hilcal.errors import DeviceError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 6
+VERSION = 7
+MORE_COLUMNS = 7
+"""Version of a file whose readings have joint torques, or are of several observers (stations,
+distances, gauges): programs that do not know these would take the file for damaged."""
 CHANGED_CELL = 6
 """Version of a file with a revision that was fitted in a cell that was changed since its readings
 were taken: programs that do not know it would take the cell as it was."""

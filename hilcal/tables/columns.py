@@ -19,6 +19,9 @@ TEXT = ("pose", "load")
 TARGET = "target"
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
 COVERS = "covers"
+STATION = "station"
+ONE = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
+"""Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
 AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
@@ -52,6 +55,12 @@ def approach_columns(n: int) -> tuple[str, ...]:
     return tuple(f"approach{i}" for i in range(1, n + 1))
 
 
+def torque_columns(units: Units) -> tuple[str, ...]:
+    """Columns of the static torques that drives exert, as measured, N·m; of slides forces, N."""
+    of = {"q": "tau", "_rad": "_Nm", "_m": "_N"}
+    return tuple(re.sub("q|_rad|_m", lambda m: of[m[0]], name) for name in joint_columns(units))
+
+
 def covariance_columns(m: int) -> tuple[str, ...]:
     """Columns of the upper triangle of an (m, m) covariance, row by row."""
     return tuple(f"cov_{_AXES[i]}_{_AXES[j]}" for i in range(m) for j in range(i, m))
@@ -62,10 +71,19 @@ def required_columns(units: Units) -> tuple[str, ...]:
     return (*TEXT, *joint_columns(units), *POSITION)
 
 
+def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
+    """Columns of numbers that rows may leave empty: readings, where a table has several kinds."""
+    one = [c for kind in ONE.values() for c in (kind[0], kind[2])]
+    if not any(kind[0] in header for kind in ONE.values()):
+        return ()
+    return (*POSITION, *ROTATION, *covariance_columns(6), *one)
+
+
 def groups(units: Units) -> tuple[tuple[str, ...], ...]:
     """Optional columns of which a table has all or none."""
     n = len(joint_columns(units))
-    return ROTATION, temperature_columns(n), approach_columns(n), actual_columns(units)
+    of_joints = temperature_columns(n), approach_columns(n)
+    return ROTATION, *of_joints, actual_columns(units), torque_columns(units)
 
 
 def known_columns(units: Units) -> tuple[str, ...]:
@@ -74,6 +92,8 @@ def known_columns(units: Units) -> tuple[str, ...]:
         *required_columns(units),
         TARGET,
         COVERS,
+        STATION,
+        *(name for kind in ONE.values() for name in kind),
         *covariance_columns(6),
         *WRENCH,
         *("cycle", "time_s", "load_time_s", "air_degC"),
@@ -107,7 +127,12 @@ def check_header(
         if count > 1:
             raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
     known, n = known_columns(units), len(joint_columns(units))
-    missing = [c for c in required_columns(units) if c not in header and c not in spare]
+    needed = required_columns(units)
+    if any(name in header for kind in ONE.values() for name in kind):
+        _check_one(path, header)
+    if sparse_columns(header):
+        needed = needed if POSITION[0] in header else needed[:-3]
+    missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
@@ -124,6 +149,21 @@ def check_header(
                 f"{path}: column '{lacking[0]}' is missing; give all of "
                 f"{', '.join(group)} or none of them"
             )
+
+
+def _check_one(path: str, header: Sequence[str]) -> None:
+    """Refuse distances and heights without the name of what they are of, or beside orientations."""
+    for value, name, variance in ONE.values():
+        for other in (name, variance):
+            if other in header and value not in header:
+                raise InputError(f"{path}: column '{other}' without column '{value}'")
+        if value in header and name not in header:
+            raise InputError(f"{path}: column '{name}' is missing; it names what '{value}' is of")
+    if ROTATION[0] in header:
+        raise InputError(
+            f"{path}: column '{ROTATION[0]}': a table of distances or heights has positions beside "
+            "them, no orientations; give those in a table of their own"
+        )
 
 
 def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> str:

@@ -4,7 +4,7 @@ Files become a `Grid` in `hilcal.tables.files`; what its columns mean is said by
 exchange table) or by a mapping, and makes a `Table` of numbers and texts of it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 
@@ -152,14 +152,30 @@ class Table:
     alias: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, grid: Grid, text: Sequence[str], number: Sequence[str]) -> "Table":
-        """Return the columns of these names; each of their cells has a value.
+    def of(
+        cls,
+        grid: Grid,
+        text: Sequence[str],
+        number: Sequence[str],
+        sparse: Collection[str] = (),
+    ) -> "Table":
+        """Return the columns of these names; each of their cells has a value but for `sparse` ones.
 
         Raises:
             InputError: a cell that is no number; names row and column.
         """
-        numbers = {name: grid.numbers(name, complete=True) for name in number}
+        numbers = {name: grid.numbers(name, complete=name not in sparse) for name in number}
         return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
+
+    def taken(self, rows: Bools) -> "Table":
+        """Return the chosen rows."""
+        at = np.flatnonzero(rows).tolist()
+        return replace(
+            self,
+            rows=self.rows[rows],
+            text={name: [cells[k] for k in at] for name, cells in self.text.items()},
+            number={name: values[rows] for name, values in self.number.items()},
+        )
 
     def at(self, index: int, column: str | None = None) -> str:
         """Where a record (and a cell) is, for messages."""

@@ -9,7 +9,7 @@ from hilcal import limits
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.readings.covariance import WHOLE, tracker_noise
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 from hilcal.tables.mapped import import_mapped
@@ -51,7 +51,7 @@ def import_readings(
     if mapping is None and second is not None:
         raise InputError(f"--second {second}: only for a --format with a section [second_file]")
     if mapping is None:
-        result = import_table(path, arm, noise, station, targets)
+        result = import_table(path, arm, noise, station, targets, _std(config))
     else:
         gravity = config.robot.gravity_m_s2
         result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
@@ -65,6 +65,13 @@ def import_readings(
     kept, named = _named_loads(result.readings[~copied], config)
     stated_noise = stated or tracker.states_noise
     return ImportResult(kept, (*notes, *named), covers, stated_noise, not stated)
+
+
+def _std(config: CellConfig) -> dict[ObserverName, float]:
+    """Return the standard deviations of distances and heights that the cell states."""
+    points = {ObserverName("point", k): p.std_m for k, p in config.points.items()}
+    gauges = {ObserverName("gauge", k): g.std_m for k, g in config.gauges.items()}
+    return {name: std for name, std in (points | gauges).items() if std is not None}
 
 
 def _mapping(form: str | Path) -> Mapping | None:
@@ -117,7 +124,7 @@ def _copies(readings: Readings) -> Bools:
         return none
     given = [s.time, s.load_time, s.air_temperature]
     columns = [s.q, s.wrench, value, *(x[:, None] for x in given if x is not None)]
-    names = np.stack([readings.load, readings.cycle, readings.target], axis=1)
+    names = np.stack([readings.load, readings.cycle, readings.line], axis=1)
     keys = np.concatenate([*columns, names], axis=1)
     _, first, of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     copied = first[of.reshape(-1)] != np.arange(len(readings))

@@ -9,22 +9,25 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise, tracker_covariance
-from hilcal.readings.readings import Readings, States
+from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.tables import checks, columns
 from hilcal.tables.columns import following_columns, with_following
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import Table
 from hilcal.tables.mapping import FileFormat
+from hilcal.tables.observed import observed_of, observer_columns
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
 from hilcal.toml import suggest
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
+LARGEST_NM = 1e5
+"""No joint of an arm carries as much, N·m."""
 FORM = FileFormat(encoding="utf-8")
 
 
@@ -65,6 +68,7 @@ def import_table(
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
     targets: Sequence[str] = (),
+    std: Mapping[ObserverName, float] | None = None,
 ) -> ImportResult:
     """Read an exchange table; every unit is SI, every complaint names row and column.
 
@@ -74,6 +78,7 @@ def import_table(
         noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         targets: names of the cell's targets, see `Cell.target_names`.
+        std: as of `readings_of`.
 
     Returns:
         The readings in the table's order, poses and loads numbered as they appear; and notes on
@@ -84,7 +89,9 @@ def import_table(
     """
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
-    return readings_of(Table.of(grid, *chosen), arm, noise, station, targets=targets)
+    sparse = columns.sparse_columns(grid.names)
+    table = Table.of(grid, chosen[0], chosen[1], sparse)
+    return readings_of(table, arm, noise, station, targets=targets, std=std)
 
 
 def readings_of(
@@ -95,6 +102,7 @@ def readings_of(
     covariance: Floats | None = None,
     targets: Sequence[str] = (),
     rounding: Floats | None = None,
+    std: Mapping[ObserverName, float] | None = None,
 ) -> ImportResult:
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
@@ -107,6 +115,7 @@ def readings_of(
         targets: names of the cell's targets, see `Cell.target_names`.
         rounding: (3,) variance of the positions' rounding, m²; found from the positions where
             None. It is added where it counts beside the covariance.
+        std: standard deviations of distances and heights, m, for a table that states none.
 
     Raises:
         InputError: anything that cannot be right.
@@ -115,10 +124,45 @@ def readings_of(
     pose, pose_names = _index(table.text["pose"])
     load, load_names = _index(table.text["load"])
     target = _targets(table, targets)
-    states, value = measured_of(table, arm)
-    states = replace(states, target=target)
+    observed = observed_of(table)
+    whole = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
+    states, value = measured_of(table, arm, whole)
+    by = None if observed is None else observed.number
+    states = replace(states, target=target, observer=by)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
+    cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
+    if whole.all():
+        cov, notes, covers = _covariance(table, value, noise, station, covariance, rounding)
+    elif whole.any():
+        some = table.taken(whole), value[whole]
+        cov[whole], notes, covers = _covariance(*some, noise, station, None, rounding)
+    if observed is not None:
+        value, cov = observed.put(table, value, cov, std or {})
+    readings = Readings(
+        states=states,
+        pose=pose,
+        load=load,
+        cycle=_cycles(table),
+        value=value,
+        covariance=cov,
+        load_names=tuple(load_names),
+        pose_names=tuple(pose_names),
+        target_names=() if target is None else tuple(targets),
+        observers=() if observed is None else observed.names,
+    )
+    return ImportResult(readings, notes, covers)
+
+
+def _covariance(
+    table: Table,
+    value: Floats,
+    noise: TrackerNoise | None,
+    station: Floats | Sequence[float] | None,
+    covariance: Floats | None,
+    rounding: Floats | None,
+) -> tuple[Floats, tuple[str, ...], str]:
+    """Covariances (N, m, m) of positions or poses, notes on them, and what they cover."""
     stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
@@ -134,18 +178,7 @@ def readings_of(
     if rounding is None:
         rounding = np.zeros(3) if included else rounding_variance(value[:, :3], 1.0)
     cov, rounded = with_rounding(cov, rounding)
-    readings = Readings(
-        states=states,
-        pose=pose,
-        load=load,
-        cycle=_cycles(table),
-        value=value,
-        covariance=cov,
-        load_names=tuple(load_names),
-        pose_names=tuple(pose_names),
-        target_names=() if target is None else tuple(targets),
-    )
-    return ImportResult(readings, (*notes, *rounded), covers)
+    return cov, (*notes, *rounded), covers
 
 
 def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], Sequence[str]]:
@@ -165,7 +198,8 @@ def _choose(path: str, header: Sequence[str], arm: Arm) -> tuple[Sequence[str], 
         )
     columns.check_header(path, header, arm.units, arm.name, following_columns(arm))
     columns.covariance_size(path, header)
-    optional = (columns.TARGET, columns.COVERS)
+    named = [name for _, name, _ in columns.ONE.values()]
+    optional = (columns.TARGET, columns.COVERS, columns.STATION, *named)
     text = (*columns.TEXT, *(name for name in header if name in optional))
     return text, [name for name in header if name in known and name not in text]
 
@@ -245,14 +279,28 @@ def check_covers(word: str, where: str) -> None:
         )
 
 
-def measured_of(table: Table, arm: Arm) -> tuple[States, Floats]:
+def measured_of(table: Table, arm: Arm, whole: Bools | None = None) -> tuple[States, Floats]:
     """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
+
+    Args:
+        table: the rows.
+        arm: its number of joints, their limits and its reach are checked.
+        whole: (N,) rows with a position, others are zero; all of them where None.
 
     Raises:
         InputError: a value that cannot be right.
     """
-    states, value = _states(table, arm), table.matrix(columns.POSITION)
-    checks.check_positions(table, value, states.q, arm)
+    states = _states(table, arm)
+    if whole is not None and not whole.all():
+        value = np.zeros((len(table.rows), 3))
+        if whole.any():
+            value[whole] = measured_of(table.taken(whole), arm)[1]
+        return states, value
+    value = table.matrix(columns.POSITION)
+    station = np.array(table.text.get(columns.STATION, [""] * len(value)))
+    for name in dict.fromkeys(station.tolist()):
+        mine = station == name
+        checks.check_positions(table.taken(mine), value[mine], states.q[mine], arm)
     if columns.ROTATION[0] in table.number:
         rotation = table.matrix(columns.ROTATION)
         checks.check_rotations(table, rotation)
@@ -271,6 +319,7 @@ def _states(table: Table, arm: Arm) -> States:
     temperature = _group(table, columns.temperature_columns(n))
     approach = _group(table, columns.approach_columns(n))
     actual = _group(table, reported)
+    torque = _group(table, columns.torque_columns(arm.units))
     if approach is not None:
         names = columns.approach_columns(n)
         table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
@@ -278,6 +327,8 @@ def _states(table: Table, arm: Arm) -> States:
         checks.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
+    if torque is not None:
+        _in_range(table, columns.torque_columns(arm.units), -LARGEST_NM, LARGEST_NM, "N·m or N")
     if "air_degC" in number:
         _in_range(table, ("air_degC",), -50, 80, "°C")
     if "time_s" in number:
@@ -293,6 +344,7 @@ def _states(table: Table, arm: Arm) -> States:
         joint_temperature=temperature,
         approach=approach,
         q_actual=actual,
+        torque=torque,
     )
 
 
@@ -378,6 +430,8 @@ def write_table(
     }
     if readings.states.target is not None:
         found[columns.TARGET] = _names(readings.target_names, readings.target, columns.TARGET)
+    if readings.states.observer is not None:
+        found |= observer_columns(readings)
     if covers != INSTRUMENT:
         found[columns.COVERS] = [covers] * len(readings)
     header, numbers = _number_columns(readings, units)
@@ -391,8 +445,11 @@ def with_what_rounding_does(covers: str, readings: Readings) -> str:
     Where reading a table would add the variance of the positions' rounding, it says that this is in
     them already.
     """
-    rounding = rounding_variance(readings.value[:, :3], 1.0)
-    return covers + ROUNDING * bool(with_rounding(readings.covariance, rounding)[1])
+    whole = ~readings.scalar
+    if not whole.any():
+        return covers
+    rounding = rounding_variance(readings.value[whole, :3], 1.0)
+    return covers + ROUNDING * bool(with_rounding(readings.covariance[whole], rounding)[1])
 
 
 def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
@@ -414,11 +471,16 @@ def _number_columns(
     """Names and (N,) arrays of the number columns that the readings have."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
+    value, cov = readings.value, readings.covariance[:, i, j]
+    if (one := readings.scalar).any():
+        value, cov = value.copy(), cov.copy()
+        value[one] = cov[one] = np.nan
+    any_whole = not one.all()
     blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
         (("cycle",), readings.cycle),
         (columns.joint_columns(units or n), s.q),
-        ((columns.POSITION + columns.ROTATION)[:m], readings.value),
-        (columns.covariance_columns(m), readings.covariance[:, i, j]),
+        ((columns.POSITION + columns.ROTATION)[:m], value if any_whole else None),
+        (columns.covariance_columns(m), cov if any_whole else None),
         (columns.WRENCH, s.wrench if np.any(s.wrench) or np.signbit(s.wrench).any() else None),
         (("time_s",), s.time),
         (("load_time_s",), s.load_time),
@@ -426,6 +488,7 @@ def _number_columns(
         (columns.temperature_columns(n), s.joint_temperature),
         (columns.approach_columns(n), s.approach),
         (columns.actual_columns(units or n), s.q_actual),
+        (columns.torque_columns(units or n), s.torque),
     ]
     header: list[str] = []
     numbers: list[Floats | Ints] = []

@@ -85,13 +85,15 @@ def _cell(value: object) -> object:
     """Return a cell as CSV writes it."""
     if isinstance(value, str):
         return csv_text(value)
-    return "" if value is None else repr(value) if isinstance(value, float) else value
+    if value is None or value != value:
+        return ""
+    return repr(value) if isinstance(value, float) else value
 
 
 def _arrow(path: Path, columns: Mapping[str, list[Any]], about: Mapping[str, object]) -> Any:
     arrow = package(path, "pyarrow", "Parquet")
     texts = ([escaped(v) if isinstance(v, str) else v for v in c] for c in columns.values())
-    arrays = [arrow.array(values) for values in texts]
+    arrays = [arrow.array(values, from_pandas=True) for values in texts]
     fields = []
     for name, array in zip(columns, arrays, strict=True):
         unit = unit_of(name)

@@ -44,7 +44,8 @@ def wide(rng: np.random.Generator) -> tuple[Columns, Ints]:
 def expected(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats) -> Floats:
     """Sum them one by one."""
     out = np.zeros((COUNT, moves.m, SIZE))
-    sides = {"base": moves.by_base, "station": moves.by_station, "target": moves.by_target}
+    fields = ("base", "station", "target", "observer")
+    sides = {field: getattr(moves, f"by_{field}") for field in fields}
     for c, place in blocks:
         for k, at in enumerate(place[c.parameter]):
             if at < 0:

@@ -1,0 +1,331 @@
+"""Stations, distances and heights: derivative, registration, fits, verdicts, tables, refusals."""
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.cell import Cell
+from hilcal.config.observers import Gauge, Point
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.effects.catalogue import installed
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.registration import register
+from hilcal.identification.validation import validate
+from hilcal.model.model import Model
+from hilcal.present.registration import undetermined_lines
+from hilcal.readings.readings import ObserverName, Readings
+from hilcal.readings.whitening import Mode
+from hilcal.robot import se3
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.tables.table import read_table, write_table
+from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
+from tests.support.cli_cases import CELL, Capsys, ok
+from tests.support.effect_cases import numeric_slopes, random_theta, some_states
+from tests.support.fit_cases import named
+from tests.support.observer_cases import NORMAL, POINTS, Observed, base_cell, observed, stated
+
+Case = Callable[[int], Observed]
+KNOWN = replace(base_cell(stated("ABC")), registration_known=True)
+CASES: dict[str, Case] = {
+    "two stations": lambda seed: observed(["S1", "S2"], seed, alternate=True),
+    "station, point and gauge": lambda seed: observed(["S1", "A", "G"], seed),
+    "three unknown points": lambda seed: observed(["A", "B", "C"], seed, base=True),
+    "three known points": lambda seed: observed(["A", "B", "C"], seed, cell=KNOWN, base=True),
+    "a gauge": lambda seed: observed(["G"], seed, base=True),
+}
+
+
+def fitted(c: Observed, mode: Mode = "absolute") -> Fit:
+    joint_std = configuration().repeatability.per_joint(6)
+    readings = with_joint_scatter(c.cell, c.readings, joint_std)
+    return fit(baseline(c.cell, readings, mode), readings, mode)
+
+
+def apart(c: Observed, found: Fit) -> np.ndarray:
+    """Errors of the compliances over their standard uncertainties."""
+    truth = true_parameters(c.world, "joint_compliance")
+    told = [v for k, v in named(found).items() if k.startswith("joint_compliance")]
+    return np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
+
+
+NAMES = [
+    ObserverName("station", "S1"),
+    ObserverName("station", "S2"),
+    ObserverName("point", "A"),
+    ObserverName("gauge", "G"),
+]
+
+
+@pytest.mark.parametrize("moved", [0.0, 20.0])
+def test_jacobian_is_the_derivative_of_the_prediction(moved: float) -> None:
+    points = {"A": Point(estimate_offset=True)}
+    cell = replace(base_cell(points), registration_known=False)
+    cell = replace(cell.observed_by(NAMES), target_known=False)
+    turn = se3.matrix(se3.rotation(np.array([0.3, -0.4, 0.9])), np.array([0.7, 1.9, -0.4]))
+    placed = [replace(o, frame=turn if o.free else o.frame) for o in cell.observers]
+    cell = replace(cell, observers=tuple(placed))
+    states = replace(some_states(cell, 12), observer=np.arange(12) % 4)
+    names = ("base_frame", "target_offset", "joint_compliance", "tracker_drift", "tracker_scale")
+    effects = tuple(installed().make(n, cell, states) for n in (*names, "observer_frame"))
+    model = Model(cell, effects)
+    theta = moved * random_theta(effects, np.random.default_rng(4))
+    jacobian = model.jacobian(model.predict(states, theta), theta, 3)
+    scale = np.concatenate([e.magnitudes for e in effects])
+    steps = np.diag(1e-2 * scale)
+    slopes = numeric_slopes(model, states, theta, steps, 3) / (1e-2 * scale)
+    np.testing.assert_allclose(
+        jacobian * scale, slopes * scale, atol=1e-8 * np.abs(jacobian * scale).max()
+    )
+    assert len(effects[-1].parameters) == 6 + 4 + 3
+    assert [p.unit for p in effects[-1].parameters[6:10]] == ["m"] * 4
+
+
+@pytest.mark.parametrize("mode", ["absolute", "deflection"])
+@pytest.mark.parametrize("case", CASES)
+def test_true_parameters_lie_in_their_bands_and_residuals_are_noise(case: str, mode: Mode) -> None:
+    found = [(c := CASES[case](seed), fitted(c, mode)) for seed in range(12)]
+    z = np.array([apart(c, f) for c, f in found])
+    # 72 errors of about a third as many independent ones: their rms scatters by 0.12.
+    assert 0.6 < np.sqrt(np.mean(z**2)) < 1.4
+    factors = [f.variance_factor for _, f in found]
+    assert 0.9 < np.mean(factors) < 1.1
+    assert sum(int(f.outlier.sum()) for _, f in found) == 0
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_verdicts(case: str) -> None:
+    for seed, effect in ((20, None), (21, None), (22, "joint_tilt_compliance"), (23, "creep")):
+        who, kept = {
+            "two stations": (["S1", "S2"], {"alternate": True}),
+            "station, point and gauge": (["S1", "A", "G"], {}),
+            "three unknown points": (["A", "B", "C"], {"base": True}),
+            "three known points": (["A", "B", "C"], {"base": True, "cell": KNOWN}),
+            "a gauge": (["G"], {"base": True}),
+        }[case]
+        d = diagnose(fitted(observed(who, seed, effect=effect, strength=5.0, **kept)))
+        if effect is None:
+            assert d.verdict == "adequate"
+        else:
+            assert d.verdict == "missing_effect"
+            assert d.suspects[0].effect == effect
+
+
+def test_where_stations_points_and_gauges_are() -> None:
+    c = observed(["S1", "S2", "A", "G"], 3)
+    f = fitted(c)
+    cell, values = f.model.cell, named(f)
+    _, station, point, gauge = cell.observers
+    turn = se3.rotation(np.array([0.1, -0.2, 2.2]))
+    for name, true, of in (
+        ("point A", np.array(POINTS["A"]), point),
+        ("station S2", np.array([0.4, 1.9, 0.3]), station),
+    ):
+        del name
+        own = np.array([values[f"observer_frame.{of.name.name}.{a}"] for a in "xyz"])
+        begun = -of.frame[:3, 3] if of is point else of.frame[:3, 3]
+        at = begun + own[:, 0]
+        if of is station:
+            twist = [values[f"observer_frame.S2.{a}"][0] for a in ("x", "y", "z", "rx", "ry", "rz")]
+            at = (se3.matrix(*se3.exp(np.array(twist))) @ of.frame)[:3, 3]
+            np.testing.assert_allclose(of.frame[:3, :3], turn, atol=2e-3)
+        assert np.all(np.abs(at - true) < 4 * own[:, 1])
+    assert np.degrees(np.arccos(gauge.frame[0, :3] @ NORMAL)) < 0.5
+
+
+def test_fresh_readings_are_predicted_to_their_noise() -> None:
+    c = observed(["A", "B", "C"], 5, base=True, poses=20)
+    f = fitted(c)
+    fresh = observed(["A", "B", "C"], 5, base=True, poses=14)
+    other = replace(observed(["C", "A", "B"], 6, base=True), world=c.world)
+    del fresh
+    # The arm of seed 6 is another one: its readings are made anew by the arm of seed 5.
+    at = c.world.sight(other.readings.states).position
+    names = other.readings.observers
+    centre = np.array([POINTS[names[k].name] for k in other.readings.observer])
+    value = other.readings.value.copy()
+    noise = np.random.default_rng(1).standard_normal(len(value))
+    value[:, 0] = np.linalg.norm(at - centre, axis=1) + 1e-5 * noise
+    readings = replace(other.readings, value=value)
+    found = validate(f.model, f.theta, f.readings, readings, "absolute")
+    assert found.readings.observers == c.readings.observers
+    assert found.error.rms_m < 3e-5
+
+
+def test_a_bar_of_unknown_length() -> None:
+    cell = base_cell({"A": Point(estimate_offset=True)})
+    c = observed(["S1", "A"], 2, cell=cell)
+    value = c.readings.value.copy()
+    value[c.readings.scalar, 0] += 0.123
+    f = fitted(replace(c, readings=replace(c.readings, value=value)))
+    found, std = named(f)["observer_frame.A.offset"]
+    offset = f.model.cell.observers[1].offset + found
+    assert abs(offset - 0.123) < 4 * std
+    assert std < 1e-3
+    assert 0.8 < f.variance_factor < 1.25
+
+
+def test_a_direction_that_is_known() -> None:
+    gauges = {"G": Gauge(direction=tuple(2.0 * NORMAL))}
+    c = observed(["S1", "G"], 4, cell=base_cell(gauges=gauges))
+    f = fitted(c)
+    assert [k for k in named(f) if k.startswith("observer_frame")] == ["observer_frame.G.x"]
+    assert 0.8 < f.variance_factor < 1.25
+
+
+def test_what_distances_do_not_tell_is_named() -> None:
+    c = observed(["A", "B"], 1, cell=base_cell(stated("AB")))
+    found = register(c.cell, c.readings)
+    (line,) = undetermined_lines(found)
+    assert "the base's" in line
+    assert "turn about its direction" in line
+    f = fitted(c)
+    assert np.sqrt(np.mean(apart(c, f) ** 2)) < 2.5
+    free = observed(["A", "B", "C", "D"], 1, cell=base_cell(stated("ABCD")))
+    assert not register(free.cell, free.readings).undetermined
+
+
+def test_too_few_readings_of_a_point_are_refused_by_name() -> None:
+    c = observed(["S1", "A"], 1)
+    few = (c.readings.observer == 0) | (c.readings.pose < 2)
+    with pytest.raises(CannotAnswerError, match=r"point A has readings of .* 3 unknowns"):
+        register(c.cell, c.readings[few])
+
+
+def test_a_distance_that_is_far_off_is_set_aside() -> None:
+    c = observed(["A", "B", "C"], 8, base=True)
+    value = c.readings.value.copy()
+    value[17, 0] += 3e-3
+    value[40, 0] += 2e-4
+    f = fitted(replace(c, readings=replace(c.readings, value=value)))
+    assert np.flatnonzero(f.outlier).tolist() == [17, 40]
+
+
+def test_tables_files_and_calibrations_keep_observers(tmp_path: Path) -> None:
+    c = observed(["S1", "S2", "A", "G"], 0)
+    write_table(c.readings, tmp_path / "t.csv")
+    write_table(c.readings, tmp_path / "t.parquet")
+    back = read_table(tmp_path / "t.csv", cell_of().arm, None)
+    assert content_hash(back) == content_hash(c.readings)
+    assert content_hash(read_table(tmp_path / "t.parquet", cell_of().arm, None)) == content_hash(
+        back
+    )
+    with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
+        file.append_readings(back[:10])
+        file.append_readings(back[10:])
+        assert content_hash(file.readings()) == content_hash(back)
+        with pytest.raises(InputError, match="other observers"):
+            file.append_readings(observed(["S1", "S2", "B", "G"], 0).readings)
+    f = fitted(c)
+    made = Calibration.of(f)
+    made.save(tmp_path / "c.json")
+    again = Calibration.load(tmp_path / "c.json")
+    q = c.readings.states.q[:4]
+    np.testing.assert_allclose(again.predict(q).position, made.predict(q).position, atol=1e-12)
+
+
+def test_commands(tmp_path: Path, capsys: Capsys) -> None:
+    c = observed(["S1", "S2", "A", "G"], 5, effect="joint_tilt_compliance", strength=5.0)
+    write_table(c.readings, tmp_path / "t.csv")
+    (tmp_path / "cell.toml").write_text(CELL.read_text())
+    run = tmp_path / "r.hilcal"
+    told = ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", run)
+    words = " ".join(told.out.split())
+    assert "60 positions by S1, 60 positions by S2, 60 distances from A, 60 heights of G" in words
+    assert re.search(r"point A is at \(1\.\d+, 0\.\d+, -0\.\d+\) m; gauge G has", words)
+    refined = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
+    assert refined["verdict"] == "adequate"
+    assert refined["revisions"][-1]["added"] == "joint_tilt_compliance"
+    assert ok(capsys, "info", run, "--json").document["revisions"]
+    ok(capsys, "report", run, "-o", tmp_path / "r.html")
+
+
+HEADER = "pose,load,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad"
+Q = "p1,none,0,-1,0,0,0,0"
+
+
+@pytest.mark.parametrize(
+    ("more", "cells", "message"),
+    [
+        ("distance_m,from", "1.0,A", r"row 2: nothing states the noise of point A; .*'cov_d_d'"),
+        ("distance_m,cov_d_d", "1.0,1e-10", r"column 'from' is missing; it names what"),
+        ("distance_m,from,cov_d_d", "1.0,,1e-10", r"row 2, column 'from': the cell is empty"),
+        ("distance_m,from,cov_d_d", "-1.0,A,1e-10", r"'distance_m': -1 m cannot be right"),
+        ("distance_m,from,cov_d_d", "1.0,A,0", r"'cov_d_d': a variance of 0 m² cannot be right"),
+        ("distance_m,from,cov_d_d", ",A,1e-10", r"row 2: 0 readings; valid: just one of"),
+        (
+            "x_m,y_m,z_m,distance_m,from,cov_d_d",
+            "0.5,0.1,0.2,1.0,A,1e-10",
+            r"row 2: 2 readings; valid: just one of x_m, y_m, z_m, distance_m in each row",
+        ),
+        (
+            "x_m,y_m,z_m,distance_m,from,cov_d_d",
+            "0.5,,0.2,,A,1e-10",
+            r"row 2: a part of a position; valid: just one of",
+        ),
+        ("gauge", "G", r"column 'gauge' without column 'gauge_m'"),
+        (
+            "x_m,y_m,z_m,rx_rad,ry_rad,rz_rad,gauge_m,gauge",
+            "0,0,0,0,0,0,0,G",
+            r"column 'rx_rad': a table of distances or heights has positions",
+        ),
+    ],
+)
+def test_wrong_tables(tmp_path: Path, more: str, cells: str, message: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(f"{HEADER},{more}\n{Q},{cells}\n")
+    with pytest.raises(InputError, match=message) as raised:
+        read_table(path, cell_of().arm, None)
+    assert "\n" not in str(raised.value)
+
+
+def test_stations_of_poses() -> None:
+    """Attitudes are read in each station's own axes."""
+    whole = campaign(seed=3, m=6).readings
+    turn, shift = se3.rotation(np.array([0.2, 0.1, -1.0])), np.array([0.5, 2.0, -0.3])
+    second, value = whole.pose % 2 == 1, whole.value.copy()
+    value[second, :3] = value[second, :3] @ turn.T + shift
+    attitude = turn @ se3.rotation(value[second, 3:])
+    value[second, 3:] = se3.rotation_vector(attitude)
+    six = np.kron(np.eye(2), turn)
+    cov = whole.covariance.copy()
+    cov[second] = six @ cov[second] @ six.T
+    names = (ObserverName("station", "one"), ObserverName("station", "two"))
+    states = replace(whole.states, observer=second.astype(np.int64))
+    cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
+    readings = replace(whole, states=states, value=value, covariance=cov, observers=names)
+    cell = cell_of(target_known=False)
+    found, one = (fit(baseline(cell, r, "absolute"), r, "absolute") for r in (readings, whole))
+    assert found.dof == one.dof - 6
+    assert abs(one.variance_factor - 1.0) < 0.3
+    assert abs(found.variance_factor - 1.0) < 0.3
+
+
+def test_a_cell_names_its_gauges(tmp_path: Path) -> None:
+    (tmp_path / "cell.toml").write_text(
+        CELL.read_text() + "\n[gauges.G]\norigin_m = [0.0, 0.0, 1.0]\n"
+    )
+    with pytest.raises(InputError, match="origin_m without direction"):
+        Cell.load(tmp_path / "cell.toml")
+
+
+def test_other_observers_are_refused_by_name() -> None:
+    c = observed(["A", "B", "C"], 5, base=True)
+    f, other = fitted(c), observed(["A", "D"], 6, base=True).readings
+    with pytest.raises(InputError, match="point D observed these readings, but not those"):
+        validate(f.model, f.theta, f.readings, other, "absolute")
+
+
+def test_one_tracker_stays_as_it_was() -> None:
+    """A table of one station, named or not, is stored as readings by one tracker."""
+    readings: Readings = observed(["S1"], 1).readings
+    assert readings.observers
+    assert replace(readings, states=replace(readings.states, observer=None)).line.max() == 0
