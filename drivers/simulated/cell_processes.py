@@ -126,7 +126,7 @@ class DeviceProcess:
 START_TIMEOUT = 20.0
 """Real time in which every simulated device has to be ready, s."""
 
-UR_PORTS = (29999, 30003, 30004)
+UR_PORTS = (29999, 30001, 30003, 30004)
 FORCE_SENSORS = ("ft300", "bota", "hex")
 _STALE = (
     "world.json",

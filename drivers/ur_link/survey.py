@@ -1,13 +1,16 @@
 """Identity and state of the arm, and everything that hinders a run."""
 
 import math
+import re
 from collections.abc import Callable
 
-from drivers.ur_link import dashboard, states
+from drivers.ur_link import states
+from drivers.ur_link.dashboard import RobotFacts
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.probe import ControllerFacts
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.supervision import Supervision
 from hilcal.measuring.devices import Report
 
 _RATE_S = (0.4, 2.0)
@@ -23,7 +26,8 @@ def survey(
     hz: float,
     controller: ControllerFacts,
     receiver: Receiver,
-    no_dashboard: str,
+    supervision: Supervision,
+    silent: str,
 ) -> Report:
     """Ask everything that can be asked without moving.
 
@@ -33,19 +37,20 @@ def survey(
         hz: packets per second that were asked for.
         controller: what it said at the opening.
         receiver: its state.
-        no_dashboard: why there is no dashboard server; empty where there is one.
+        supervision: its dashboard server or Robot API.
+        silent: why that does not answer; empty where it does.
     """
     version = states.version_word(controller.version)
     facts = [("address", host), ("controller version", version)]
     fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
     problems: list[str] = []
     name = "Universal Robots arm"
-    if no_dashboard:
-        facts.append(("dashboard server", no_dashboard))
-        problems.append(f"{no_dashboard}; the arm cannot be controlled without it")
+    if silent:
+        facts.append((supervision.name, silent))
+        problems.append(f"{silent}; the arm cannot be controlled without it")
     else:
         try:
-            robot = dashboard.describe(host, _ASK_S)
+            robot = supervision.describe(_ASK_S)
         except LinkError as error:
             problems.append(f"{error}; the arm cannot be controlled without it")
         else:
@@ -87,7 +92,7 @@ def settled_rate(count: Callable[[float], float], hz: float) -> float:
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])
 
 
-def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
+def _facts(robot: RobotFacts) -> list[tuple[str, str]]:
     remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
     return [
         ("model", robot.model),
@@ -98,16 +103,21 @@ def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
     ]
 
 
-def _problems(robot: dashboard.RobotFacts, model: str) -> list[str]:
+def _problems(robot: RobotFacts, model: str) -> list[str]:
     out = []
     if robot.remote is False:
         out.append("it is in local mode; switch it to remote control on the pendant")
-    # "UR10" may stand for an UR10e as well: only the size decides
-    size = "".join(c for c in robot.model if c.isdigit())
-    told = model.lower().removeprefix("ur").removesuffix("e")
-    if model.lower().startswith("ur") and told.isdigit() and size and told != size:
+    # "UR10" may stand for an UR10e or UR12e as well: only the size decides
+    size, told = _size(robot.model), _size(model)
+    if size and told and told != size:
         out.append(f'it is a {robot.model}; the configuration says model = "{model}"')
     return out
+
+
+def _size(model: str) -> str:
+    """Return the number in the name of an arm of this maker; UR7e and UR12e have their old one."""
+    found = re.match(r"ur(\d+)", model.lower())
+    return "" if found is None else {"7": "5", "12": "10"}.get(found[1], found[1])
 
 
 def _state(reading: Reading) -> list[tuple[str, str]]:

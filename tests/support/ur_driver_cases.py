@@ -10,7 +10,9 @@ import psutil
 import pytest
 
 from drivers.ur import UrArm, open_arm
+from drivers.simulated.ur_server import API
 from drivers.ur_link import dashboard
+from drivers.ur_link.robot_api import RobotApi
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
@@ -26,6 +28,7 @@ Sim = sim_ur_cases.SimulatedUr
 def config(
     host: str | None, model: str = "ur10e", clock: float = 1.0, **options: Any
 ) -> CellConfig:
+    options = {"robot_api_port": API, **options}
     robot = {"model": model, "driver": "ur", "host": host, "options": options}
     return CellConfig.model_validate({"robot": robot, "simulation": {"clock": clock}})
 
@@ -82,6 +85,10 @@ def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
     return text
 
 
+def api(sim: Sim) -> RobotApi:
+    return RobotApi(sim.host, API)
+
+
 def children() -> list[psutil.Process]:
     """Child processes of the driver (the simulated controllers are children, too)."""
     mine = psutil.Process().children(recursive=True)
@@ -103,7 +110,11 @@ def put_right(sim: Sim) -> None:
     sim.admin("remote_mode")
     sim.admin("release_emergency_stop")
     if sim.admin()["robot_mode"] != 7:
-        dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
+        if sim.is_x:
+            for action in ("POWER_ON", "BRAKE_RELEASE"):
+                api(sim).order("/robotstate/v1/state", action, 2.0)
+        else:
+            dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
         sim.wait("robot_mode", 7)
     sim.wait("moving", False)
 
