@@ -25,7 +25,7 @@ from drivers.ur_link.motion import MotionInProgress, deceleration, stands
 from drivers.ur_link.options import UrOptions
 from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
 from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
-from drivers.ur_link.supervision import Generation, generation, why_silent
+from drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
 from drivers.ur_link.survey import survey
 from drivers.ur_link.worker import WorkerError
 from hilcal.config import CellConfig
@@ -97,6 +97,7 @@ class UrArm:
             self._receiver,
             self._generation.supervision,
             self._silent,
+            self._generation.script_port == PRIMARY_PORT,
         )
 
     def sample(self) -> ArmSample:

@@ -16,6 +16,7 @@ import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard, N
+from drivers.simulated.ur_server import API, POLYSCOPE_X
 from drivers.simulated.world import World
 from drivers.simulated.world_server import open_board, write_world
 from hilcal.config import CellConfig
@@ -200,7 +201,7 @@ class SimulatedCell:
             ) from None
         for attempt in range(1, _HOSTS + 1):
             host = free_host()
-            devices = _devices(world, config, directory, seed, host)
+            devices = _devices(world, config, directory, seed, host, base_dir or Path())
             cell = cls(_filled_in(config, directory, host), directory, devices, board)
             try:
                 cell._begin(devices.values())
@@ -353,10 +354,12 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 
 
 def _devices(
-    world: World, config: CellConfig, directory: Path, seed: int, host: str
+    world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
     """Return what has to be started."""
     noise = world.noise
+    file = config.robot.calibration
+    calibration = () if file is None else ("--calibration", str(base_dir / file))
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
         return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
@@ -367,6 +370,8 @@ def _devices(
             "arm",
             "ur_server",
             *("--host", host, "--robot", config.robot.model),
+            *("--version", config.simulation.controller_version),
+            *calibration,
             *("--seed", str(seed + 3)),
         ),
         "tracker": device(
@@ -385,14 +390,17 @@ def _devices(
 
 def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
     """Return the configuration that leads to the simulated devices; what it gives stays."""
-    robot = {"host": host, "driver": config.robot.driver or "ur"}
+    options: dict[str, Any] = {**config.robot.options}
+    if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
+        options["robot_api_port"] = API
+    robot = {"host": host, "driver": config.robot.driver or "ur", "options": options}
     directory = directory.absolute()
     tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
-    options = {**config.operator.options, "socket": str(directory / "world.sock")}
+    operator = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {
         "robot": config.robot.model_copy(update=robot),
         "tracker": config.tracker.model_copy(update=tracker),
-        "operator": config.operator.model_copy(update={"driver": "simulated", "options": options}),
+        "operator": config.operator.model_copy(update={"driver": "simulated", "options": operator}),
     }
     if config.force_sensor is not None:
         port = {"port": str(directory / "force")}

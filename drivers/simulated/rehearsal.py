@@ -146,6 +146,7 @@ def simulation_case(
     visit: Callable[[Cell], CampaignStates],
     noise: SimulatedNoise,
     catalogue: Catalogue | None = None,
+    base_dir: Path | None = None,
 ) -> SimulationCase:
     """Make a simulated cell and hide an effect in it at the configured strength.
 
@@ -156,6 +157,7 @@ def simulation_case(
         visit: returns the states at which the strength holds.
         noise: the tracker's noise of one reading.
         catalogue: has the effects of a user's own.
+        base_dir: directory that a robot's file path is relative to.
 
     Raises:
         InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
@@ -166,7 +168,7 @@ def simulation_case(
     if choice == RANDOM:  # a wrong registration shows only where one is believed
         unseen = () if config.loads else DEFLECTION_EFFECTS
         hidden = str(rng.choice([e for e in choices() if e not in ("base_frame", *unseen)]))
-    cell = cell_from_config(config)
+    cell = cell_from_config(config, base_dir)
     v = visit(cell)
     own = None
     if catalogue is not None and hidden in own_choices(catalogue):
@@ -294,7 +296,12 @@ def planned_states(
 
 
 def case_of_plan(
-    config: CellConfig, plan: Plan, choice: str, seed: int, catalogue: Catalogue | None = None
+    config: CellConfig,
+    plan: Plan,
+    choice: str,
+    seed: int,
+    catalogue: Catalogue | None = None,
+    base_dir: Path | None = None,
 ) -> SimulationCase:
     """Hide an effect in the simulated cell of a configuration.
 
@@ -307,6 +314,7 @@ def case_of_plan(
         choice: an effect, "random" or "nothing".
         seed: of everything random.
         catalogue: has the effects of a user's own, which can be hidden, too.
+        base_dir: directory that a robot's file path is relative to.
 
     Raises:
         InputError: an unknown choice, or a cell without loads.
@@ -314,7 +322,13 @@ def case_of_plan(
     rng = np.random.default_rng(seed)
     mean = measurement_noise(config, config.acquire.samples)
     secret = simulation_case(
-        config, choice, rng, lambda cell: planned_states(cell, config, plan), mean, catalogue
+        config,
+        choice,
+        rng,
+        lambda cell: planned_states(cell, config, plan),
+        mean,
+        catalogue,
+        base_dir,
     )
     return replace(secret, world=replace(secret.world, noise=measurement_noise(config)))
 

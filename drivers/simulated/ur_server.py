@@ -48,7 +48,7 @@ HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 """Where a controller that is switched on for the first time finds its arm, rad."""
 
 _MOVING, _STILL = 0.004, 0.01  # s of real time between steps
-_POLYSCOPE_X = 10  # from this version on there is a Robot API
+POLYSCOPE_X = 10  # from this version on there is a Robot API
 _LINE = 1 << 16  # bytes of the longest line
 Version = tuple[int, int, int, int]
 
@@ -90,7 +90,7 @@ class Server:
         self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
         self.controller.hears = self.rtde.hears
         model = state.kinematics.arm.name
-        self.is_x = state.version[0] >= _POLYSCOPE_X
+        self.is_x = state.version[0] >= POLYSCOPE_X
         supervision = RobotApi if self.is_x else Dashboard
         self.dashboard = supervision(self.controller, self.faults, model)
         status = NOT_INITIALISED if factory is None else factory.status

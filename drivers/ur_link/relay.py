@@ -63,16 +63,17 @@ def _pump(source: socket.socket, sink: Callable[[bytes], Any], other: socket.soc
 
 
 def _join(client: socket.socket, host: str, port: int) -> None:
-    with contextlib.suppress(OSError), client:
-        with socket.create_connection((host, port), timeout=_CONNECT_S) as server:
-            server.settimeout(None)
-            for line in (client, server):
-                line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            back = (lambda data: None) if port == _PRIMARY else client.sendall
-            answers = threading.Thread(target=_pump, args=(server, back, client), daemon=True)
-            answers.start()
-            _pump(client, server.sendall, server)
-            answers.join()
+    with contextlib.ExitStack() as stack, contextlib.suppress(OSError):
+        stack.enter_context(client)
+        server = stack.enter_context(socket.create_connection((host, port), timeout=_CONNECT_S))
+        server.settimeout(None)
+        for line in (client, server):
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        back = (lambda data: None) if port == _PRIMARY else client.sendall
+        answers = threading.Thread(target=_pump, args=(server, back, client), daemon=True)
+        answers.start()
+        _pump(client, server.sendall, server)
+        answers.join()
 
 
 def _accept(door: socket.socket, host: str, port: int) -> None:

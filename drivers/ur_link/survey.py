@@ -4,7 +4,7 @@ import math
 import re
 from collections.abc import Callable
 
-from drivers.ur_link import states
+from drivers.ur_link import primary, states
 from drivers.ur_link.dashboard import RobotFacts
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.probe import ControllerFacts
@@ -28,6 +28,7 @@ def survey(
     receiver: Receiver,
     supervision: Supervision,
     silent: str,
+    needs_primary: bool,
 ) -> Report:
     """Ask everything that can be asked without moving.
 
@@ -39,12 +40,25 @@ def survey(
         receiver: its state.
         supervision: its dashboard server or Robot API.
         silent: why that does not answer; empty where it does.
+        needs_primary: whether programs go by the primary port.
     """
     version = states.version_word(controller.version)
     facts = [("address", host), ("controller version", version)]
     fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
     problems: list[str] = []
     name = "Universal Robots arm"
+    kinematics = None
+    try:
+        kinematics = primary.kinematics(host, _ASK_S)
+    except LinkError as error:
+        facts.append(("its kinematics", f"not told: {error}"))
+        if needs_primary:
+            problems.append(
+                f"{error}; programs go by it, so that the arm cannot be controlled without it: "
+                "enable the primary client interface in the controller's settings, under services"
+            )
+    else:
+        fields.append(("kinematics", kinematics.to_dict()))
     if silent:
         facts.append((supervision.name, silent))
         problems.append(f"{silent}; the arm cannot be controlled without it")
@@ -76,7 +90,7 @@ def survey(
         problems += _hindrances(reading)
         if rate < _SHARE * hz:
             problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
-    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields))
+    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields), kinematics)
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:

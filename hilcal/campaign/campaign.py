@@ -57,7 +57,7 @@ from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.records import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
-from hilcal.store.robot_file import ROBOT_FILE, check_robot
+from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table
 from hilcal.types import Floats
@@ -132,8 +132,9 @@ class Campaign:
             config = changed(config, changes)
         except InputError as error:
             raise InputError(f"{file.path}: a revision is damaged ({error})") from None
-        check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
-        cell = cell_from_config(config, None, file.about(ROBOT_FILE))
+        kept = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
+        check_robot(file.path, file.config_json, *kept)
+        cell = cell_from_config(config, None, *kept)
         readings, covers = file.readings(), file.about(COVERS)
         noise = None if _restates(file, changes) else estimated_noise(file)
         readings = _with_instrument(readings, file, config, changes, noise)

@@ -132,7 +132,9 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
-            secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
+            secret = case_of_plan(
+                told.config, plan, told.choice, told.seed, told.world, told.base_dir
+            )
             say("starting the simulated devices")
             there = stack.enter_context(simulated_cell(secret, told.seed, told.base_dir))
         t.notice(NEWCOMER)
@@ -167,7 +169,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
     They are written bit by bit, as a real campaign grows.
     """
     with working(t.progress):
-        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world)
+        secret = case_of_plan(told.config, plan, told.choice, told.seed, told.world, told.base_dir)
     source = "rehearsal in a simulated cell, without devices"
     made = secret.config.to_json()
     with CampaignFile.create(
@@ -319,7 +321,7 @@ def simulate(
         else:
             made = load_plan(plan)
         say("preparing the simulated cell")
-        secret = case_of_plan(config, made, choice, number, catalogue)
+        secret = case_of_plan(config, made, choice, number, catalogue, base_dir)
     if secret.hidden != NOTHING and (config.fitted, secret.mode) == ("deflection", "absolute"):
         what = f"{choice} hides what they may not show" if choice == RANDOM else f"{choice} cancels"
         t.notice(
@@ -350,9 +352,8 @@ def with_person(config: CellConfig) -> CellConfig:
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
-    """Return the configuration with a robot's file named by its whole path."""
-    path = base_dir / config.robot.model
-    if not path.suffix:
-        return config
-    robot = config.robot.model_copy(update={"model": str(path.absolute())})
+    """Return the configuration with a robot's files named by their whole paths."""
+    told = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
+    files = {k: str((base_dir / v).absolute()) for k, v in told.items() if Path(v).suffix}
+    robot = config.robot.model_copy(update=files)
     return config.model_copy(update={"robot": robot})

@@ -39,6 +39,7 @@ from hilcal.errors import (
 )
 from hilcal.measuring.connect import ConnectionResult, Rig, connect
 from hilcal.measuring.devices import Clock
+from hilcal.measuring.kinematics import with_kinematics
 from hilcal.measuring.progress import Watcher
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
@@ -117,7 +118,9 @@ def run(
                 from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 
                 choice = config.simulation.hide or NOTHING
-                secret = case_of_plan(config, made, choice, config.simulation.seed, catalogue)
+                secret = case_of_plan(
+                    config, made, choice, config.simulation.seed, catalogue, base_dir
+                )
                 simulated = simulated_cell(secret, config.simulation.seed, base_dir)
                 config = stack.enter_context(simulated).config
         if append:
@@ -260,6 +263,7 @@ def measure(
             if rig is not None:
                 stack.callback(rig.close)
                 answers = tuple(_sighted(rig, answer, say) for answer in answers)
+        answers = with_kinematics(answers, cell)
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))

@@ -121,7 +121,9 @@ def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKi
         found = reader(text, nominal, str(path))
     except (ValueError, KeyError, TypeError, configparser.Error) as error:
         words = " ".join(str(error).split())
-        raise InputError(f"{path}: not the kinematics of an arm ({words}); valid: {KINDS}") from None
+        raise InputError(
+            f"{path}: not the kinematics of an arm ({words}); valid: {KINDS}"
+        ) from None
     check_of(found, nominal)
     return found
 
