@@ -181,10 +181,21 @@ def check(
             "Write the kinematics that the arm's controller holds, for [robot] calibration.",
         ),
     ] = None,
+    factory: Annotated[
+        Path | None,
+        option(
+            "--factory F.hilcal",
+            "Is the arm still what its factory measured? Measures a few readings without a load "
+            "into a new campaign, or takes those of one that is there.",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, option("--yes -y", "With --factory: do not ask before the arm moves.")
+    ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Connect to every device and report its state; nothing moves."""
+    """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
         raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
@@ -210,6 +221,11 @@ def check(
         replace_file(save_calibration, told.to_toml(), must_be_new=True)
         t.show(f"The kinematics of the arm's controller are in {save_calibration}.")
     failed: HilcalError | None = None
+    judged = None
+    if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
+        from hilcal.cli.factory import factory_check  # which needs this file
+
+        judged = factory_check(t, config, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
     elif dry is not None:
@@ -219,6 +235,7 @@ def check(
             "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
             "devices": [answer_json(a) for a in answers],
             "plan": None if dry is None else asdict(dry),
+            **({} if judged is None else {"factory": judged}),
         },
         failed,
     )

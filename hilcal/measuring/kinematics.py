@@ -5,6 +5,7 @@ from dataclasses import replace
 from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.measuring.connect import ConnectionResult
+from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.factory import (
     FAR,
@@ -35,6 +36,16 @@ def with_kinematics(
     return tuple(_compared(a, cell) if told_by((a,)) is not None else a for a in answers)
 
 
+def nominal_arm(cell: Cell) -> Arm:
+    """Return the arm as its maker designed it, its joints not yet counted as the cell says.
+
+    Raises:
+        InputError: its file cannot be read.
+    """
+    robot = cell.configured().robot
+    return load_arm(robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link)
+
+
 def _compared(answer: ConnectionResult, cell: Cell) -> ConnectionResult:
     report = answer.report
     assert report is not None  # noqa: S101 - for the type checker
@@ -42,9 +53,7 @@ def _compared(answer: ConnectionResult, cell: Cell) -> ConnectionResult:
     robot = cell.configured().robot
     problems, fields, told = list(report.problems), list(report.fields), report.kinematics
     try:
-        nominal = load_arm(
-            robot.model, cell.base_dir, base_link=robot.base_link, tip_link=robot.tip_link
-        )
+        nominal = nominal_arm(cell)
         ours = with_factory(nominal, told)
     except InputError as error:  # an arm with other joints, or a campaign without its file
         return replace(answer, report=replace(report, facts=(*report.facts, (WHAT, str(error)))))
