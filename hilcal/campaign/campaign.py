@@ -401,8 +401,21 @@ class Campaign:
                 "effects": list(record.effects),
                 "verdict": judged.get("verdict"),
                 "readings_sha256": record.data_hash,
+                **self._kinematics(),
             },
         )
+
+    def _kinematics(self) -> dict[str, object]:
+        """Return the controller's kinematics as a calibration keeps them, where they were told."""
+        if self.file.about(PLAN) is not None:
+            event = RunLog(self.file).last("devices") or {}
+            for answer in event.get("answers", ()):
+                if "kinematics" in answer.get("fields", {}):
+                    return {"kinematics": answer["fields"]["kinematics"]}
+        factory = self.cell.factory
+        if factory is None or factory.rows is None:
+            return {}
+        return {"kinematics": factory.to_dict()}
 
     def posterior(self, revision: int | None = None) -> Posterior:
         """Return what a stored fit taught of the arm, which is the prior of another campaign.

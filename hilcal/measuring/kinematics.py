@@ -10,13 +10,12 @@ from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.factory import (
     FAR,
     LINEARISED,
+    SAME,
     FactoryKinematics,
     flange_difference,
     with_factory,
 )
 
-SAME = 1e-6
-"""m; flanges that are nearer are of the same kinematics: files keep 12 digits and more."""
 WHAT = "its kinematics"
 
 

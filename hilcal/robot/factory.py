@@ -20,6 +20,7 @@ import configparser
 import tomllib
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -33,6 +34,8 @@ from hilcal.types import Floats
 
 N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml that hilcal check has written"
+SAME = 1e-6
+"""m; flanges that are nearer are of the same kinematics: files keep 12 digits and more."""
 LINEARISED = 2
 """Calibration status of an arm that the factory has measured."""
 FAR = 0.05
@@ -95,6 +98,21 @@ def of_rows(
         across = _place((a[k], 0.0, 0.0, alpha[k], 0.0, 0.0))
         links[k + 1] = _screw(0.0, d[k]) @ across
     return FactoryKinematics(links, rows, status, checksum, source)
+
+
+def of_dict(told: Any, source: str) -> FactoryKinematics:
+    """Return the kinematics that `FactoryKinematics.to_dict` has written.
+
+    Raises:
+        InputError: it is something else.
+    """
+    try:
+        rows = np.array([told[key] for key in _KEYS], dtype=float)
+        checksum = tuple(map(int, told["joint_checksum"]))
+        return of_rows(rows, source, int(told["calibration_status"]), checksum)
+    except (ValueError, KeyError, TypeError) as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"{source}: not the kinematics of an arm ({words})") from None
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
@@ -203,11 +221,7 @@ def _values(text: str) -> list[str]:
 
 
 def _of_toml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
-    told = tomllib.loads(text)
-    rows = np.array([told[key] for key in _KEYS], dtype=float)
-    return of_rows(
-        rows, source, int(told["calibration_status"]), tuple(map(int, told["joint_checksum"]))
-    )
+    return of_dict(tomllib.loads(text), source)
 
 
 def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
