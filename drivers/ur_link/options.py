@@ -14,5 +14,5 @@ class UrOptions(Section):
         125.0, description="packets of state per second, 10 to 500"
     )
     robot_api_port: Annotated[int, Strict(), Field(ge=1, le=65535)] = Field(
-        80, description="TCP port of the Robot API of PolyScope X, 1 to 65535"
+        80, description="number of the TCP port of PolyScope X's Robot API, 1 to 65535"
     )

@@ -199,6 +199,8 @@ def check(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
         raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
+    if save_calibration is not None and save_calibration.exists():
+        raise InputError(f"{save_calibration}: the file exists; choose another name")
     config, numbers = read_cell(cell)
     try:
         check_effects(numbers, config, catalogue)

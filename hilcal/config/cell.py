@@ -79,7 +79,7 @@ class Robot(Conventions):
         min_length=1,
         description="the path of a file with the factory's kinematics of this one arm of Universal "
         "Robots: calibration.conf, a .yaml of ur_calibration, or a .toml of "
-        "hilcal check --save-calibration",
+        "check --save-calibration",
         examples=["calibration.conf"],
     )
     base_link: str | None = Field(

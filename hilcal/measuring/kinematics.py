@@ -71,8 +71,8 @@ def _compared(answer: ConnectionResult, cell: Cell) -> ConnectionResult:
     elif off > SAME:
         problems.append(
             f"its kinematics are not those of [robot] calibration = {robot.calibration!r}: the "
-            f"flange is up to {1e3 * off:.3f} mm elsewhere; hilcal check --save-calibration "
-            "writes what the controller holds"
+            f"flange is up to {1e3 * off:.3f} mm elsewhere; hilcal check CELL.toml "
+            "--save-calibration FILE.toml writes what the controller holds"
         )
     new = replace(
         report,

@@ -75,14 +75,14 @@ def factory_words(found: "FactoryCheck") -> Iterator[Block]:
     yield ""
     if found.changed:
         yield (
-            f"The arm is no longer what its factory measured: its geometry has moved the target "
-            f"by {moved} ± {std} (rms, p = {found.p_value:.1g})."
+            "The arm is no longer what its factory measured: its geometry has changed "
+            f"(p = {found.p_value:.1g}), which moves the target by {moved} (rms, ± {std})."
         )
     else:
-        least = numbers.length(2.0 * found.moved_std_m)
         yield (
             "The arm is what its factory measured, as far as these readings tell "
-            f"(p = {found.p_value:.2g}): a change of {least} (rms at the target) would have shown."
+            f"(p = {found.p_value:.2g}): what they leave of its geometry moves the target by "
+            f"{moved} (rms, ± {std})."
         )
     yield (
         f"From the factory's kinematics {found.readings} readings are "

@@ -33,7 +33,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
 
 N = 6
-KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml that hilcal check has written"
+KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
 SAME = 1e-6
 """m; flanges that are nearer are of the same kinematics: files keep 12 digits and more."""
 LINEARISED = 2

@@ -237,6 +237,8 @@ TAKEN = {
     "cli/running": "tests/cli/test_until_goal.py::test_run_until",
     "cli/showing": "tests/cli/test_workbench_page.py"
     "::test_a_table_becomes_a_calibration_at_one_page",
+    "config/cell": "tests/wire/test_polyscope_x_cell.py"
+    "::test_the_controllers_kinematics_are_checked_written_stored_and_judged",
     "config/template": "tests/cli/test_init.py::test_the_file_is_planned_without_an_edit",
     "design/checked_plan": f"{HERE}::test_files_that_are_not_there_yet",
     "discovery/write_effect": "tests/cli/test_discover.py"
@@ -246,6 +248,8 @@ TAKEN = {
     "identification/learnt": f"{HERE}::test_nothing_to_carry_over",
     "identification/weight": "tests/unit/identification/test_weight.py"
     "::test_without_the_weight_they_are_too_soft_and_that_is_said",
+    "measuring/kinematics": "tests/wire/test_polyscope_x_cell.py"
+    "::test_the_controllers_kinematics_are_checked_written_stored_and_judged",
     "measuring/run": f"{HERE}::test_files_that_are_not_there_yet",
     "present/campaign": f"{HERE}::test_what_a_report_names",
     "present/comparison": f"{HERE}::test_what_a_comparison_says",
