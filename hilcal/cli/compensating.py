@@ -179,8 +179,8 @@ def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Float
         return None
     there = calibration.predict(q, tool=task.tool, std=False)
     nominal = se3.matrix(there.nominal_rotation, there.nominal_position)
-    told = np.isfinite(poses).all(axis=(1, 2))
-    return np.where(told[:, None, None], poses, nominal)
+    told = np.isfinite(poses).all(axis=(1, 2), keepdims=True)
+    return np.where(told, poses, nominal)
 
 
 def _say_written(t: Terminal, paths: list[Path]) -> None:

@@ -12,7 +12,6 @@ from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError, StoppedError
-from hilcal.identification.fit_document import plain
 from hilcal.measuring.connect import ConnectionResult
 from hilcal.measuring.kinematics import nominal_arm, told_by
 from hilcal.present.progress import working
@@ -52,7 +51,7 @@ def factory_check(
         say("fitting all effects from the factory's kinematics")
         found = check_factory(run.cell, nominal_arm(run.cell), factory, run.readings, catalogue)
     t.show(factory_words(found))
-    return plain({**asdict(found), "campaign": str(output)})
+    return {**asdict(found), "campaign": str(output)}
 
 
 def _measured(
