@@ -3,7 +3,7 @@
 Every call into ur_rtde is made in a child process with a deadline, since it can hang, crash,
 or go on with old values: the receive interface in one, the control interface, which exists
 only after `take_control`, in another. The arm can be stopped in three independent ways: by the
-control interface, by the dashboard server, by a program on the script port; and the
+control interface, by the dashboard server or Robot API, by a program on the script port; and the
 controller's watchdog stops it 0.1 s after the control process has ended.
 """
 
@@ -16,7 +16,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from drivers.ur_link import cause, dashboard, probe, states
+from drivers.ur_link import cause, probe, states
 from drivers.ur_link.brakes import Brakes
 from drivers.ur_link.control import Control, take
 from drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
@@ -25,6 +25,7 @@ from drivers.ur_link.motion import MotionInProgress, deceleration, stands
 from drivers.ur_link.options import UrOptions
 from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
 from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
+from drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
 from drivers.ur_link.survey import survey
 from drivers.ur_link.worker import WorkerError
 from hilcal.config import CellConfig
@@ -33,13 +34,11 @@ from hilcal.measuring.devices import ArmSample, Report
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
-_PROBE_S, _DASHBOARD_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
+_PROBE_S, _ASK_S, _RECEIVE_S = 2.5, 1.5, 4.0  # 8 s together
 _PAYLOAD_S = 1.5
 _ORPHAN_S = 1.6
 _PULSE_S = 0.1
 """Deadline for asking the control process why the program ended, real s; the stop waits for it."""
-POLYSCOPE_X = 10
-"""Major version of the controllers without a dashboard server."""
 _MASS_KG, _COM_M = 1e-3, 1e-4  # how well a payload has to be read back
 _MAX_Q, _MAX_SPEED, _MAX_ACCELERATION = 6.34, 3.2, 40.0
 
@@ -56,16 +55,16 @@ class UrArm:
         host: str,
         hz: float,
         controller: probe.ControllerFacts,
-        no_dashboard: str,
+        generation: Generation,
+        silent: str,
         receiver: Receiver,
     ) -> None:
         """Use an open link; `open_arm` makes one."""
         self._host, self._hz, self._model = host, hz, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
-        self._controller, self._no_dashboard = controller, no_dashboard
+        self._controller, self._generation, self._silent = controller, generation, silent
         self._receiver = receiver
-        self._has_dashboard = controller.version[0] < POLYSCOPE_X
-        self._brakes = Brakes(host, receiver, self._has_dashboard)
+        self._brakes = Brakes(host, receiver, generation)
         self._control: Control | None = None
         self._motion: MotionInProgress | None = None
         self._brake = deceleration(config.motion.speed_rad_s)
@@ -96,7 +95,9 @@ class UrArm:
             self._hz,
             self._controller,
             self._receiver,
-            self._no_dashboard,
+            self._generation.supervision,
+            self._silent,
+            self._generation.script_port == PRIMARY_PORT,
         )
 
     def sample(self) -> ArmSample:
@@ -115,11 +116,11 @@ class UrArm:
                 self._receiver.renew(_RECEIVE_S)
             except LinkError as error:
                 raise failure(self._host, str(error), CHECK_LINK) from None
-        self._no_dashboard = _why_no_dashboard(self._host, self._controller.version)
-        if self._no_dashboard:
-            raise failure(self._host, f"cannot take control: {self._no_dashboard}")
+        self._silent = why_silent(self._generation.supervision, _ASK_S)
+        if self._silent:
+            raise failure(self._host, f"cannot take control: {self._silent}")
         self._end_program()
-        self._control = take(self._host, self._receiver)
+        self._control = take(self._host, self._receiver, self._generation)
         self._was_ours = True
         self._fault = ""
         try:
@@ -263,9 +264,9 @@ class UrArm:
 
         After a lost link ur_rtde may have uploaded it again, with no watchdog.
         """
-        if self._was_ours and not self._no_dashboard:
+        if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
-                dashboard.stop(self._host, _DASHBOARD_S)
+                self._generation.supervision.stop(_ASK_S)
                 self._was_ours = False
 
     def _stands_already(self) -> bool:
@@ -301,7 +302,7 @@ class UrArm:
         """Stop the arm first, then find out the cause and raise it."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = cause.find(self._host, halt, noticed, self._has_dashboard)
+        self._fault, advice = cause.find(self._generation.supervision, halt, noticed)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
@@ -352,21 +353,11 @@ def open_arm(config: CellConfig) -> UrArm:
         if missing:
             version = states.version_word(controller.version)
             raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
-        no_dashboard = _why_no_dashboard(host, controller.version)
+        how = generation(host, controller.version, options.robot_api_port)
+        silent = why_silent(how.supervision, _ASK_S)
         receiver = Receiver(host, options.receive_hz, controller.outputs, _RECEIVE_S)
     except LinkError as error:
         raise failure(
             host, str(error), "check that the controller is on and [robot] host"
         ) from None
-    return UrArm(config, host, options.receive_hz, controller, no_dashboard, receiver)
-
-
-def _why_no_dashboard(host: str, version: tuple[int, ...]) -> str:
-    """Return why there is no dashboard server, which control needs; empty where there is one."""
-    if version[0] >= POLYSCOPE_X:
-        return "PolyScope X has no dashboard server, and ur_rtde cannot start its program there"
-    try:
-        dashboard.ask(host, ("robotmode",), _DASHBOARD_S)
-    except LinkError as error:
-        return str(error)
-    return ""
+    return UrArm(config, host, options.receive_hz, controller, how, silent, receiver)

@@ -13,6 +13,7 @@ from hilcal.readings.readings import ObserverName
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import as_counted
+from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.robot.se3 import rotation
 from hilcal.types import Floats, Ints
 
@@ -72,6 +73,8 @@ class Cell:
         base_dir: directory that relative paths in `config` refer to.
         measured_torques: whether effects take the joint torques that were measured, where readings
             have them, in place of those of the described masses and loads.
+        factory: kinematics of this one arm by its factory, where a file of them is given; `arm` has
+            them where the configuration says so.
         targets: (T, 4, 4) T_flange_target of several targets, in the order of `target_names`;
             `target` is the first of them. None where the tool carries one.
         target_names: their names.
@@ -92,6 +95,7 @@ class Cell:
     config: CellConfig | None = None
     base_dir: Path = Path()
     measured_torques: bool = False
+    factory: FactoryKinematics | None = None
     targets: Floats | None = None
     target_names: tuple[str, ...] = ()
     targets_known: tuple[bool, ...] = ()
@@ -186,7 +190,10 @@ STANDARD_GRAVITY = np.array([0.0, 0.0, -STANDARD_GRAVITY_M_S2])
 
 
 def cell_from_config(
-    config: CellConfig, base_dir: Path | None = None, robot_file: str | None = None
+    config: CellConfig,
+    base_dir: Path | None = None,
+    robot_file: str | None = None,
+    calibration_file: str | None = None,
 ) -> Cell:
     """Return the cell that a configuration describes.
 
@@ -198,6 +205,7 @@ def cell_from_config(
         config: the checked configuration.
         base_dir: directory that a robot's file path is relative to.
         robot_file: what that file holds, as a campaign keeps it; then none is read.
+        calibration_file: the same of the file of its kinematics by the factory.
 
     Raises:
         InputError: unknown robot, unusable robot file, or a number of joint values that does
@@ -211,6 +219,11 @@ def cell_from_config(
         tip_link=robot.tip_link,
         text=robot_file,
     )
+    factory = None
+    if robot.calibration is not None:
+        path = (base_dir or Path()) / robot.calibration
+        factory = read_factory(path, arm, calibration_file)
+        arm = with_factory(arm, factory) if robot.kinematics == "factory" else arm
     try:
         arm = as_counted(arm, robot)
     except InputError as error:
@@ -235,6 +248,7 @@ def cell_from_config(
         base_dir=base_dir or Path(),
         measured_torques=robot.torques == "measured",
         targets=poses if len(poses) > 1 else None,
+        factory=factory,
         target_names=tuple(t.name for t in tool.targets),
         targets_known=known if len(poses) > 1 else (),
     )

@@ -16,6 +16,7 @@ import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.ur_server import API, POLYSCOPE_X
 from drivers.simulated.world import World
 from drivers.simulated.world_server import open_board, write_world
 from hilcal.config import CellConfig
@@ -128,7 +129,7 @@ class DeviceProcess:
 START_TIMEOUT = 20.0
 """Real time in which every simulated device has to be ready, s."""
 
-UR_PORTS = (29999, 30003, 30004)
+UR_PORTS = (29999, 30001, 30003, 30004)
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ARM_DRIVER = "drivers.simulated.arm:open_arm"
 """Of every other arm, by its place: it is of use in a simulated cell alone."""
@@ -209,7 +210,7 @@ class SimulatedCell:
             ) from None
         for attempt in range(1, _HOSTS + 1):
             host = free_host()
-            devices = _devices(world, config, directory, seed, host)
+            devices = _devices(world, config, directory, seed, host, base_dir or Path())
             filled = _filled_in(config, directory, host, is_ur(world.cell.arm))
             cell = cls(filled, directory, devices, board)
             try:
@@ -358,10 +359,12 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 
 
 def _devices(
-    world: World, config: CellConfig, directory: Path, seed: int, host: str
+    world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
     """Return what has to be started."""
     noise = world.noise
+    file = config.robot.calibration
+    calibration = () if file is None else ("--calibration", str(base_dir / file))
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
         return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
@@ -371,7 +374,10 @@ def _devices(
         "arm": device(
             "arm",
             *(
-                ("ur_server", "--host", host, "--robot", config.robot.model)
+                (
+                    *("ur_server", "--host", host, "--robot", config.robot.model),
+                    *("--version", config.simulation.controller_version, *calibration),
+                )
                 if is_ur(world.cell.arm)
                 else ("arm_server",)
             ),
@@ -407,16 +413,20 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
 
     What it gives stays, but for the driver of an arm whose own protocol is not simulated.
     """
+    options: dict[str, Any] = {**config.robot.options}
+    if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
+        options["robot_api_port"] = API
     directory = directory.absolute()
-    robot: dict[str, Any] = {"host": host, "driver": config.robot.driver or "ur"}
+    driver = config.robot.driver or "ur"
+    robot: dict[str, Any] = {"host": host, "driver": driver, "options": options}
     if not ur:
         robot = {"driver": ARM_DRIVER, "options": {"socket": str(directory / "arm.sock")}}
     tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
-    options = {**config.operator.options, "socket": str(directory / "world.sock")}
+    operator = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {
         "robot": config.robot.model_copy(update=robot),
         "tracker": config.tracker.model_copy(update=tracker),
-        "operator": config.operator.model_copy(update={"driver": "simulated", "options": options}),
+        "operator": config.operator.model_copy(update={"driver": "simulated", "options": operator}),
     }
     if config.force_sensor is not None:
         port = {"port": str(directory / "force")}

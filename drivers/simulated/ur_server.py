@@ -1,10 +1,11 @@
 """A simulated Universal Robots controller on an address of its own; admin `arm.sock`.
 
     python -m drivers.simulated.ur_server --directory DIR --host 127.A.B.C --robot ur10e
-        [--version 5.11.6.1010327] [--seed N]
+        [--version 5.11.6.1010327] [--api-port 8080] [--calibration FILE] [--seed N]
 
-Ports as on a real one: RTDE 30004, dashboard 29999 (none from PolyScope X, version 10, on),
-script 30003.
+Ports as on a real one: RTDE 30004, primary 30001, dashboard 29999 and script 30003; PolyScope X
+(version 10 and later) has neither of these two, but a Robot API (port 80 on a real one, which
+needs an administrator here). With a calibration its kinematics are those of the file.
 
 Admin operations: `state`, `protective_stop`, `emergency_stop`, `release_emergency_stop`,
 `local_mode`, `remote_mode`, `kill_script`; `rtde_drop`, `rtde_stall {on}`, `rtde_mute {on}`,
@@ -22,6 +23,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,20 +31,24 @@ import numpy as np
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
 from drivers.simulated.ur.controller import Controller, Dashboard
+from drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
 from drivers.simulated.ur.programs import ScriptStream
+from drivers.simulated.ur.robot_api import RobotApi
 from drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
 from drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
+from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.types import Floats
 
-DASHBOARD, SCRIPT, RTDE = 29999, 30003, 30004
+DASHBOARD, PRIMARY, SCRIPT, RTDE = 29999, 30001, 30003, 30004
+API = 8080
 HOME = np.array([0.0, -1.57, 1.57, -1.57, -1.57, 0.0])
 """Where a controller that is switched on for the first time finds its arm, rad."""
 
 _MOVING, _STILL = 0.004, 0.01  # s of real time between steps
-_POLYSCOPE_X = 10  # from this version on there is no dashboard
+POLYSCOPE_X = 10  # from this version on there is a Robot API
 _LINE = 1 << 16  # bytes of the longest line
 Version = tuple[int, int, int, int]
 
@@ -68,7 +74,13 @@ class Server:
     """Everything that answers on one address."""
 
     def __init__(
-        self, state: ArmState, board: Blackboard, host: str, rng: np.random.Generator
+        self,
+        state: ArmState,
+        board: Blackboard,
+        host: str,
+        rng: np.random.Generator,
+        api_port: int = API,
+        factory: FactoryKinematics | None = None,
     ) -> None:
         """Put the parts together; nothing is opened."""
         self.arm = state
@@ -78,7 +90,14 @@ class Server:
         self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
         self.controller.hears = self.rtde.hears
         model = state.kinematics.arm.name
-        self.dashboard = Dashboard(self.controller, self.faults, model)
+        self.is_x = state.version[0] >= POLYSCOPE_X
+        supervision = RobotApi if self.is_x else Dashboard
+        self.dashboard = supervision(self.controller, self.faults, model)
+        status = NOT_INITIALISED if factory is None else factory.status
+        rows = None if factory is None else factory.rows
+        rows = _rows(state.kinematics.arm) if rows is None else rows
+        self.primary = PrimaryPort(self.controller, rows, status)
+        self._api_port = api_port
         self._host = host
         self._listening: asyncio.Server | None = None
         self._others: list[asyncio.Server] = []
@@ -89,9 +108,13 @@ class Server:
         Raises:
             DeviceError: an address is in use, or is none of this computer's.
         """
-        self._others = [await self._listen(self._run_script, SCRIPT)]
-        if self.arm.version[0] < _POLYSCOPE_X:
-            self._others.append(await self._listen(self.dashboard.run, DASHBOARD))
+        supervised = self._api_port if self.is_x else DASHBOARD
+        self._others = [
+            await self._listen(self.primary.run, PRIMARY),
+            await self._listen(self.dashboard.run, supervised),
+        ]
+        if not self.is_x:
+            self._others.append(await self._listen(self._run_script, SCRIPT))
         await self.accept(True)
 
     async def accept(self, on: bool) -> None:
@@ -143,6 +166,14 @@ class Server:
             pass
         finally:
             writer.close()
+
+
+def _rows(arm: Arm) -> Floats:
+    """(4, 6) θ, a, d, α of an arm, as its controller tells them."""
+    from hilcal.calibration.dh_table import dh_rows  # slow to import
+
+    rows = dh_rows(arm)
+    return np.stack([rows.offset, rows.a, rows.d, rows.alpha])
 
 
 def read_version(text: str) -> Version:
@@ -291,6 +322,10 @@ async def serve(options: argparse.Namespace) -> None:
     arm = load_arm(options.robot)
     if arm.n != len(HOME):
         raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")
+    factory = None
+    if options.calibration is not None:
+        factory = read_factory(options.calibration, arm)
+        arm = with_factory(arm, factory)
     world = options.directory / "world.bin"
     try:
         board = Blackboard.attach(world)
@@ -298,7 +333,7 @@ async def serve(options: argparse.Namespace) -> None:
         raise DeviceError(f"simulated arm: no shared world at {world} ({error})") from None
     rng = np.random.default_rng(options.seed)
     state = switched_on(arm, board, read_version(options.version), rng)
-    server = Server(state, board, options.host, rng)
+    server = Server(state, board, options.host, rng, options.api_port, factory)
     await server.open()
     loop = asyncio.get_running_loop()
     admin.serve(options.directory / "arm.sock", AdminOperations(server, loop))
@@ -311,6 +346,8 @@ def main() -> None:
     parser.add_argument("--host", required=True)
     parser.add_argument("--robot", required=True)
     parser.add_argument("--version", default="5.11.6.1010327")
+    parser.add_argument("--api-port", type=int, default=API)
+    parser.add_argument("--calibration", type=Path)
     options = parser.parse_args()
     admin.end_with_parent()
     try:

@@ -4,12 +4,13 @@ import contextlib
 import time
 from dataclasses import dataclass, replace
 
-from drivers.ur_link import dashboard, script_port, states
+from drivers.ur_link import script_port, states
 from drivers.ur_link.control import Control
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.motion import stands
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.receiver import STALE_S, Receiver
+from drivers.ur_link.supervision import Generation
 from drivers.ur_link.worker import WorkerError
 
 ASK_S = 0.25
@@ -42,12 +43,12 @@ class Brakes:
     Attributes:
         host: address of the controller.
         receiver: for seeing that it stands.
-        has_dashboard: whether the controller has a dashboard server.
+        generation: how it is supervised, and where programs go.
     """
 
     host: str
     receiver: Receiver
-    has_dashboard: bool
+    generation: Generation
 
     def ease(self, control: Control, brake: float) -> bool:
         """Stop through the control worker and keep control; whether the arm stands."""
@@ -75,7 +76,7 @@ class Brakes:
                 pass
             finally:
                 control.kill()  # and the robot's watchdog stops it, whatever else fails
-        if not self._by_dashboard():
+        if not self._by_order():
             self._by_script(brake)
         try:
             if not lost:
@@ -96,16 +97,15 @@ class Brakes:
             reading = self._until_still(_SURE_S - _AGAIN_S, program=True)
         return Halt(reading or self.receiver.read(STALE_S), reading is not None, "")
 
-    def _by_dashboard(self) -> bool:
-        if self.has_dashboard:
-            with contextlib.suppress(LinkError):
-                dashboard.stop(self.host, ASK_S)
-                return True
+    def _by_order(self) -> bool:
+        with contextlib.suppress(LinkError):
+            self.generation.supervision.stop(ASK_S)
+            return True
         return False
 
     def _by_script(self, brake: float) -> None:
         with contextlib.suppress(LinkError):
-            script_port.stop(self.host, brake, ASK_S)
+            script_port.stop(self.host, brake, ASK_S, self.generation.script_port)
 
     def _until_still(self, seconds: float, *, program: bool) -> Reading | None:
         """Return the second of two readings at rest in a row; None if there is none in time.

@@ -2,38 +2,37 @@
 
 import contextlib
 
-from drivers.ur_link import dashboard, states
+from drivers.ur_link import states
 from drivers.ur_link.brakes import ASK_S, Halt
 from drivers.ur_link.control_worker import WATCHDOG_HZ
 from drivers.ur_link.failure import CHECK_LINK, RESUME
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.reading import Reading
+from drivers.ur_link.supervision import Supervision
 from drivers.ur_link.worker import WorkerError
 
 UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
 
 
-def find(host: str, halt: Halt, noticed: str, has_dashboard: bool) -> tuple[str, str]:
+def find(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, str]:
     """Return what happened and what to do about it, after the arm has been stopped.
 
     A safety stop ends the program, and a lost link the process that commands the arm: what was
     noticed first is reported only where nothing deeper is found.
 
     Args:
-        host: address of the controller.
+        supervision: the controller's, to be asked.
         halt: how the stop ended.
         noticed: what the driver noticed.
-        has_dashboard: whether there is a dashboard server to ask.
     """
     reading = halt.reading
     if reading is not None and reading.sample.safety != states.NORMAL:
         return reading.sample.safety, f"{states.safety_advice(reading.safety_bits)}, {RESUME}"
     if reading is not None and reading.mode != states.RUNNING:
         return _not_running(reading)
-    if has_dashboard:
-        with contextlib.suppress(LinkError):
-            if dashboard.in_remote_control(host, ASK_S) is False:
-                return "it was switched to local mode", f"switch it to remote control, {RESUME}"
+    with contextlib.suppress(LinkError):
+        if supervision.in_remote_control(ASK_S) is False:
+            return "it was switched to local mode", f"switch it to remote control, {RESUME}"
     if halt.lost:
         return f"the link is lost: {halt.lost}", CHECK_LINK
     return noticed, f"look at the pendant, {RESUME}"

@@ -4,10 +4,11 @@ import contextlib
 import time
 from dataclasses import dataclass
 
-from drivers.ur_link import dashboard, probe, states
+from drivers.ur_link import probe, states
 from drivers.ur_link.failure import CHECK_LINK, failure
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.supervision import PRIMARY_PORT, Generation
 from drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats
 
@@ -19,8 +20,6 @@ CONNECT_S = 8.0
 """Deadline for taking control, real s."""
 _ORPHAN_S = 1.6
 _HZ = 125.0
-_REGISTERS = ("input_int_register_24", "input_double_register_24")
-"""Two of the registers that ur_rtde sends its commands through."""
 _NO_COG = 1e-6
 """Stands for a centre of mass at the flange: (0, 0, 0) keeps the old one in ur_rtde's script, m."""
 
@@ -91,7 +90,7 @@ class Control:
         self._worker.kill()
 
 
-def take(host: str, receiver: Receiver) -> Control:
+def take(host: str, receiver: Receiver, generation: Generation) -> Control:
     """Take control of an arm that is ready for it.
 
     Raises:
@@ -100,15 +99,15 @@ def take(host: str, receiver: Receiver) -> Control:
     end = time.monotonic() + CONNECT_S
     try:
         _ready(host, receiver)
-        if probe.in_use(host, _REGISTERS, 1.0):
+        if probe.in_use(host, generation.registers, 1.0):
             raise _controlled(host)
-        _no_program(host, receiver)
-        if dashboard.in_remote_control(host, 1.0) is False:
+        _no_program(host, receiver, generation)
+        if generation.supervision.in_remote_control(1.0) is False:
             raise failure(host, "it is in local mode", "switch it to remote control on the pendant")
     except LinkError as error:
         raise failure(host, str(error), CHECK_LINK) from None
     try:
-        worker = _start(host, end)
+        worker = _start(host, generation, end)
     except WorkerError as error:
         text = str(error)
         if "already in use" in text:
@@ -124,9 +123,10 @@ def take(host: str, receiver: Receiver) -> Control:
     return Control(worker)
 
 
-def _start(host: str, end: float) -> Worker:
+def _start(host: str, generation: Generation, end: float) -> Worker:
     """Start the worker; the registers may be ours for a moment longer, from being asked for."""
-    arguments = (host, repr(_HZ), repr(LEASE_S))
+    relayed = str(int(generation.script_port == PRIMARY_PORT))
+    arguments = (host, repr(_HZ), repr(LEASE_S), relayed, str(int(generation.upper)))
     module = "drivers.ur_link.control_worker"
     try:
         return Worker(module, arguments, end - time.monotonic())
@@ -155,13 +155,13 @@ def _ready(host: str, receiver: Receiver) -> None:
         raise failure(host, f"it is not running ({word})", "switch it on and release the brakes")
 
 
-def _no_program(host: str, receiver: Receiver) -> None:
+def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
     """Refuse a robot that runs somebody's program; end a paused one, which a stop left behind."""
     with contextlib.suppress(LinkError):  # an orphan of ours ends by its watchdog
         _wait_for(receiver, (states.STOPPED, states.PAUSED), _ORPHAN_S)
     runtime = receiver.read().runtime
     if runtime == states.PAUSED:
-        dashboard.stop(host, 1.0)
+        generation.supervision.stop(1.0)
         _wait_for(receiver, (states.STOPPED,), 2.0)
     elif runtime != states.STOPPED:
         word = states.runtime_word(runtime)

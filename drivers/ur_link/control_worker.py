@@ -11,6 +11,7 @@ import os
 import time
 from typing import Any
 
+from drivers.ur_link import relay
 from drivers.ur_link.child import Line, outliving, start, words
 
 WATCHDOG_HZ = 10.0
@@ -101,15 +102,17 @@ def serve(line: Line, control: ControlInterface) -> None:
 
 def main() -> None:
     """Take control, say so, then answer requests."""
-    line, (host, hz, lease) = start()
+    line, (host, hz, lease, relayed, upper) = start()
     try:
         from rtde_control import RTDEControlInterface as Interface
 
         flags = (
             int(Interface.FLAG_UPLOAD_SCRIPT)
-            | int(Interface.FLAG_UPPER_RANGE_REGISTERS)
             | int(Interface.FLAG_NO_EXT_FT)
+            | (int(Interface.FLAG_UPPER_RANGE_REGISTERS) if int(upper) else 0)
         )
+        if int(relayed):
+            _relay, host = relay.start(host)  # kept: its input stays open as long as this process
         # From the upload of its program to the watchdog nothing would end it but this process.
         with outliving(TAKING_S):
             control = ControlInterface(Interface(host, float(hz), flags), float(lease))

@@ -1,7 +1,7 @@
 """The dashboard server: questions about the robot's state, and a second way to stop it.
 
 One line per command, one line per answer. Source: Universal Robots, "Dashboard Server
-e-Series", port 29999. PolyScope X has none.
+e-Series", port 29999. PolyScope X has a Robot API in its place.
 """
 
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ NOT_UNDERSTOOD = "could not understand"
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """State of the robot by its dashboard.
+    """State of the robot by its dashboard server or Robot API; empty where it does not say.
 
     Attributes:
         model: e.g. "UR10"; empty where unknown.
@@ -33,6 +33,34 @@ class RobotFacts:
     safety: str
     remote: bool | None
     program: str
+
+
+@dataclass(frozen=True, slots=True)
+class Dashboard:
+    """The dashboard server at an address; see `supervision.Supervision`."""
+
+    host: str
+
+    @property
+    def name(self) -> str:
+        """What it is, for people."""
+        return "dashboard server"
+
+    def check(self, seconds: float) -> None:
+        """Ask for a sign of life."""
+        ask(self.host, ("robotmode",), seconds)
+
+    def describe(self, seconds: float) -> RobotFacts:
+        """Ask for everything worth knowing."""
+        return describe(self.host, seconds)
+
+    def in_remote_control(self, seconds: float) -> bool | None:
+        """Whether programs may command the arm; None where the robot has no such mode (CB3)."""
+        return in_remote_control(self.host, seconds)
+
+    def stop(self, seconds: float) -> None:
+        """Stop the robot's program, and with it the arm."""
+        stop(self.host, seconds)
 
 
 def ask(host: str, commands: tuple[str, ...], seconds: float) -> list[str]:

@@ -92,8 +92,9 @@ class Connection:
         """End the connection, and let the other side see it before it returns."""
         with contextlib.suppress(OSError), self._socket:
             self._socket.shutdown(socket.SHUT_WR)
-            self._socket.settimeout(0.1)
-            for _ in range(100):
+            end = time.monotonic() + 0.1
+            while (left := end - time.monotonic()) > 0:
+                self._socket.settimeout(left)
                 if not self._socket.recv(65536):
                     break
 

@@ -1,13 +1,16 @@
 """Identity and state of the arm, and everything that hinders a run."""
 
 import math
+import re
 from collections.abc import Callable
 
-from drivers.ur_link import dashboard, states
+from drivers.ur_link import primary, states
+from drivers.ur_link.dashboard import RobotFacts
 from drivers.ur_link.lines import LinkError
 from drivers.ur_link.probe import ControllerFacts
 from drivers.ur_link.reading import Reading
 from drivers.ur_link.receiver import Receiver
+from drivers.ur_link.supervision import Supervision
 from hilcal.measuring.devices import Report
 
 _RATE_S = (0.4, 2.0)
@@ -23,7 +26,9 @@ def survey(
     hz: float,
     controller: ControllerFacts,
     receiver: Receiver,
-    no_dashboard: str,
+    supervision: Supervision,
+    silent: str,
+    needs_primary: bool,
 ) -> Report:
     """Ask everything that can be asked without moving.
 
@@ -33,19 +38,33 @@ def survey(
         hz: packets per second that were asked for.
         controller: what it said at the opening.
         receiver: its state.
-        no_dashboard: why there is no dashboard server; empty where there is one.
+        supervision: its dashboard server or Robot API.
+        silent: why that does not answer; empty where it does.
+        needs_primary: whether programs go by the primary port.
     """
     version = states.version_word(controller.version)
     facts = [("address", host), ("controller version", version)]
     fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
     problems: list[str] = []
     name = "Universal Robots arm"
-    if no_dashboard:
-        facts.append(("dashboard server", no_dashboard))
-        problems.append(f"{no_dashboard}; the arm cannot be controlled without it")
+    kinematics = None
+    try:
+        kinematics = primary.kinematics(host, _ASK_S)
+    except LinkError as error:
+        facts.append(("its kinematics", f"not told: {error}"))
+        if needs_primary:
+            problems.append(
+                f"{error}; programs go by it, so that the arm cannot be controlled without it: "
+                "enable the primary client interface in the controller's settings, under services"
+            )
+    else:
+        fields.append(("kinematics", kinematics.to_dict()))
+    if silent:
+        facts.append((supervision.name, silent))
+        problems.append(f"{silent}; the arm cannot be controlled without it")
     else:
         try:
-            robot = dashboard.describe(host, _ASK_S)
+            robot = supervision.describe(_ASK_S)
         except LinkError as error:
             problems.append(f"{error}; the arm cannot be controlled without it")
         else:
@@ -71,7 +90,7 @@ def survey(
         problems += _hindrances(reading)
         if rate < _SHARE * hz:
             problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
-    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields))
+    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields), kinematics)
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:
@@ -87,7 +106,7 @@ def settled_rate(count: Callable[[float], float], hz: float) -> float:
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])
 
 
-def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
+def _facts(robot: RobotFacts) -> list[tuple[str, str]]:
     remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
     return [
         ("model", robot.model),
@@ -98,16 +117,21 @@ def _facts(robot: dashboard.RobotFacts) -> list[tuple[str, str]]:
     ]
 
 
-def _problems(robot: dashboard.RobotFacts, model: str) -> list[str]:
+def _problems(robot: RobotFacts, model: str) -> list[str]:
     out = []
     if robot.remote is False:
         out.append("it is in local mode; switch it to remote control on the pendant")
-    # "UR10" may stand for an UR10e as well: only the size decides
-    size = "".join(c for c in robot.model if c.isdigit())
-    told = model.lower().removeprefix("ur").removesuffix("e")
-    if model.lower().startswith("ur") and told.isdigit() and size and told != size:
+    # "UR10" may stand for an UR10e or UR12e as well: only the size decides
+    size, told = _size(robot.model), _size(model)
+    if size and told and told != size:
         out.append(f'it is a {robot.model}; the configuration says model = "{model}"')
     return out
+
+
+def _size(model: str) -> str:
+    """Return the number in the name of an arm of this maker; UR7e and UR12e have their old one."""
+    found = re.match(r"ur(\d+)", model.lower())
+    return "" if found is None else {"7": "5", "12": "10"}.get(found[1], found[1])
 
 
 def _state(reading: Reading) -> list[tuple[str, str]]:

@@ -48,7 +48,9 @@ from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -228,6 +230,19 @@ class Calibration:
         else:
             inverse = self._invert(of, states, goal or self.nominal(of, states))
         return Compensation(inverse, self, of, states, goal, std, untold)
+
+    @cached_property
+    def controller(self) -> Arm:
+        """The arm by which the controller computes poses, as far as it was told; else the nominal.
+
+        Raises:
+            InputError: what is kept of it is damaged.
+        """
+        arm, told = self.model.cell.arm, self.source.get("kinematics")
+        if told is None or arm.sign is not None or arm.coupling is not None:
+            return arm
+        other = with_factory(arm, of_dict(told, "the controller's kinematics"))
+        return other if flange_difference(other, arm)[1] > SAME else arm
 
     @cached_property
     def _compiled(self) -> Compiled | tuple[str, ...]:

@@ -57,7 +57,7 @@ from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.records import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
-from hilcal.store.robot_file import ROBOT_FILE, check_robot
+from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table
 from hilcal.types import Floats
@@ -132,8 +132,9 @@ class Campaign:
             config = changed(config, changes)
         except InputError as error:
             raise InputError(f"{file.path}: a revision is damaged ({error})") from None
-        check_robot(file.path, file.config_json, file.about(ROBOT_FILE))
-        cell = cell_from_config(config, None, file.about(ROBOT_FILE))
+        kept = file.about(ROBOT_FILE), file.about(CALIBRATION_FILE)
+        check_robot(file.path, file.config_json, *kept)
+        cell = cell_from_config(config, None, *kept)
         readings, covers = file.readings(), file.about(COVERS)
         noise = None if _restates(file, changes) else estimated_noise(file)
         readings = _with_instrument(readings, file, config, changes, noise)
@@ -401,8 +402,21 @@ class Campaign:
                 "effects": list(record.effects),
                 "verdict": judged.get("verdict"),
                 "readings_sha256": record.data_hash,
+                **self._kinematics(),
             },
         )
+
+    def _kinematics(self) -> dict[str, object]:
+        """Return the controller's kinematics as a calibration keeps them, where they were told."""
+        if self.file.about(PLAN) is not None:
+            event = RunLog(self.file).last("devices") or {}
+            for answer in event.get("answers", ()):
+                if "kinematics" in answer.get("fields", {}):
+                    return {"kinematics": answer["fields"]["kinematics"]}
+        factory = self.cell.factory
+        if factory is None or factory.rows is None:
+            return {}
+        return {"kinematics": factory.to_dict()}
 
     def posterior(self, revision: int | None = None) -> Posterior:
         """Return what a stored fit taught of the arm, which is the prior of another campaign.

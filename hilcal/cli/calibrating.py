@@ -37,6 +37,7 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
+from hilcal.measuring.kinematics import with_kinematics
 from hilcal.measuring.run import HOW_ON
 from hilcal.names import quoted
 from hilcal.present.calibration import (
@@ -388,7 +389,7 @@ class Operator:
         """Ask every device once whether it is ready; nothing moves."""
         if self._ready or self._rehearse:
             return
-        answers = answers_of(self._t, self._p.config)
+        answers = with_kinematics(answers_of(self._t, self._p.config), self._p.cell)
         for a in answers:
             name = "no answer" if a.report is None else a.report.name
             self._t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")

@@ -44,6 +44,7 @@ from hilcal.present.calibration import (
 )
 from hilcal.present.progress import working
 from hilcal.robot import se3
+from hilcal.robot.arm import Arm
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.mapping import PointMapping, find_mapping
 from hilcal.types import Bools, Floats
@@ -124,8 +125,8 @@ def compensate(
     with working(t.progress) as say:
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
-        arm = calibration.model.cell.arm
         task = _task(points, calibration, tool, leave, kind)
+        arm = calibration.controller if task.program else calibration.model.cell.arm
         if task.points.taken:
             t.notice(f"{points}: {task.points.taken}")
         given = _wrench(task.points, calibration, load, wrench)
@@ -139,7 +140,10 @@ def compensate(
         uncertain = doubts(arm, on_flange, understood, q, start) or [""] * len(q)
         sensed = task.points.sensed
         acting = given if sensed is None else calibration.load_wrench(q, sensed)
-        found = calibration.compensate(q, acting, tool=task.tool, recorded=task.points.recorded)
+        wanted = _wanted(task, calibration, q, arm)
+        found = calibration.compensate(
+            q, acting, tool=task.tool, wanted=wanted, recorded=task.points.recorded
+        )
     slow = calibration.without_kernel(task.tool)
     if slow:
         t.notice(
@@ -153,7 +157,8 @@ def compensate(
         _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
-        found = calibration.compensate(q, acting, tool=task.tool)
+        wanted = None if wanted is None else wanted[kept]
+        found = calibration.compensate(q, acting, tool=task.tool, wanted=wanted)
     document = found.to_dict(task.points.names)
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
@@ -163,6 +168,22 @@ def compensate(
     t.show(waypoints_table(become))
     _say_written(t, output or [])
     t.document({**document, "written": [str(path) for path in output or ()]})
+
+
+def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:
+    """Return where a program asks for the tool (N, 4, 4), None where the nominal arm has it there.
+
+    The controller takes a pose by its own kinematics, so that the nominal arm is elsewhere at the
+    joint values `q` that it goes to; joint values are those of the nominal arm. A calibration of
+    deflections knows no geometry: its unloaded arm is where the controller has it.
+    """
+    poses = task.points.wanted
+    if poses is None or arm is calibration.model.cell.arm or calibration.mode == "deflection":
+        return None
+    there = calibration.predict(q, tool=task.tool, std=False)
+    nominal = se3.matrix(there.nominal_rotation, there.nominal_position)
+    told = np.isfinite(poses).all(axis=(1, 2), keepdims=True)
+    return np.where(told, poses, nominal)
 
 
 def _say_written(t: Terminal, paths: list[Path]) -> None:

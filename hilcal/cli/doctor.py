@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Annotated
 
 import hilcal
-from drivers.ur_link.services import SERVICES
+from drivers.ur_link.services import services
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, argument, option
 from hilcal.cli.terminal import terminal
@@ -42,7 +42,7 @@ def doctor(
         findings += serial_ports(_ports(config), adapters())
         if config is not None and config.robot.driver == "ur" and config.robot.host:
             say(f"connecting to {config.robot.host}")
-            findings += reachable(config.robot.host, SERVICES)
+            findings += reachable(config.robot.host, services(config))
     t.show(doctor_report(findings))
     failed: HilcalError | None = None
     if any(f.state == "problem" for f in findings):

@@ -49,6 +49,7 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import plain
 from hilcal.measuring.connect import ConnectionResult, connect
 from hilcal.measuring.dry_run import DryRun, dry_run
+from hilcal.measuring.kinematics import told_by, with_kinematics
 from hilcal.names import quoted
 from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
@@ -173,11 +174,33 @@ def _known(
 def check(
     cell: CellFile,
     plan: PlanFile = None,
+    save_calibration: Annotated[
+        Path | None,
+        option(
+            "--save-calibration F.toml",
+            "Write the kinematics that the arm's controller holds, for [robot] calibration.",
+        ),
+    ] = None,
+    factory: Annotated[
+        Path | None,
+        option(
+            "--factory F.hilcal",
+            "Is the arm still what its factory measured? Measures a few readings without a load "
+            "into a new campaign, or takes those of one that is there.",
+        ),
+    ] = None,
+    yes: Annotated[
+        bool, option("--yes -y", "With --factory: do not ask before the arm moves.")
+    ] = False,
     effects_from: EffectsFrom = None,
     as_json: Json = False,
 ) -> None:
-    """Connect to every device and report its state; nothing moves."""
+    """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
+        raise InputError(f"--save-calibration {save_calibration}; valid: a name that ends in .toml")
+    if save_calibration is not None and save_calibration.exists():
+        raise InputError(f"{save_calibration}: the file exists; choose another name")
     config, numbers = read_cell(cell)
     try:
         check_effects(numbers, config, catalogue)
@@ -187,13 +210,24 @@ def check(
     if plan is not None:
         dry = dry_checked(t, numbers, config, load_plan(plan))
     try:
-        answers = answers_of(t, config)
+        answers = with_kinematics(answers_of(t, config), numbers)
     except InputError:  # the cell names no device: the plan is checked all the same
         if dry is None or not dry.problems:
             raise
         answers = ()
     t.show(check_report(answers, dry))
+    if save_calibration is not None:
+        told = told_by(answers)
+        if told is None:
+            raise DeviceError("arm: it does not tell its kinematics; nothing is written")
+        replace_file(save_calibration, told.to_toml(), must_be_new=True)
+        t.show(f"The kinematics of the arm's controller are in {save_calibration}.")
     failed: HilcalError | None = None
+    judged = None
+    if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
+        from hilcal.cli.factory import factory_check  # which needs this file
+
+        judged = factory_check(t, config, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
         failed = DeviceError(f"not ready: {names}; see above")
     elif dry is not None:
@@ -203,6 +237,7 @@ def check(
             "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
             "devices": [answer_json(a) for a in answers],
             "plan": None if dry is None else asdict(dry),
+            **({} if judged is None else {"factory": judged}),
         },
         failed,
     )

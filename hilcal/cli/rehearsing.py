@@ -354,9 +354,8 @@ def with_person(config: CellConfig) -> CellConfig:
 
 
 def _placed(config: CellConfig, base_dir: Path) -> CellConfig:
-    """Return the configuration with a robot's file named by its whole path."""
-    path = base_dir / config.robot.model
-    if not path.suffix:
-        return config
-    robot = config.robot.model_copy(update={"model": str(path.absolute())})
+    """Return the configuration with a robot's files named by their whole paths."""
+    told = {"model": config.robot.model, "calibration": config.robot.calibration or ""}
+    files = {k: str((base_dir / v).absolute()) for k, v in told.items() if Path(v).suffix}
+    robot = config.robot.model_copy(update=files)
     return config.model_copy(update={"robot": robot})

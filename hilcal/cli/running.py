@@ -39,6 +39,7 @@ from hilcal.errors import (
 )
 from hilcal.measuring.connect import ConnectionResult, Rig, connect
 from hilcal.measuring.devices import Clock
+from hilcal.measuring.kinematics import with_kinematics
 from hilcal.measuring.progress import Watcher
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
@@ -261,6 +262,7 @@ def measure(
             if rig is not None:
                 stack.callback(rig.close)
                 answers = tuple(_sighted(rig, answer, say) for answer in answers)
+        answers = with_kinematics(answers, cell)
         refuse_unready(answers)
         assert rig is not None  # noqa: S101  (refuse_unready has raised otherwise)
         watcher: Watcher = stack.enter_context(watching(t.progress, len(log.plan.steps)))

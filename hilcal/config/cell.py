@@ -74,12 +74,35 @@ class Robot(Conventions):
         description='"modelled" or "measured": the joint torques that twist the drives, those of '
         "the described masses and loads, or the columns tau1_Nm, ... of the readings",
     )
+    kinematics: Literal["nominal", "factory"] = Field(
+        "nominal",
+        description='"nominal" (the arm as its maker designed it) or "factory" (as calibration has '
+        "it): what corrections are counted from",
+        examples=["factory"],
+    )
+    calibration: str | None = Field(
+        None,
+        min_length=1,
+        description="the path of a file with the factory's kinematics of this one arm of Universal "
+        "Robots: calibration.conf, a .yaml of ur_calibration, or a .toml of "
+        "check --save-calibration",
+        examples=["calibration.conf"],
+    )
     base_link: str | None = Field(
         None, description="the name of a link of the URDF", examples=["base_link"]
     )
     tip_link: str | None = Field(
         None, description="the name of a link of the URDF", examples=["tool0"]
     )
+
+    @model_validator(mode="after")
+    def _has_calibration(self) -> "Robot":
+        if self.kinematics == "factory" and self.calibration is None:
+            raise ValueError(
+                'kinematics = "factory" needs calibration = FILE; hilcal check CELL.toml '
+                "--save-calibration FILE writes what the controller holds"
+            )
+        return self
 
     @model_validator(mode="after")
     def _plausible_gravity(self) -> "Robot":
@@ -311,6 +334,13 @@ class Simulation(Section):
         1.0,
         description="how much faster than real time the simulated world goes, 1 to 200",
         examples=[20.0],
+    )
+    controller_version: str = Field(
+        "5.11.6.1010327",
+        pattern=r"^\d+\.\d+\.\d+\.\d+$",
+        description="the software of the simulated arm's controller, four numbers with dots "
+        "between; from 10 on it is PolyScope X",
+        examples=["10.14.0.0"],
     )
 
 

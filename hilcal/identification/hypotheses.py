@@ -16,7 +16,7 @@ from hilcal.cell import Cell
 from hilcal.config.joints import Conventions
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.catalogue import load_arm, other_arms
 from hilcal.robot.conventions import as_counted, may_follow, with_conventions
 from hilcal.types import Bools, Floats
 
@@ -281,9 +281,8 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     simple = ["millimetres", "metres", "joint_degrees", "joint_radians", "mirrored"]
     simple += ["travel_millimetres"] * bool(slides.any())
     yield from map(Hypothesis, simple if d.turn is None else [*simple, *OF_ATTITUDES])
-    for name in robot_names():
-        if name != d.arm.name and load_arm(name).n == n:
-            yield Hypothesis("arm", arm=name)
+    for arm in other_arms(d.arm):
+        yield Hypothesis("arm", arm=arm.name)
     yield from (Hypothesis("shift", shift=k) for k in SHIFTS)
     yield from (Hypothesis("columns", order=order) for order in column_orders(n))
 

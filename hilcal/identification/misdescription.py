@@ -49,7 +49,7 @@ from hilcal.identification.solver import minimise
 from hilcal.numbers import length
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
-from hilcal.robot.catalogue import load_arm, robot_names
+from hilcal.robot.catalogue import other_arms
 from hilcal.robot.chain import evaluate
 from hilcal.robot.conventions import as_counted
 from hilcal.types import Bools, Floats, Ints
@@ -537,10 +537,8 @@ def other_arm_of(cell: Cell, readings: Readings) -> OtherArm | None:
 def _others(cell: Cell) -> Iterator[Arm]:
     """Yield the other arms of the catalogue with as many joints, as the controller counts them."""
     robot = None if cell.config is None else cell.config.robot
-    for name in robot_names():
-        arm = load_arm(name)
-        if name != cell.arm.name and arm.n == cell.arm.n:
-            yield arm if robot is None else as_counted(arm, robot)
+    for arm in other_arms(cell.arm):
+        yield arm if robot is None else as_counted(arm, robot)
 
 
 def _left(cell: Cell, arm: Arm, readings: Readings) -> float:

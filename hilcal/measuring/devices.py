@@ -11,6 +11,7 @@ from typing import Protocol, runtime_checkable
 
 from hilcal.config import Load
 from hilcal.errors import DeviceError
+from hilcal.robot.factory import FactoryKinematics
 from hilcal.types import Floats
 
 
@@ -68,6 +69,7 @@ class Report:
         facts: (what, value) for people: versions, modes, rates, temperatures.
         problems: what has to be put right before a run, one clear line each.
         fields: (name, value) of the facts for scripts: numbers with their unit in the name.
+        kinematics: of an arm, by which its controller computes poses; None where it does not tell.
     """
 
     device: str
@@ -75,6 +77,7 @@ class Report:
     facts: tuple[tuple[str, str], ...] = ()
     problems: tuple[str, ...] = ()
     fields: tuple[tuple[str, object], ...] = ()
+    kinematics: FactoryKinematics | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

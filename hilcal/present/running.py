@@ -35,6 +35,7 @@ from hilcal.present.document import Block, table
 if TYPE_CHECKING:
     from hilcal.measuring.connect import ConnectionResult
     from hilcal.measuring.dry_run import DryRun
+    from hilcal.transfer.factory import FactoryCheck
 
 
 def spoken(seconds: float) -> str:
@@ -66,6 +67,29 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
         yield "All devices are ready. Nothing was moved."
     if dry is not None:
         yield from _dry_report(dry)
+
+
+def factory_words(found: "FactoryCheck") -> Iterator[Block]:
+    """Yield whether an arm is still what its factory measured, and how well that is known."""
+    moved, std = numbers.length(found.moved_m), numbers.length(found.moved_std_m)
+    yield ""
+    if found.changed:
+        yield (
+            "The arm is no longer what its factory measured: its geometry has changed "
+            f"(p = {found.p_value:.1g}), which moves the target by {moved} (rms, ± {std})."
+        )
+    else:
+        yield (
+            "The arm is what its factory measured, as far as these readings tell "
+            f"(p = {found.p_value:.2g}): what they leave of its geometry moves the target by "
+            f"{moved} (rms, ± {std})."
+        )
+    yield (
+        f"From the factory's kinematics {found.readings} readings are "
+        f"{numbers.length(found.factory_m)} off (rms, the arm's own weight in it), from the "
+        f"maker's nominal ones {numbers.length(found.nominal_m)}; "
+        f"their noise is {numbers.length(found.noise_m)}."
+    )
 
 
 def _dry_report(dry: "DryRun") -> Iterator[Block]:

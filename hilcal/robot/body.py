@@ -65,27 +65,41 @@ class Figures:
 # the joint torque T has 78 mm (T / 330 N·m)^0.27, which gives 60 mm for the 150 N·m joint and
 # 40 mm for the 28 N·m joint of those two arms within 3 mm. All radii are below half of the data
 # sheets' footprints of 128 (UR3e), 149 (UR5e), 190 (UR10e) and 245 mm (UR20), as they must be.
+# Of UR8 Long, UR15 and UR18 no tubes are published (their `offsets` are of the meshes). Their radii
+# are by the same rule from 433, 204 and 70 N·m; the offsets of their tubes are guessed: as far
+# beyond the links' centres of mass (0.193 and 0.071 m) as those of UR10e and UR20 are on average.
 _UR5 = ((0.060, 0.060, 0.055, 0.040), (0.050, 0.038))
 _UR10 = ((0.078, 0.078, 0.058, 0.050), (0.060, 0.043))
 _UR3 = ((0.049, 0.049, 0.041, 0.033), (0.040, 0.030))
 _UR20 = ((0.099, 0.099, 0.084, 0.060), (0.078, 0.062))
+_UR15 = ((0.084, 0.084, 0.069, 0.051), (0.066, 0.050))
 _FIGURES = {
     "ur3": Figures(0.1198, 0.0275, *_UR3),
     "ur3e": Figures(0.120, 0.027, *_UR3),
     "ur5": Figures(0.13585, 0.0165, *_UR5),
     "ur5e": Figures(0.138, 0.007, *_UR5),
+    "ur7e": Figures(0.138, 0.007, *_UR5),
+    "ur8long": Figures(0.227, 0.046, *_UR15),
     "ur10": Figures(0.220941, 0.049042, *_UR10),
     "ur10e": Figures(0.1762, 0.0393, *_UR10),
+    "ur12e": Figures(0.1762, 0.0393, *_UR10),
+    "ur15": Figures(0.227, 0.046, *_UR15),
     "ur16e": Figures(0.1762, 0.0393, *_UR10),
+    "ur18": Figures(0.227, 0.046, *_UR15),
     "ur20": Figures(0.260, 0.043, *_UR20),
     "ur30": Figures(0.260, 0.043, *_UR20),
 }
+_GUESSED = frozenset({"ur8long", "ur15", "ur18"})
 
 
 def is_known(arm: Arm) -> bool:
-    """Whether the arm's sizes are known; else they are guessed from its reach."""
+    """Whether the arm's sizes are known; else they are guessed, as a rule from its reach."""
+    return arm.name not in _GUESSED and _has_figures(arm)
+
+
+def _has_figures(arm: Arm) -> bool:
     if arm.sign is not None:
-        return is_known(as_drawn(arm))
+        return _has_figures(as_drawn(arm))
     parallel = arm.n == _JOINTS and min(abs(arm.links[k][2, 2]) for k in (2, 3)) > 0.99
     return arm.name in _FIGURES and bool(parallel)  # a file of the same name may be another arm
 
@@ -97,7 +111,7 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
     most an eighth of the radius, which the margins of collision checks cover.
     """
     if arm.sign is None:
-        return _of_ur(arm, _FIGURES[arm.name]) if is_known(arm) else _of_any(arm)
+        return _of_ur(arm, _FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
     # The shapes are those of the drawn arm; the bodies of turned axes have turned frames.
     turned = np.append(False, arm.sign < 0)
     return tuple(

@@ -1,7 +1,10 @@
 """The arms that come with the program, and the way to load any other."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
@@ -9,6 +12,12 @@ from hilcal.robot.dh import arm_from_dh
 from hilcal.toml import suggest
 
 OTHER_ARMS = "the path of a .urdf file, or of a .toml file with DH rows"
+UNPUBLISHED = {
+    "ur10g-1750": "the lengths and torques of its joints",
+    "ur17g-1300": "the lengths, masses, centres of mass and torques of its joints",
+    "ur18g-950": "the lengths and torques of its joints",
+}
+"""Arms that are on sale, and what of them was not found in a published source (November 2026)."""
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -25,6 +34,14 @@ def configs_dir() -> Path:
 def robot_names() -> tuple[str, ...]:
     """Names of the arms in the catalogue."""
     return tuple(sorted(path.stem for path in (configs_dir() / "robots").glob("*.toml")))
+
+
+def other_arms(arm: Arm) -> Iterator[Arm]:
+    """Yield the arms of the catalogue with as many joints as an arm, and other lengths."""
+    for name in robot_names():
+        other = load_arm(name)
+        if name != arm.name and other.n == arm.n and not np.array_equal(other.links, arm.links):
+            yield other
 
 
 def load_arm(
@@ -64,6 +81,11 @@ def load_arm(
     if suffix == ".toml":
         return arm_from_dh(path)
     names = robot_names()
+    if model in UNPUBLISHED:
+        raise InputError(
+            f'robot "{model}" is not in the catalogue: {UNPUBLISHED[model]} are not published; '
+            f"give {OTHER_ARMS}"
+        )
     if model not in names:
         raise InputError(
             f'unknown robot "{model}"{suggest(model, names)}; '

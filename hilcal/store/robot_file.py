@@ -1,4 +1,4 @@
-"""The file that describes a robot which is not of the catalogue: a campaign keeps its text.
+"""Files that describe a robot, its model and its kinematics by the factory: a campaign keeps them.
 
 A campaign that was sent is read by that, on any machine, and reads no file outside of itself.
 """
@@ -11,12 +11,15 @@ from hilcal.errors import InputError
 from hilcal.names import quoted
 
 ROBOT_FILE = "robot_file"
-"""Its key in the campaign."""
+"""Key of the file of a robot which is not of the catalogue."""
+CALIBRATION_FILE = "calibration_file"
+"""Key of the file of [robot] calibration."""
+KEYS = {ROBOT_FILE: "model", CALIBRATION_FILE: "calibration"}
 _KINDS = (".urdf", ".toml")
 
 
 def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
-    """Return what to keep of the robot of a configuration; nothing for one of the catalogue.
+    """Return what to keep of the robot of a configuration; no model for one of the catalogue.
 
     Args:
         config_json: the cell's configuration.
@@ -25,22 +28,33 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
     Raises:
         InputError: the file is too large.
     """
-    path = Path(base_dir) / _model(config_json)
-    return text_of(path) if path.suffix else {}
+    out: dict[str, str] = {}
+    for key, name in KEYS.items():
+        path = Path(base_dir) / _told(config_json, name)
+        out |= text_of(path, key) if path.suffix else {}
+    return out
 
 
-def check_robot(path: Path, config_json: str, kept: str | None) -> None:
+def check_robot(
+    path: Path, config_json: str, kept: str | None, calibration: str | None = None
+) -> None:
     """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path.
 
     Args:
         path: the campaign.
         config_json: the cell's configuration.
         kept: what the campaign keeps of its robot's file.
+        calibration: the same of the file of its kinematics.
 
     Raises:
         InputError: says how to put it into the campaign.
     """
-    model = _model(config_json)
+    if calibration is None and (file := _told(config_json, "calibration")):
+        raise InputError(
+            f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, and "
+            "which is not read; valid: a campaign that was made where that file was"
+        )
+    model = _told(config_json, "model")
     if kept is None and Path(model).suffix.lower() in _KINDS:
         raise InputError(
             f"{path}: its robot is in a file that it does not hold, {model!r}, and which is not "
@@ -49,7 +63,7 @@ def check_robot(path: Path, config_json: str, kept: str | None) -> None:
         )
 
 
-def text_of(path: Path) -> dict[str, str]:
+def text_of(path: Path, key: str = ROBOT_FILE) -> dict[str, str]:
     """Return a robot's file as a campaign keeps it; nothing where it cannot be read.
 
     Raises:
@@ -58,12 +72,12 @@ def text_of(path: Path) -> dict[str, str]:
     try:
         if not path.is_file():
             return {}
-        return {ROBOT_FILE: limits.read_text(path, limits.PROGRAM)}
+        return {key: limits.read_text(path, limits.PROGRAM)}
     except (OSError, UnicodeDecodeError):
         return {}
 
 
-def _model(config_json: str) -> str:
+def _told(config_json: str, key: str) -> str:
     content = json.loads(config_json)
     robot = content.get("robot") if isinstance(content, dict) else None
-    return str(robot.get("model", "")) if isinstance(robot, dict) else ""
+    return str(robot.get(key) or "") if isinstance(robot, dict) else ""

@@ -19,7 +19,7 @@ from hilcal.store.appended import joined, with_new_names
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.revision import utc_now
-from hilcal.store.robot_file import ROBOT_FILE, robot_file_of
+from hilcal.store.robot_file import KEYS, robot_file_of
 from hilcal.store.stored_schema import Detail, check, check_event
 
 PLAN = "plan"
@@ -74,13 +74,13 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
     Raises:
         InputError: names the section, or the robot's file, that differs.
     """
-    kept = campaign.about(ROBOT_FILE)
-    now = robot_file_of(config.to_json(), str(base_dir)).get(ROBOT_FILE)
-    if kept is not None and now is not None and kept != now:
-        raise InputError(
-            f"{base_dir / config.robot.model} is not what it was when {campaign.path} was begun; a "
-            "campaign is of one robot: start another one for this"
-        )
+    for key, now in robot_file_of(config.to_json(), str(base_dir)).items():
+        kept = campaign.about(key)
+        if kept is not None and kept != now:
+            raise InputError(
+                f"{base_dir / getattr(config.robot, KEYS[key])} is not what it was when "
+                f"{campaign.path} was begun; a campaign is of one robot: start another one for this"
+            )
     for section in SAME:
         stored, given = (
             c.model_dump(mode="json", include={section: True}, exclude={section: ADDRESSES})

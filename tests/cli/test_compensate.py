@@ -13,9 +13,11 @@ from hilcal.config import load_config
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
+from hilcal.robot.factory import with_factory
 from hilcal.robot.se3 import matrix, of_six, rotation, six
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
+from tests.support.factory_cases import factory_of
 
 JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 
@@ -300,3 +302,45 @@ def test_a_joint_whole_turns_from_what_was_measured_is_inside(capsys, fitted, tm
     points.write_text("\n".join([JOINTS, *lines]))
     said = refused(capsys, 4, "compensate", fitted, points, "--load", "10kg")
     assert "1 of 3 points are refused: 3: joint 6 angle" in said
+
+
+def test_a_pose_of_a_program_is_by_the_controllers_own_kinematics(capsys, fitted, tmp_path) -> None:
+    """The controller goes where its own arm has the tool; that is where the correction begins."""
+    file, factory = tmp_path / "arm.json", factory_of("ur10e")
+    ok(capsys, "export", fitted, "--calibration", file)
+    with hc.Campaign.open(fitted, read_only=True) as run:
+        q = run.readings.states.q[0] + 0.01
+        c, nominal = run.calibration(), run.cell.arm
+    tool = of_six([0.06, 0.02, 0.12, 0.0, 0.0, 0.0])
+    theirs = with_factory(nominal, factory)
+
+    def pose_by(arm, q):
+        chain = evaluate(arm, np.atleast_2d(q))
+        return matrix(chain.rotation[-1], chain.position[-1])[0] @ tool
+
+    pose = pose_by(theirs, q)
+    program = tmp_path / "p.script"
+    numbers = ", ".join(f"{v:.12f}" for v in six(pose))
+    joints = ", ".join(f"{v:.9f}" for v in q)
+    program.write_text(
+        "set_tcp(p[0.06,0.02,0.12,0,0,0])\n"
+        f"movej(get_inverse_kin(p[{numbers}], qnear=[{joints}]), a=1)\n"
+        f"movej([{joints}], a=1)\n"
+    )
+    content = json.loads(file.read_text())
+    (plain,) = ok(capsys, "compensate", file, program, "--json").document["points"][:1]
+    content["source"]["kinematics"] = factory.to_dict()
+    file.write_text(json.dumps(content))
+    first, second = ok(capsys, "compensate", file, program, "--json").document["points"]
+    np.testing.assert_allclose(first["q_command"], q, atol=1e-8)  # as the controller takes it
+    assert np.abs(np.array(plain["q_command"]) - q).max() > 1e-5  # the nominal arm takes another
+    np.testing.assert_allclose(plain["q_corrected"], first["q_corrected"], atol=1e-7)
+    there = c.predict(np.array(first["q_corrected"]), tool=tool, std=False)
+    np.testing.assert_allclose(there.position[0], pose[:3, 3], atol=1e-8)
+    before = c.predict(q, tool=tool, std=False).position[0]
+    assert np.linalg.norm(before - pose[:3, 3]) > 1e-4
+    at_joints = c.predict(np.array(second["q_corrected"]), tool=tool, std=False).position[0]
+    np.testing.assert_allclose(at_joints, pose_by(nominal, q)[:3, 3], atol=1e-8)
+    content["source"]["kinematics"] = {"a_m": "far"}
+    file.write_text(json.dumps(content))
+    assert "not the kinematics" in refused(capsys, 2, "compensate", file, program)

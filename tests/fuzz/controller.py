@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.ur_link import dashboard, lines, probe, reading
+from drivers.ur_link import dashboard, lines, primary, probe, reading
 from drivers.ur_link.lines import LinkError
 from tests.fuzz.damage import bytes_damaged
 from tests.fuzz.harness import Accepted, Parser
@@ -90,6 +90,27 @@ def dashboard_server() -> Parser:
         return True
 
     return Parser("dashboard", make, parse, refusals=(LinkError,))
+
+
+def primary_port() -> Parser:
+    def package(kind: int, body: bytes) -> bytes:
+        return struct.pack(">iB", 5 + len(body), kind) + body
+
+    part = package(5, struct.pack(">6I24dI", *range(6), *(0.1 * k for k in range(24)), 2))
+    state = package(16, package(0, bytes(47)) + part)
+    corpus = [package(20, b"version") + state, state, package(16, package(0, bytes(47))) + state]
+
+    def make(by: Random) -> bytes:
+        return bytes_damaged(by.choice(corpus), by, corpus)
+
+    def parse(data: bytes) -> bool:
+        with instead(lines, _network(data)):
+            found = primary.kinematics("fuzz", 1.0)
+        if not np.isfinite(found.links).all():
+            raise Accepted("primary: transforms that are no numbers")
+        return True
+
+    return Parser("primary", make, parse, refusals=(LinkError,))
 
 
 def packet() -> Parser:

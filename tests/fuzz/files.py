@@ -18,6 +18,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.robot.dh import arm_from_dh
+from hilcal.robot.factory import nominal_rows, read_factory, with_factory
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.store.plan import load_plan
 from hilcal.tables.importing import import_readings
@@ -28,6 +29,7 @@ from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, toml_dam
 from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
 from tests.fuzz.packed import packed
 from tests.support.campaigns import configuration
+from tests.support.factory_cases import UR5E_YAML, factory_of
 
 
 def _plain(readings: hc.Readings) -> None:
@@ -187,6 +189,28 @@ def _toml(bench: Bench, name: str, folder: str, read: Callable[[Path], object]) 
     return Parser(name, make, parse)
 
 
+def _factory(bench: Bench) -> Parser:
+    """Kinematics of one arm, in each of the three forms."""
+    nominal, made = load_arm("ur5e"), factory_of("ur5e")
+    deltas = made.rows - nominal_rows(nominal)
+    keys = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+    conf = "".join(f"{k} = {v}\n" for k, v in zip(keys, deltas.tolist(), strict=True))
+    texts = [(".yaml", UR5E_YAML), (".conf", f"[mounting]\n{conf}"), (".toml", made.to_toml())]
+
+    def make(by: Random) -> bytes:
+        k = by.randrange(len(texts))
+        return bytes([k]) + bytes_damaged(texts[k][1].encode(), by)
+
+    def parse(data: bytes) -> bool:
+        path = bench.path(f"factory{texts[data[0] % len(texts)][0]}", data[1:])
+        arm = with_factory(nominal, read_factory(path, nominal))
+        if not np.isfinite(arm.links).all():
+            raise Accepted("factory: transforms that are no numbers")
+        return True
+
+    return Parser("factory", make, parse)
+
+
 def _document(
     bench: Bench, name: str, sound: Callable[[], str], read: Callable[[Path], object]
 ) -> Parser:
@@ -266,6 +290,7 @@ def parsers() -> list[Parser]:
         ),
         _document(bench, "plan", lambda: bench.plan, load_plan),
         _document(bench, "parameters", bench.of_run("parameters"), parameters_document.read),
+        _factory(bench),
         _urdf(bench),
         campaigns,
         *stored.parsers(bench),

@@ -259,5 +259,6 @@ def parsers() -> list[Parser]:
         _modbus(),
         controller.rtde(),
         controller.dashboard_server(),
+        controller.primary_port(),
         controller.packet(),
     ]

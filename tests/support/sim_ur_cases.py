@@ -20,7 +20,7 @@ from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
 
 ROOT = Path(__file__).resolve().parents[2]
-PORTS = (29999, 30003, 30004)
+PORTS = (29999, 30001, 30003, 30004)
 _READY = 20.0  # s
 
 
@@ -50,6 +50,7 @@ class SimulatedUr:
     host: str
     board: Blackboard
     process: subprocess.Popen[bytes]
+    is_x: bool = False
 
     def admin(self, op: str = "state", **arguments: Any) -> Any:
         return admin.ask(self.directory / "arm.sock", op, **arguments)
@@ -93,7 +94,8 @@ def start(
     process = subprocess.Popen(
         command(directory, host, *arguments), stdin=subprocess.PIPE, env=environment()
     )
-    running = SimulatedUr(directory, host, board, process)
+    is_x = any(argument.startswith("10.") for argument in arguments)
+    running = SimulatedUr(directory, host, board, process, is_x)
     deadline = time.monotonic() + _READY
     while not (directory / "arm.sock").exists():
         if process.poll() is not None or time.monotonic() > deadline:

@@ -9,8 +9,12 @@ import numpy as np
 import psutil
 import pytest
 
+from drivers.simulated.ur_server import API
 from drivers.ur import UrArm, open_arm
 from drivers.ur_link import dashboard
+from drivers.ur_link.dashboard import Dashboard
+from drivers.ur_link.robot_api import RobotApi
+from drivers.ur_link.supervision import Supervision
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
@@ -26,6 +30,7 @@ Sim = sim_ur_cases.SimulatedUr
 def config(
     host: str | None, model: str = "ur10e", clock: float = 1.0, **options: Any
 ) -> CellConfig:
+    options = {"robot_api_port": API, **options}
     robot = {"model": model, "driver": "ur", "host": host, "options": options}
     return CellConfig.model_validate({"robot": robot, "simulation": {"clock": clock}})
 
@@ -82,10 +87,29 @@ def error_of(call: Callable[[], Any], seconds: float = 20.0) -> str:
     return text
 
 
+def supervision(sim: Sim) -> Supervision:
+    return RobotApi(sim.host, API) if sim.is_x else Dashboard(sim.host)
+
+
+def api(sim: Sim) -> RobotApi:
+    return RobotApi(sim.host, API)
+
+
 def children() -> list[psutil.Process]:
-    """Child processes of the driver (the simulated controllers are children, too)."""
-    mine = psutil.Process().children(recursive=True)
-    return [p for p in mine if "drivers.ur_link" in " ".join(_words(p))]
+    """Child processes of the driver (the simulated controllers are children, too).
+
+    A relay to PolyScope X ends by itself with the process that commands, a moment later.
+    """
+    end = time.monotonic() + 2.0
+    while True:
+        mine = psutil.Process().children(recursive=True)
+        ours = [(p, " ".join(_words(p))) for p in mine]
+        relays = sum("ur_link.relay" in words for _, words in ours)
+        commands = sum("ur_link.control_worker" in words for _, words in ours)
+        if relays <= commands or time.monotonic() > end:
+            assert relays <= commands
+            return [p for p, words in ours if "ur_link" in words and "relay" not in words]
+        time.sleep(0.01)
 
 
 def _words(process: psutil.Process) -> list[str]:
@@ -103,7 +127,11 @@ def put_right(sim: Sim) -> None:
     sim.admin("remote_mode")
     sim.admin("release_emergency_stop")
     if sim.admin()["robot_mode"] != 7:
-        dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
+        if sim.is_x:
+            for action in ("POWER_ON", "BRAKE_RELEASE"):
+                api(sim).order("/robotstate/v1/state", action, 2.0)
+        else:
+            dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
         sim.wait("robot_mode", 7)
     sim.wait("moving", False)
 
@@ -116,10 +144,14 @@ def check_resting(sim: Sim, since: int) -> None:
     assert sim.admin()["q"] == state["q"]
 
 
-@pytest.fixture(scope="module")
-def sim(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Sim]:
-    """One controller for a file."""
-    running = start(tmp_path_factory.mktemp("ur"))
+GENERATIONS = ("5.11.6.1010327", "10.14.0.0")
+"""With a dashboard server, and with the Robot API of PolyScope X: one contract."""
+
+
+@pytest.fixture(scope="module", params=GENERATIONS)
+def sim(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Sim]:
+    """One controller of each generation for a file."""
+    running = start(tmp_path_factory.mktemp("ur"), "--version", request.param)
     yield running
     running.close()
 

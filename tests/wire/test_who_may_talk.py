@@ -34,7 +34,7 @@ def listening(pid: int) -> list[str]:
 
 def test_the_simulated_arm_listens_on_loopback_alone(arm: SimulatedUr) -> None:
     found = listening(arm.process.pid)
-    assert len(found) == 3  # RTDE, dashboard, script
+    assert len(found) == 4  # RTDE, dashboard, primary, script
     assert all(address.startswith("127.") for address in found)
 
 

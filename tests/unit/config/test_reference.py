@@ -65,7 +65,14 @@ def test_every_key_has_unit_default_and_an_example_that_is_valid(
         assert adapter.validate_python(default) == field.get_default(call_default_factory=True)
     else:
         assert field.get_default(call_default_factory=True) in (None, (), {})
-    texts = {"joint", "follows", "joint_sign", "seed", "target_normal"}  # numbers without a unit
+    texts = {
+        "joint",
+        "follows",
+        "joint_sign",
+        "seed",
+        "target_normal",
+        "robot_api_port",
+    }  # numbers without a unit
     if numeric(field.annotation) and section_of(field) is None and key not in texts:
         assert found.unit
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
-from hilcal.robot.catalogue import configs_dir, load_arm, robot_names
+from hilcal.robot.catalogue import UNPUBLISHED, configs_dir, load_arm, robot_names
 from hilcal.robot.chain import evaluate
 from hilcal.robot.pinocchio_model import pinocchio_model
 from hilcal.robot.statics import Load, slot_wrenches
@@ -27,6 +27,11 @@ PUBLISHED = {
     "ur10": (0.1273, -0.612, -0.5723, 0.163941, 0.1157, 0.0922, 28.9),
     "ur3e": (0.15185, -0.24355, -0.2132, 0.13105, 0.08535, 0.0921, 11.2),
     "ur5e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
+    "ur7e": (0.1625, -0.425, -0.3922, 0.1333, 0.0997, 0.0996, 20.6),
+    "ur8long": (0.2186, -0.8989, -0.7149, 0.1824, 0.1361, 0.1434, None),
+    "ur12e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
+    "ur15": (0.2186, -0.6475, -0.5164, 0.1824, 0.1361, 0.1434, 40.7),
+    "ur18": (0.2186, -0.475, -0.3389, 0.1824, 0.1361, 0.1434, None),
     "ur10e": (0.1807, -0.6127, -0.57155, 0.17415, 0.11985, 0.11655, 33.5),
     "ur16e": (0.1807, -0.4784, -0.36, 0.17415, 0.11985, 0.11655, 33.1),
     "ur20": (0.2363, -0.862, -0.7287, 0.201, 0.1593, 0.1543, 64.0),
@@ -35,6 +40,7 @@ PUBLISHED = {
 PAYLOAD = {
     "ur3": 3, "ur5": 5, "ur10": 10, "ur3e": 3, "ur5e": 5,
     "ur10e": 12.5, "ur16e": 16, "ur20": 20, "ur30": 30,
+    "ur7e": 7.5, "ur8long": 8, "ur12e": 12.5, "ur15": 15, "ur18": 18,
 }  # fmt: skip
 
 
@@ -202,7 +208,8 @@ def test_pinocchio_agrees(name: str) -> None:
 def test_masses_and_limits_are_plausible(name: str) -> None:
     arm, weight = load_arm(name), PUBLISHED[name][-1]
     # the foot does not move: the rest weighs less than the whole, but is most of it
-    assert 0.75 * weight < arm.masses.sum() < weight
+    if weight is not None:
+        assert 0.75 * weight < arm.masses.sum() < weight
     assert np.all(arm.masses > 0)
     assert arm.payload == PAYLOAD[name]
     assert np.all(arm.q_min == -arm.q_max)
@@ -213,6 +220,12 @@ def test_masses_and_limits_are_plausible(name: str) -> None:
     reach = np.linalg.norm(flange(arm, np.zeros(6))[:2, 3])
     assert abs(stretched[1]) + 9.81 * arm.payload * reach < arm.torque_max[1]
     assert np.all(np.abs(stretched) < 0.6 * arm.torque_max)
+
+
+@pytest.mark.parametrize("name", UNPUBLISHED)
+def test_an_arm_without_published_figures_is_refused_by_name(name: str) -> None:
+    with pytest.raises(InputError, match=f"{name}.*not published.*DH rows"):
+        load_arm(name)
 
 
 def test_a_dh_table_of_ones_own(tmp_path: Path) -> None:

@@ -1,0 +1,259 @@
+"""The kinematics that a maker has measured of one arm, by which its controller computes poses.
+
+A controller of Universal Robots holds them as classic rows,
+T_base_flange = Π_i Rz(q_i + θ_i) Tz(d_i) Tx(a_i) Rx(α_i); its `calibration.conf` has what is to be
+added to the nominal rows, and `ur_calibration` of the ROS driver writes the transforms between the
+joints, x, y, z, roll, pitch, yaw each. Axes 2 to 4 are nearly parallel, so that their d are up to
+some kilometres and cancel. A joint's frame may be moved along its axis and turned about it without
+any change of the arm:
+
+    L_k → Z_k⁻¹ L_k Z_{k+1},   Z_k = Tz(s_k) Rz(φ_k), which Rz(q_k) commutes with,
+
+and s_k, φ_k are chosen so that each frame is as near as can be to that of the nominal arm. So all
+that belongs to frames (masses, compliances, shapes) keeps its meaning.
+
+Sources: Universal Robots, "Remote Control via TCP/IP", kinematics info; `ur_calibration` of the
+Universal Robots ROS 2 driver; `ur_description`, urdf/inc and config/*/default_kinematics.yaml.
+"""
+
+import configparser
+import tomllib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+
+N = 6
+KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
+SAME = 1e-6
+"""m; flanges that are nearer are of the same kinematics: files keep 12 digits and more."""
+LINEARISED = 2
+"""Calibration status of an arm that the factory has measured."""
+FAR = 0.05
+"""m; a factory's figures move the flange by some millimetres, those of another arm by more."""
+_KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
+_DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
+_BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_PLACE = ("x", "y", "z", "roll", "pitch", "yaw")
+_EXACT = 1e-9
+_LARGEST = 1e5  # m or rad
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FactoryKinematics:
+    """The kinematics of one arm.
+
+    Attributes:
+        links: (7, 4, 4) constant transforms L_k, see `Arm`; their frames may be far away.
+        rows: (4, 6) θ, a, d, α of classic rows, rad and m; None where transforms are given.
+        status: of the calibration, 2 where the factory has measured the arm.
+        checksum: of the joints, as the controller tells it; empty where it is not known.
+        source: where they come from.
+    """
+
+    links: Floats
+    rows: Floats | None
+    status: int
+    checksum: tuple[int, ...]
+    source: str
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the numbers as a file and a campaign keep them; there have to be rows."""
+        assert self.rows is not None  # noqa: S101 - for the type checker
+        out: dict[str, object] = dict(zip(_KEYS, self.rows.tolist(), strict=True))
+        return {**out, "calibration_status": self.status, "joint_checksum": list(self.checksum)}
+
+    def to_toml(self) -> str:
+        """Return a file that `[robot] calibration` reads; there have to be rows."""
+        head = (
+            f"# Kinematics of one arm: {self.source}.\n"
+            "# T_base_flange = product over i of Rz(q_i + theta_i) Tz(d_i) Tx(a_i) Rx(alpha_i).\n"
+        )
+        return head + tomli_w.dumps(self.to_dict())
+
+
+def of_rows(
+    rows: Floats, source: str, status: int = LINEARISED, checksum: tuple[int, ...] = ()
+) -> FactoryKinematics:
+    """Return the kinematics of classic rows (4, 6): θ, a, d, α.
+
+    Raises:
+        InputError: numbers that no arm has.
+    """
+    if rows.shape != (4, N) or not (np.abs(rows) < _LARGEST).all():
+        raise InputError(f"{source}: not four times {N} lengths in m and angles in rad")
+    theta, a, d, alpha = rows
+    links = np.tile(np.eye(4), (N + 1, 1, 1))
+    for k in range(N):
+        links[k] = links[k] @ _screw(theta[k], 0.0)
+        across = _place((a[k], 0.0, 0.0, alpha[k], 0.0, 0.0))
+        links[k + 1] = _screw(0.0, d[k]) @ across
+    return FactoryKinematics(links, rows, status, checksum, source)
+
+
+def of_dict(told: Any, source: str) -> FactoryKinematics:
+    """Return the kinematics that `FactoryKinematics.to_dict` has written.
+
+    Raises:
+        InputError: it is something else.
+    """
+    try:
+        rows = np.array([told[key] for key in _KEYS], dtype=float)
+        checksum = tuple(map(int, told["joint_checksum"]))
+        return of_rows(rows, source, int(told["calibration_status"]), checksum)
+    except (ValueError, KeyError, TypeError) as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"{source}: not the kinematics of an arm ({words})") from None
+
+
+def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
+    """Read a file of one arm's kinematics.
+
+    Args:
+        path: the file; its ending says of which kind it is.
+        nominal: the arm as its maker designed it, to which a calibration.conf adds.
+        text: what the file holds, as a campaign keeps it; then none is read.
+
+    Raises:
+        InputError: unreadable, of no known kind, or of another arm.
+    """
+    kind = path.suffix.lower()
+    reader = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}.get(kind)
+    if reader is None:
+        raise InputError(f"{path}: not the kinematics of an arm; valid: {KINDS}")
+    try:
+        text = limits.read_text(path, limits.PROGRAM) if text is None else text
+    except (OSError, UnicodeDecodeError) as error:
+        words = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: {words}; expected {KINDS}") from None
+    try:
+        found = reader(text, nominal, str(path))
+    except (ValueError, KeyError, TypeError, configparser.Error) as error:
+        words = " ".join(str(error).split())
+        raise InputError(
+            f"{path}: not the kinematics of an arm ({words}); valid: {KINDS}"
+        ) from None
+    check_of(found, nominal)
+    return found
+
+
+def check_of(factory: FactoryKinematics, nominal: Arm) -> None:
+    """Refuse the kinematics of another arm.
+
+    Raises:
+        InputError: says how far it is off.
+    """
+    off = flange_difference(with_factory(nominal, factory), nominal)[1]
+    if not off < FAR:
+        raise InputError(
+            f"{factory.source}: of another arm than {nominal.name}: its flange lies up to "
+            f"{1e3 * off:.0f} mm from where that one's does"
+        )
+
+
+def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
+    """Return an arm with measured kinematics, its frames as near to the nominal ones as can be.
+
+    Raises:
+        InputError: the arm has another number of joints, or coupled ones.
+    """
+    if nominal.n != N or nominal.coupling is not None or nominal.drive is not None:
+        raise InputError(
+            f"{factory.source}: kinematics of an arm of {N} joints that turn each by itself; "
+            f"{nominal.name} is another one"
+        )
+    ours, theirs = nominal.links[0], factory.links[0]
+    links = factory.links.copy()
+    for k in range(N):
+        # both frames at zero angles: the nominal one's origin and x axis, in the measured frame
+        near = se3.inverse(theirs) @ ours
+        move = _screw(float(np.arctan2(near[1, 0], near[0, 0])), float(near[2, 3]))
+        links[k] = links[k] @ move
+        links[k + 1] = se3.inverse(move) @ links[k + 1]
+        theirs = theirs @ move @ links[k + 1]
+        ours = ours @ nominal.links[k + 1]
+    return replace(nominal, links=links, source=f"{nominal.source}; kinematics: {factory.source}")
+
+
+def flange_difference(one: Arm, other: Arm, states: int = 400) -> tuple[float, float]:
+    """Return how far apart the flanges of two arms are, rms and largest, m, at random states."""
+    q = np.random.default_rng(20251126).uniform(-np.pi, np.pi, (states, one.n))
+    apart = evaluate(one, q).position[-1] - evaluate(other, q).position[-1]
+    off = np.linalg.norm(apart, axis=1)
+    return float(np.sqrt(np.mean(off**2))), float(off.max())
+
+
+def nominal_rows(arm: Arm) -> Floats:
+    """(4, 6) θ, a, d, α of an arm of classic rows without offsets.
+
+    Raises:
+        ValueError: it is not such an arm.
+    """
+    rows = np.zeros((4, arm.n))
+    for k, link in enumerate(arm.links[1:]):
+        rows[1:, k] = link[0, 3], link[2, 3], np.arctan2(link[2, 1], link[1, 1])
+    if arm.n != N or np.abs(of_rows(rows, arm.name).links - arm.links).max() > _EXACT:
+        raise ValueError(f"the nominal rows of {arm.name} are not known")
+    return rows
+
+
+def _of_conf(text: str, nominal: Arm, source: str) -> FactoryKinematics:
+    parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), strict=False)
+    parser.read_string(text)
+    mounting = parser["mounting"]
+    deltas = np.array([[float(v) for v in _values(mounting[key])] for key in _DELTAS])
+    status = int(mounting.get("calibration_status", str(LINEARISED)), 0)
+    checksum = tuple(int(v, 0) for v in _values(mounting.get("joint_checksum", "")))
+    return of_rows(nominal_rows(nominal) + deltas, source, status, checksum)
+
+
+def _values(text: str) -> list[str]:
+    return text.strip().strip("[]").replace(",", " ").split()
+
+
+def _of_toml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
+    return of_dict(tomllib.loads(text), source)
+
+
+def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
+    """Of the one layout that is written: a mapping of bodies, each with its six numbers."""
+    places: dict[str, dict[str, float]] = {}
+    body = ""
+    for line in text.splitlines():
+        key, colon, value = line.partition("#")[0].strip().partition(":")
+        if not colon:
+            continue
+        if not value.strip():
+            body = key
+        elif key in _PLACE:
+            places.setdefault(body, {})[key] = float(value)
+    links = np.tile(np.eye(4), (N + 1, 1, 1))
+    for k, name in enumerate(_BODIES):
+        place = tuple(places[name][key] for key in _PLACE)
+        if not np.abs(place).max() < _LARGEST:
+            raise ValueError(f"{name} is nowhere")
+        links[k] = _place(place)
+    return FactoryKinematics(links, None, LINEARISED, (), source)
+
+
+def _screw(angle: float, shift: float) -> Floats:
+    """Rz(angle) Tz(shift)."""
+    return _place((0.0, 0.0, shift, 0.0, 0.0, angle))
+
+
+def _place(place: tuple[float, ...]) -> Floats:
+    """T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll)."""
+    roll, pitch, yaw = np.eye(3) * np.array(place[3:])
+    out = np.eye(4)
+    out[:3, :3] = se3.rotation(yaw) @ se3.rotation(pitch) @ se3.rotation(roll)
+    out[:3, 3] = place[:3]
+    return out

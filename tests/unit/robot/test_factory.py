@@ -1,0 +1,153 @@
+"""The kinematics that a factory measured: read from its files, and put into an arm."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilcal.cell import cell_from_config
+from hilcal.config import CellConfig
+from hilcal.errors import InputError
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.robot.factory import (
+    flange_difference,
+    nominal_rows,
+    of_dict,
+    of_rows,
+    read_factory,
+    with_factory,
+)
+from hilcal.types import Floats
+from tests.support.factory_cases import UR5E_YAML, factory_of, measured_arm
+
+CONF = """\
+[mounting]
+# of one arm
+delta_theta = {}
+delta_a = {}
+delta_d = {}
+delta_alpha = {}
+joint_checksum = [0xb630883c, 0xb61f6e2e, 0xb5484b61, 0xb612c3a2, 0xb62bd7bc, 0xb61c0e94]
+calibration_status = 2   # 0 == notInitialized, 1 == notLinearised, 2 == Linearised
+"""
+
+
+def by_rows(rows: Floats, q: Floats) -> Floats:
+    """Flange positions (N, 3) by the closed form of a classic row, one matrix after the other."""
+    out = []
+    for angles in q:
+        pose = np.eye(4)
+        for (theta, a, d, alpha), angle in zip(rows.T, angles, strict=True):
+            c, s, ca, sa = (f(x) for x in (angle + theta, alpha) for f in (math.cos, math.sin))
+            row = [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d]]
+            pose = pose @ np.array([*row, [0, 0, 0, 1]])
+        out.append(pose[:3, 3])
+    return np.array(out)
+
+
+def states(n: int = 50) -> Floats:
+    return np.random.default_rng(4).uniform(-np.pi, np.pi, (n, 6))
+
+
+@pytest.mark.parametrize("name", ["ur5e", "ur15", "ur20"])
+def test_rows_whose_distances_cancel_are_held_exactly_near_the_nominal_frames(name: str) -> None:
+    nominal, factory = load_arm(name), factory_of(name)
+    assert np.abs(factory.rows[2]).max() > 30.0  # m: nearly parallel axes
+    arm = with_factory(nominal, factory)
+    assert np.abs(arm.links - nominal.links).max() < 0.01
+    q = states()
+    # rounding of some km: 1e-16 * 2e3 m, a few times
+    np.testing.assert_allclose(
+        evaluate(arm, q).position[-1], by_rows(factory.rows, q), rtol=0, atol=1e-11
+    )
+    assert flange_difference(arm, measured_arm(name))[1] < 1e-11
+    assert flange_difference(arm, nominal)[1] > 1e-3
+    np.testing.assert_array_equal(arm.coms, nominal.coms)
+
+
+def test_a_calibration_conf_adds_to_the_nominal_rows(tmp_path: Path) -> None:
+    nominal, factory = load_arm("ur10e"), factory_of("ur10e")
+    deltas = factory.rows - nominal_rows(nominal)
+    file = tmp_path / "calibration.conf"
+    file.write_text(CONF.format(*(str(list(map(float, row))) for row in deltas)))
+    found = read_factory(file, nominal)
+    np.testing.assert_allclose(found.rows, factory.rows, rtol=1e-15, atol=1e-15)
+    assert found.status == 2
+    assert found.checksum[0] == 0xB630883C
+
+
+def test_the_file_of_ur_calibration_is_the_published_arm(tmp_path: Path) -> None:
+    """Its transforms, one after the other, are where `ur_description` has tool0."""
+    file = tmp_path / "my_robot_calibration.yaml"
+    file.write_text(UR5E_YAML)
+    nominal = load_arm("ur5e")
+    found = read_factory(file, nominal)
+    arm = with_factory(nominal, found)
+    rms, most = flange_difference(arm, nominal)
+    assert 5e-4 < rms < most < 3e-3  # some millimetres, as factories find
+    q = states()
+    pose = np.broadcast_to(found.links[0], (len(q), 4, 4))
+    for k in range(6):
+        turn = np.tile(np.eye(4), (len(q), 1, 1))
+        turn[:, 0, 0] = turn[:, 1, 1] = np.cos(q[:, k])
+        turn[:, 1, 0], turn[:, 0, 1] = np.sin(q[:, k]), -np.sin(q[:, k])
+        pose = pose @ turn @ found.links[k + 1]
+    np.testing.assert_allclose(evaluate(arm, q).position[-1], pose[:, :3, 3], rtol=0, atol=1e-12)
+
+
+def test_a_file_of_our_own_comes_back(tmp_path: Path) -> None:
+    made, file = factory_of("ur15"), tmp_path / "arm.toml"
+    file.write_text(made.to_toml())
+    found = read_factory(file, load_arm("ur15"))
+    np.testing.assert_array_equal(found.rows, made.rows)
+    assert found.checksum == made.checksum
+    np.testing.assert_array_equal(of_dict(found.to_dict(), "kept").rows, made.rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("x.txt", "", "valid: a calibration.conf"),
+        ("x.conf", "delta_a = 1", "not the kinematics"),
+        ("x.conf", "[mounting]\ndelta_theta = [1, 2]\n", "not the kinematics"),
+        ("x.conf", CONF.format(*["[0,0,0,0,0,nan]"] * 4), "not four times"),
+        ("x.yaml", "kinematics:\n  shoulder:\n    x: 0\n", "not the kinematics"),
+        ("x.yaml", UR5E_YAML.replace("0.1627122445743823", "far"), "not the kinematics"),
+        ("x.toml", "a_m = 1", "not the kinematics"),
+        ("x.toml", "= =", "not the kinematics"),
+    ],
+)
+def test_other_files_are_refused_in_one_line(
+    tmp_path: Path, name: str, text: str, words: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=words) as refused:
+        read_factory(tmp_path / name, load_arm("ur5e"))
+    assert "\n" not in str(refused.value)
+
+
+def test_the_kinematics_of_another_arm_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text(UR5E_YAML)
+    with pytest.raises(InputError, match="another arm than ur10e"):
+        read_factory(tmp_path / "x.yaml", load_arm("ur10e"))
+    with pytest.raises(InputError, match="four times 6"):
+        of_rows(np.zeros((4, 7)), "rows")
+
+
+def test_a_cell_counts_from_what_the_configuration_says(tmp_path: Path) -> None:
+    (tmp_path / "x.yaml").write_text(UR5E_YAML)
+    robot = {"model": "ur5e", "calibration": "x.yaml"}
+    nominal = load_arm("ur5e")
+    told = cell_from_config(CellConfig.model_validate({"robot": robot}), tmp_path)
+    np.testing.assert_array_equal(told.arm.links, nominal.links)
+    assert told.factory is not None
+    robot["kinematics"] = "factory"
+    used = cell_from_config(CellConfig.model_validate({"robot": robot}), tmp_path)
+    assert flange_difference(used.arm, with_factory(nominal, told.factory))[1] == 0.0
+    kept = cell_from_config(CellConfig.model_validate({"robot": robot}), None, None, UR5E_YAML)
+    np.testing.assert_array_equal(kept.arm.links, used.arm.links)
+    del robot["calibration"]
+    with pytest.raises(ValueError, match="needs calibration"):
+        CellConfig.model_validate({"robot": robot})

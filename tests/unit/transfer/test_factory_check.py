@@ -1,0 +1,59 @@
+"""Whether an arm is still what its factory measured, on readings of a simulated world."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from drivers.simulated.rehearsal import case_of_plan, read_plan
+from hilcal.cell import cell_from_config
+from hilcal.cli.planning import make_plan
+from hilcal.config import CellConfig
+from hilcal.effects.catalogue import installed
+from hilcal.errors import CannotAnswerError
+from hilcal.readings.readings import Readings
+from hilcal.robot.catalogue import load_arm
+from hilcal.transfer.factory import check_factory
+from tests.support.factory_cases import factory_of, write
+
+CELL = {
+    "robot": {"model": "ur15", "kinematics": "factory", "calibration": "arm.toml"},
+    "tool": {"target_m": [0.06, 0.02, 0.12], "mass_kg": 0.8, "com_m": [0.01, 0.0, 0.06]},
+    "repeatability": {"joint_std_rad": 1e-5},
+    "planning": {"readings": "absolute", "candidates": 150},
+    "simulation": {"strength_sigma": 20.0},
+}
+
+
+def readings(folder: Path, hide: str, seed: int) -> tuple[CellConfig, Readings]:
+    """Readings of 20 poses of an arm that the factory had measured, with a later change."""
+    write(folder / "arm.toml", "ur15")
+    config = CellConfig.model_validate(CELL)
+    plan = make_plan(cell_from_config(config, folder), config, 20, 1, installed())
+    secret = case_of_plan(config, plan, hide, seed, None, folder)
+    return config, read_plan(secret, plan, [seed]).readings
+
+
+@pytest.mark.parametrize("hide", ["nothing", "encoder_offset", "link_geometry"])
+def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path, hide) -> None:
+    config, measured = readings(tmp_path, hide, 3)
+    cell, nominal = cell_from_config(config, tmp_path), load_arm("ur15")
+    found = check_factory(cell, nominal, cell.factory, measured)
+    assert found.changed == (hide != "nothing")
+    assert found.readings == len(measured)
+    assert found.nominal_m > 2.0 * found.factory_m  # the arm is the factory's, not the maker's
+    if hide == "nothing":
+        assert found.moved_m < 3.0 * found.moved_std_m < 1e-4
+        other = check_factory(cell, nominal, factory_of("ur15", seed=8), measured)
+        assert other.changed  # somebody else's file
+        assert other.factory_m > found.factory_m
+    else:
+        assert found.moved_m > 3.0 * found.moved_std_m
+
+
+def test_too_few_readings_cannot_answer(tmp_path: Path) -> None:
+    config, measured = readings(tmp_path, "nothing", 3)
+    cell = cell_from_config(config, tmp_path)
+    few = measured[:7]
+    with pytest.raises(CannotAnswerError, match="7 readings; 8"):
+        check_factory(replace(cell), load_arm("ur15"), cell.factory, few)
