@@ -127,6 +127,10 @@ START_TIMEOUT = 20.0
 """Real time in which every simulated device has to be ready, s."""
 
 UR_PORTS = (29999, 30003, 30004)
+EMSCON_PORT = 7000
+"""Of the simulated tracker: the real one, 700, is for the administrator alone."""
+PORTS = (*UR_PORTS, EMSCON_PORT)
+TRACKERS = ("geocom", "emscon")
 FORCE_SENSORS = ("ft300", "bota", "hex")
 _STALE = (
     "world.json",
@@ -205,7 +209,7 @@ class SimulatedCell:
             try:
                 cell._begin(devices.values())
             except BaseException as error:
-                taken = devices["arm"].ended and "in use" in str(error)
+                taken = "in use" in str(error) and any(d.ended for d in devices.values())
                 cell.close()
                 if attempt == _HOSTS or not taken:
                     raise
@@ -300,7 +304,7 @@ class SimulatedCell:
 
 
 def free_host() -> str:
-    """Return a loopback address whose robot ports are free now.
+    """Return a loopback address whose ports of devices are free now.
 
     Raises:
         DeviceError: none was found.
@@ -310,7 +314,7 @@ def free_host() -> str:
         host = f"{host}.{secrets.randbelow(254) + 1}"
         try:
             with contextlib.ExitStack() as stack:
-                for port in UR_PORTS:
+                for port in PORTS:
                     line = stack.enter_context(socket.socket())
                     line.bind((host, port))
         except OSError:
@@ -318,7 +322,7 @@ def free_host() -> str:
         return host
     raise DeviceError(
         "simulated arm: no free loopback address 127.x.y.z with the ports "
-        f"{', '.join(map(str, UR_PORTS))}; is the loopback network up?"
+        f"{', '.join(map(str, PORTS))}; is the loopback network up?"
     )
 
 
@@ -334,6 +338,11 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
             "simulated cell: a station measures from where it stands, but the readings' origin "
             'lies within the arm\'s reach; valid: [tracker] frame = "tracker", with a base that '
             "is unknown or farther away than the arm reaches"
+        )
+    tracker = config.tracker.driver or TRACKERS[0]
+    if tracker not in TRACKERS:
+        raise InputError(
+            f"simulated cell: no simulated tracker {tracker!r}; valid: {', '.join(TRACKERS)}"
         )
     sensor = config.force_sensor
     if sensor is not None and sensor.driver not in FORCE_SENSORS:
@@ -357,6 +366,10 @@ def _devices(
 ) -> dict[str, DeviceProcess]:
     """Return what has to be started."""
     noise = world.noise
+    networked: tuple[str, ...] = ()
+    if config.tracker.driver == "emscon":
+        turn = ("--orientation-std", repr(float(noise.orientation_std)))
+        networked = ("--host", host, "--port", str(EMSCON_PORT), *turn)
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
         return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
@@ -371,7 +384,8 @@ def _devices(
         ),
         "tracker": device(
             "tracker",
-            "geocom_server",
+            f"{config.tracker.driver or TRACKERS[0]}_server",
+            *networked,
             *("--range-std", *map(repr, map(float, noise.range_std))),
             *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
             *("--seed", str(seed + 1)),
@@ -387,7 +401,11 @@ def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
     """Return the configuration that leads to the simulated devices; what it gives stays."""
     robot = {"host": host, "driver": config.robot.driver or "ur"}
     directory = directory.absolute()
-    tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
+    tracker = {"driver": config.tracker.driver or TRACKERS[0]}
+    if tracker["driver"] == "emscon":
+        tracker["host"] = f"{host}:{EMSCON_PORT}"
+    else:
+        tracker["port"] = str(directory / "tracker")
     options = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {
         "robot": config.robot.model_copy(update=robot),

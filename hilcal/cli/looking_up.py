@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from drivers.emscon import Options as EmsconOptions
 from drivers.geocom import Options as GeoComOptions
 from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import (
@@ -186,6 +187,7 @@ def template_of(name: str) -> str:
 DRIVERS_OWN: dict[str, type[Section]] = {
     "robot.options": UrOptions,
     "tracker.options": GeoComOptions,
+    "tracker.options (emscon)": EmsconOptions,
 }
 """Keys of the drivers that come with the program, by section."""
 
