@@ -295,7 +295,7 @@ def operations(t: Tracker) -> admin.Operations:
         "uninitialize": uninitialize,
         "reflector": reflector,
         "fail": lambda command, status, count=1: t.failing.update({command: (status, count)}),
-        "change": t.tell,
+        "change": lambda number: t.tell(int(number)),
         "transform": transform,
         "drop": drop,
         "mute": lambda on: setattr(t, "mute", bool(on)),

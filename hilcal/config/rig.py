@@ -10,9 +10,7 @@ Whole = Annotated[int, Strict(), Field(ge=1)]
 OPTIONS = "a table of the driver's own keys"
 VECTOR_M = "three finite numbers in m, e.g. [0.0, 0.0, 0.1]"
 ROTVEC = "a rotation vector: three finite numbers in rad, e.g. [0.0, 0.0, 1.57]"
-HOST = (
-    'the address in the network, e.g. "192.168.0.1", with another port than usual "192.168.0.1:7000"'
-)
+HOST = 'the address in the network, e.g. "192.168.0.1", with another port than usual "192.168.0.1:7000"'
 """Of an instrument that is connected by Ethernet."""
 PORT = 'the serial port, e.g. "/dev/serial/by-id/usb-FTDI_..."'
 
@@ -41,7 +39,9 @@ class ForceSensor(Section):
     """[force_sensor]: the wrench sensor between flange and tool."""
 
     driver: str = Field(
-        min_length=1, description='the name of a driver, e.g. "ft300", "bota" or "netft"', examples=["ft300"]
+        min_length=1,
+        description='the name of a driver, e.g. "ft300", "bota" or "netft"',
+        examples=["ft300"],
     )
     port: str | None = Field(
         None, min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-Silicon_Labs_..."]
