@@ -356,7 +356,7 @@ class EmsconTracker:
         except struct.error:
             self._line.close()
             raise DeviceError(
-                f"{DEVICE}: measuring: a result of {len(body)} bytes comes; is it an emScon tracker?"
+                f"{DEVICE}: measuring: a result of {len(body)} bytes comes; is this emScon?"
             ) from None
         if (found.quaternion is None) == (wanted == es.STATIONARY_6D):
             raise DeviceError(f"{DEVICE}: measuring: the tracker measures in another mode than set")

@@ -129,9 +129,10 @@ START_TIMEOUT = 20.0
 UR_PORTS = (29999, 30003, 30004)
 EMSCON_PORT = 7000
 """Of the simulated tracker: the real one, 700, is for the administrator alone."""
-PORTS = (*UR_PORTS, EMSCON_PORT)
+RDT_PORT, WEB_PORT = 49152, 8080
+PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
 TRACKERS = ("geocom", "emscon")
-FORCE_SENSORS = ("ft300", "bota", "hex")
+FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
 _STALE = (
     "world.json",
     "world.bin",
@@ -392,8 +393,11 @@ def _devices(
         ),
     }
     if config.force_sensor is not None:
-        kind = ("--kind", config.force_sensor.driver)
-        out["force"] = device("force", "force_server", *kind, "--seed", str(seed + 2))
+        server, *kind = ("force_server", "--kind", config.force_sensor.driver)
+        if config.force_sensor.driver == "netft":
+            server, *kind = "netft_server", "--host", host, "--port", str(RDT_PORT)
+            kind += ("--web-port", str(WEB_PORT))
+        out["force"] = device("force", server, *kind, "--seed", str(seed + 2))
     return out
 
 
@@ -413,6 +417,9 @@ def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
         "operator": config.operator.model_copy(update={"driver": "simulated", "options": options}),
     }
     if config.force_sensor is not None:
-        port = {"port": str(directory / "force")}
-        changes["force_sensor"] = config.force_sensor.model_copy(update=port)
+        where: dict[str, Any] = {"port": str(directory / "force")}
+        if config.force_sensor.driver == "netft":
+            web = {**config.force_sensor.options, "web_port": WEB_PORT}
+            where = {"host": f"{host}:{RDT_PORT}", "options": web}
+        changes["force_sensor"] = config.force_sensor.model_copy(update=where)
     return config.model_copy(update=changes)

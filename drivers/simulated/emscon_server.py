@@ -6,12 +6,13 @@
 One client at a time, as an AT40x. Admin operations: `beam {on}` blocks it, `hide {targets}`,
 `lock_lost`, `freeze {on}`, `stray {on}`, `uninitialize` loses the zeros, `reflector {number}` sets
 another one at the controller, `fail {command, status, count}`, `change {number}` tells a change of
-state, `transform {on}` sets an object's coordinate system, `drop` closes the connection, `mute {on}`,
-`rubbish {data}` sends what is no packet, `closing`, `log`, `state`.
+state, `transform {on}` sets an object's coordinate system, `drop` closes the connection,
+`mute {on}`, `rubbish {data}` sends what is no packet, `log`, `state`.
 
 Source: as `drivers.emscon_packets`. CESAPI, a client of others, is tested against it.
 """
 
+import contextlib
 import select
 import socket
 import struct
@@ -88,10 +89,8 @@ class Tracker:
     def send(self, kind: int, body: bytes) -> None:
         """Send a packet to who is connected."""
         if self.client is not None and not self.mute:
-            try:
+            with contextlib.suppress(OSError):  # gone; seen when it is read from
                 self.client.sendall(es.HEADER.pack(es.HEADER.size + len(body), kind) + body)
-            except OSError:
-                pass  # gone; seen when it is read from
 
     def tell(self, change: int) -> None:
         """Tell a change of state, where the client wants to hear of it."""
@@ -146,9 +145,11 @@ class Tracker:
         seen = self.station.seen
         if seen is None or self.station.distance == 0.0:
             return None
-        position = seen.distance * seen.direction()
+        position: Floats = seen.distance * seen.direction()
         covariance = self.noise.covariance(position[None], 3)[0]
-        turn, angles, turned = None, np.zeros(3), np.zeros((3, 3))
+        turn: Floats | None = None
+        turned: Floats = np.zeros((3, 3))
+        angles = np.zeros(3)
         if struct.unpack("<I", self.settings[es.GET_MODE])[0] == es.STATIONARY_6D:
             rotation = settled_truth(self.station.board)["target_rotation"]
             moved = Rotation.from_rotvec(self.noise.orientation_std * self.rng.normal(size=3))
@@ -163,9 +164,11 @@ class Tracker:
         length, angle, *_ = struct.unpack("<5I", self.settings[es.GET_UNITS])
         a, b = (1.0, 1e3, 1e6)[length], (1.0, np.rad2deg(1.0), 200 / np.pi)[angle]
         settings = struct.unpack("<I8i", self.settings[es.GET_SETTINGS])
-        position = m.position + (np.array([1.0, 2.0, 3.0]) if settings[1] else 0.0)
+        moved = np.array([1.0, 2.0, 3.0]) if settings[1] else np.zeros(3)
         c, t = a * a * m.covariance, b * b * m.angle_covariance
-        return es.Measurement(a * position, c, m.quaternion, b * m.angles, t, m.environment)
+        return es.Measurement(
+            a * (m.position + moved), c, m.quaternion, b * m.angles, t, m.environment
+        )
 
 
 def _rates(angles: Floats) -> Floats:

@@ -10,7 +10,7 @@ Whole = Annotated[int, Strict(), Field(ge=1)]
 OPTIONS = "a table of the driver's own keys"
 VECTOR_M = "three finite numbers in m, e.g. [0.0, 0.0, 0.1]"
 ROTVEC = "a rotation vector: three finite numbers in rad, e.g. [0.0, 0.0, 1.57]"
-HOST = 'the address in the network, e.g. "192.168.0.1", with another port than usual "192.168.0.1:7000"'
+HOST = 'the address in the network, e.g. "192.168.0.1"; another port as "192.168.0.1:7000"'
 """Of an instrument that is connected by Ethernet."""
 PORT = 'the serial port, e.g. "/dev/serial/by-id/usb-FTDI_..."'
 

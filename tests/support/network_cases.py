@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.cell_processes import EMSCON_PORT, free_host
+from drivers.simulated.blackboard import Blackboard
+from drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, free_host
 from hilcal.config import CellConfig
 from tests.support.sim_serial_cases import TRACKER_NOISE, Instrument, start
 
@@ -42,3 +43,27 @@ def emscon(scale: float = 20.0, *options: str) -> Iterator[tuple[Instrument, str
             yield tracker, f"{host}:{EMSCON_PORT}"
         finally:
             tracker.close()
+
+
+WRENCH = np.array([1.0, -2.0, 30.0, 0.1, 0.2, -0.3])
+
+
+@contextmanager
+def netft(*options: str) -> Iterator[tuple[Instrument, str]]:
+    """Run a Net F/T that feels `WRENCH`, warm; yields its address without a port, too."""
+    host = free_host()
+    with tempfile.TemporaryDirectory() as directory:
+        world = Blackboard.create(Path(directory) / "world.bin", 1.0)
+        world.write("truth", time=world.time, sensor_wrench=WRENCH)
+        place = ("--host", host, "--seed", "1", "--on", "1e6")
+        sensor = start("netft_server", "force", Path(directory), 1.0, *place, *options)
+        try:
+            yield sensor, host
+        finally:
+            sensor.close()
+
+
+def force_cell(host: str, **options: Any) -> CellConfig:
+    """A cell whose force sensor is a Net F/T."""
+    section = {"driver": "netft", "host": host, "options": {"web_port": WEB_PORT, **options}}
+    return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})
