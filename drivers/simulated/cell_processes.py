@@ -131,7 +131,8 @@ EMSCON_PORT = 7000
 """Of the simulated tracker: the real one, 700, is for the administrator alone."""
 RDT_PORT, WEB_PORT = 49152, 8080
 PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
-TRACKERS = ("geocom", "emscon")
+NATNET_PORT = 1510
+TRACKERS = ("geocom", "emscon", "natnet")
 FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
 _STALE = (
     "world.json",
@@ -367,10 +368,19 @@ def _devices(
 ) -> dict[str, DeviceProcess]:
     """Return what has to be started."""
     noise = world.noise
-    networked: tuple[str, ...] = ()
-    if config.tracker.driver == "emscon":
-        turn = ("--orientation-std", repr(float(noise.orientation_std)))
-        networked = ("--host", host, "--port", str(EMSCON_PORT), *turn)
+    tracker = config.tracker.driver or TRACKERS[0]
+    stated = (
+        *("--range-std", *map(repr, map(float, noise.range_std))),
+        *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
+    )
+    of_tracker = {
+        "geocom": stated,
+        "emscon": (
+            *("--host", host, "--port", str(EMSCON_PORT), *stated),
+            *("--orientation-std", repr(float(noise.orientation_std))),
+        ),
+        "natnet": ("--host", host, "--port", str(NATNET_PORT)),  # its errors are its own
+    }[tracker]
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
         return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
@@ -385,10 +395,8 @@ def _devices(
         ),
         "tracker": device(
             "tracker",
-            f"{config.tracker.driver or TRACKERS[0]}_server",
-            *networked,
-            *("--range-std", *map(repr, map(float, noise.range_std))),
-            *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
+            f"{tracker}_server",
+            *of_tracker,
             *("--seed", str(seed + 1)),
         ),
     }
@@ -406,8 +414,9 @@ def _filled_in(config: CellConfig, directory: Path, host: str) -> CellConfig:
     robot = {"host": host, "driver": config.robot.driver or "ur"}
     directory = directory.absolute()
     tracker = {"driver": config.tracker.driver or TRACKERS[0]}
-    if tracker["driver"] == "emscon":
-        tracker["host"] = f"{host}:{EMSCON_PORT}"
+    ports = {"emscon": EMSCON_PORT, "natnet": NATNET_PORT}
+    if tracker["driver"] in ports:
+        tracker["host"] = f"{host}:{ports[tracker['driver']]}"
     else:
         tracker["port"] = str(directory / "tracker")
     options = {**config.operator.options, "socket": str(directory / "world.sock")}

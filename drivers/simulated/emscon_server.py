@@ -156,7 +156,7 @@ class Tracker:
             seen_turn = moved * Rotation.from_matrix(rotation)
             turn, angles = np.roll(seen_turn.as_quat(), 1), seen_turn.as_euler("xyz")
             J = _rates(angles)
-            turned = self.noise.orientation_std**2 * np.linalg.inv(J.T @ J)
+            turned = np.asarray(self.noise.orientation_std**2 * np.linalg.inv(J.T @ J))
         return es.Measurement(position, covariance, turn, angles, turned, self.environment())
 
     def in_units(self, m: es.Measurement) -> es.Measurement:

@@ -11,6 +11,7 @@ import typer
 
 from drivers.emscon import Options as EmsconOptions
 from drivers.geocom import Options as GeoComOptions
+from drivers.natnet import Options as NatNetOptions
 from drivers.netft import Options as NetFtOptions
 from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import (
@@ -189,6 +190,7 @@ DRIVERS_OWN: dict[str, type[Section]] = {
     "robot.options": UrOptions,
     "tracker.options": GeoComOptions,
     "tracker.options (emscon)": EmsconOptions,
+    "tracker.options (natnet)": NatNetOptions,
     "force_sensor.options": NetFtOptions,
 }
 """Keys of the drivers that come with the program, by section."""
