@@ -46,7 +46,7 @@ from drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
 
 NAME, BODY = "SIM Motive", 7
-RATE_HZ, FASTEST_HZ = 120.0, 600.0
+RATE_HZ, FASTEST_HZ = 120.0, 240.0
 """Frames per second of world time, and the most per second of real time."""
 WAVE_M, ARM_M = 0.4, 0.1
 FORGOTTEN_S = 10.0

@@ -67,3 +67,17 @@ def force_cell(host: str, **options: Any) -> CellConfig:
     """A cell whose force sensor is a Net F/T."""
     section = {"driver": "netft", "host": host, "options": {"web_port": WEB_PORT, **options}}
     return CellConfig.model_validate({"robot": {"model": "ur10e"}, "force_sensor": section})
+
+
+@contextmanager
+def natnet(*options: str) -> Iterator[tuple[Instrument, str]]:
+    """Run cameras that see `TARGET`, turned by `TURNED`; yields their address, too."""
+    host = free_host()
+    with tempfile.TemporaryDirectory() as directory:
+        place = ("--host", host, "--seed", "1")
+        cameras = start("natnet_server", "tracker", Path(directory), 2.0, *place, *options)
+        try:
+            cameras.truth(target=np.array(TARGET), target_rotation=TURNED)
+            yield cameras, host
+        finally:
+            cameras.close()
