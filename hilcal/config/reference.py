@@ -29,6 +29,8 @@ _UNITS = (
     ("_share", "1"),
     ("baud", "Bd"),
     ("samples", "readings"),
+    ("frames", "frames"),
+    ("web_port", "TCP"),
     ("candidates", "poses"),
     ("clock", "times real time"),
     ("singularity", "1"),
