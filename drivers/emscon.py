@@ -347,7 +347,14 @@ class EmsconTracker:
     def _measure(self) -> es.Measurement:
         until = self._ready(self._clock.real(self._options.measuring_s))
         self._do("measuring", es.START_MEASUREMENT, until=until)
-        kind, status, body = self._line.result(until=until)
+        return self._sound(*self._line.result(until=until))
+
+    def _sound(self, kind: int, status: int, body: bytes) -> es.Measurement:
+        """Return a result that can be.
+
+        Raises:
+            DeviceError: it failed, or is none that the tracker can give.
+        """
         if status != es.OK or kind == es.ERROR:
             raise es.failure("measuring", status)
         wanted = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
@@ -372,7 +379,7 @@ class EmsconTracker:
     def _turn_covariance(self, found: es.Measurement, turn: Rotation) -> Floats:
         """(3, 3) of a small rotation about the tracker's axes, rad²."""
         stated = found.angle_covariance
-        if not _positive(stated):
+        if not (_positive(stated) and np.isfinite(found.angles).all()):
             return self._config.orientation_std_rad**2 * np.eye(3)
         for order in _ORDERS:
             there = Rotation.from_euler(order, found.angles)

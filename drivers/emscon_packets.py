@@ -166,7 +166,8 @@ def _three(values: Floats) -> tuple[float, float, float]:
 
 def _covariance(std: Floats, mixed: Floats) -> Floats:
     """(3, 3) of standard deviations 1, 2, 3 and covariances 12, 13, 23."""
-    out = np.diag(std**2)
+    with np.errstate(over="ignore"):
+        out = np.diag(std**2)
     for value, (i, k) in zip(mixed, ((0, 1), (0, 2), (1, 2)), strict=True):
         out[i, k] = out[k, i] = value
     return out
