@@ -285,7 +285,7 @@ class EmsconTracker:
         """
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = self._ready(moving)
-        if not self._status(until) & es.INITIALIZED:
+        if self._system(until)[1] != es.INITIALIZED:
             homing = until + max(_LEAST_S, self._clock.real(HOMING_S))
             self._do("finding its zeros", es.INITIALIZE, until=homing)
             self._remarks.append(HOMED)
@@ -320,10 +320,14 @@ class EmsconTracker:
         celsius, mbar, humid = self._line.unpack("<3d", body)
         facts.append(("environment", f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"))
         fields += [("temperature_degC", celsius), ("pressure_mbar", mbar), ("humidity", humid)]
-        state = self._status(until)
-        if not state & es.INITIALIZED:
+        _, state, _, _, *version, weather, _, _ = self._system(until)
+        firmware = ".".join(map(str, version))
+        station = dict(enumerate(es.WEATHER)).get(weather, f"state {weather}")
+        facts += [("emScon", firmware), ("weather station", station)]
+        fields += [("emscon", firmware), ("weather_station", station)]
+        if state != es.INITIALIZED:
             problems.append("it has not found its zeros (it is not initialised); initialise it")
-        elif state & es.REFLECTOR_FOUND or self._options.target == "pose":
+        elif self._options.target == "pose" or self._holds_reflector(until):
             try:
                 sample = self.measure()
                 std = 1e6 * float(np.sqrt(np.trace(sample.covariance[:3, :3])))
@@ -485,9 +489,14 @@ class EmsconTracker:
                 raise es.failure("reading its reflectors", status)
         return found
 
-    def _status(self, until: float) -> int:
+    def _system(self, until: float) -> tuple[int, ...]:
+        """Last status, state of tracker, laser and distance meter, version (3), weather, 2 more."""
+        body = self._do("reading its state", es.GET_SYSTEM_STATUS, until=until)
+        return self._line.unpack("<4I3iI2i", body)
+
+    def _holds_reflector(self, until: float) -> bool:
         body = self._do("reading its state", es.GET_STATUS_INFO, until=until)
-        return int(self._line.unpack("<Ii", body)[1])
+        return bool(self._line.unpack("<Ii", body)[1] & es.REFLECTOR_FOUND)
 
     def _search(self, radius: float, until: float) -> None:
         seconds = max(_LEAST_S, self._clock.real(SEARCHING_S))
@@ -508,7 +517,7 @@ class EmsconTracker:
             DeviceError: it did not work.
         """
         status, body = self._line.ask(command, parameters, until=until)
-        if status != es.OK:
+        if status not in es.GOOD:
             raise es.failure(doing, status)
         return body
 

@@ -44,9 +44,15 @@ CLOSING = {
     997: "its controller closes the connection",
     998: "its server is being shut down",
 }
-REFLECTOR_FOUND, LEVELLED, INITIALIZED = 2048, 32768, 65536
+REFLECTOR_FOUND, LEVELLED = 2048, 32768
+BOOTED, INITIALIZED = 3, 5
+"""States of the tracker in GET_SYSTEM_STATUS."""
+WEATHER = ("none: temperature, pressure, humidity as set", "read, but not used", "used")
+"""States of the weather station there."""
 
 OK, BUSY, NOT_IMPLEMENTED, NOT_INITIALIZED = 0, 1, 2, 39
+GOOD = frozenset({OK, *range(11, 22, 2)})
+"""Done; or a parameter is out of its range, and done."""
 NO_DISTANCE, NO_RESULT = 37, 10009
 
 LOST = {

@@ -129,7 +129,7 @@ class Tracker:
     def status(self) -> int:
         """Return the bits of its state."""
         held = es.REFLECTOR_FOUND if self.station.held() is not None else 0
-        return 15 | 4096 | es.LEVELLED | held | (es.INITIALIZED if self.initialized else 0)
+        return 15 | 4096 | es.LEVELLED | held
 
     def environment(self) -> tuple[float, float, float]:
         """Return temperature °C, pressure mbar, relative humidity %."""
@@ -238,11 +238,18 @@ def _environment(t: Tracker, body: bytes) -> None:
     t.answer(es.GET_ENVIRONMENT, es.OK, struct.pack("<3d", *t.environment()))
 
 
+def _system(t: Tracker, body: bytes) -> None:
+    state = es.INITIALIZED if t.initialized else es.BOOTED
+    packed = struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)
+    t.answer(es.GET_SYSTEM_STATUS, es.OK, packed)
+
+
 def _status(t: Tracker, body: bytes) -> None:
     t.answer(es.GET_STATUS_INFO, es.OK, struct.pack("<Ii", es.OK, t.status()))
 
 
 _DO: dict[int, Callable[[Tracker, bytes], None]] = {
+    es.GET_SYSTEM_STATUS: _system,
     es.INITIALIZE: _initialize,
     es.START_MEASUREMENT: _measure,
     es.FIND_REFLECTOR: _find,

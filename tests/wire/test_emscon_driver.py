@@ -222,7 +222,10 @@ def test_the_client_of_others_measures_the_same(there: There) -> None:
         command = CommandSync(connection)
         assert command.GetUnits().unitsSettings.lenUnitType == packet.ES_LU_Meter
         assert command.GetEnvironmentParams().environmentData.dPressure == 1013.25
-        assert command.GetMeasurementStatusInfo().lMeasurementStatusInfo & packet.ES_MSI_Initialized
+        assert command.GetSystemStatus().trackerProcessorStatus == packet.ES_TPS_Initialized
+        assert (
+            command.GetMeasurementStatusInfo().lMeasurementStatusInfo & packet.ES_MSI_ReflectorFound
+        )
         assert command.GetReflector().iInternalReflectorId == 1
         found = command.StartMeasurement()
         assert packet.packetType(found) == packet.ES_DT_SingleMeasResult2
@@ -274,20 +277,24 @@ def test_the_driver_measures_on_the_simulator_of_others() -> None:
         address, end = f"{simulator.host}:{simulator.port}", time.monotonic() + 10.0
         while True:
             try:
-                device = open_tracker(cell(address, "emscon", reflector="Rocinante"))
+                device = open_tracker(cell(address, "emscon"))
                 break
             except DeviceError:
                 assert time.monotonic() < end
                 time.sleep(0.1)
         try:
+            assert any("initialise it" in problem for problem in device.report().problems)
+            device.find_target()  # it has to be initialised first, and tells that it was
+            assert "initialised again" in device.measure().warning
             report = device.report()
-            assert ("reflector", "Rocinante") in report.facts
+            assert ("emScon", "3.8.900") in report.facts
             assert ("environment", "22.0 °C, 1013.2 mbar, 0 %") in report.facts
             assert report.problems == ()
-            device.find_target()
             sample = device.measure()
         finally:
             device.close()
+        with pytest.raises(InputError, match='no reflector "ball"; valid: Rocinante'):
+            open_tracker(cell(address, "emscon", reflector="ball"))
     assert sample.value == pytest.approx(TARGET, abs=0.0)
     stated = np.diag([1e-10, 4e-10, 9e-10])
     stated[0, 2] = stated[2, 0] = 1e-10
