@@ -54,12 +54,14 @@ SHAKEN = Fault(
     act("tracker", "fail", command=es.START_MEASUREMENT, status=0, count=0),
     ("tracker", "does not stand firmly"),
 )
-TRACKER = (
+STALL = switched("force", "stall", "nothing came")
+AT_REST = (
     switched("tracker", "beam", "not found|no measurement", "searched 2 times"),
     switched("tracker", "mute", "no answer"),
     PRISM,
     DROP,
     SHAKEN,
+    STALL,
 )
 ERROR = Fault(
     "error of the sensor",
@@ -69,14 +71,14 @@ ERROR = Fault(
 )
 
 
-@each(TRACKER)
-def test_a_fault_of_the_tracker(fault: Fault, cell: Site, path: Path) -> None:
+@each(AT_REST)
+def test_a_fault_while_the_arm_rests(fault: Fault, cell: Site, path: Path) -> None:
     meets(fault, cell, path, moving=False)
 
 
-@each((switched("force", "stall", "nothing came"), ERROR))
-def test_a_fault_of_the_force_sensor_in_motion(fault: Fault, cell: Site, path: Path) -> None:
-    meets(fault, cell, path, moving=True)
+@pytest.mark.slow
+def test_an_error_of_the_force_sensor_stops_the_arm(cell: Site, path: Path) -> None:
+    meets(ERROR, cell, path, moving=True)
 
 
 def test_faults_that_are_overcome_cost_nothing(cell: Site, path: Path) -> None:
