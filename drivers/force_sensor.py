@@ -2,11 +2,10 @@
 
 from collections.abc import Callable
 
-import serial
-
-from drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from drivers.force_stream import DEVICE, ForceStream, Port, SensorFormat
 from drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.config import CellConfig
+from hilcal.config.rig import PORT
 from hilcal.config.rig import ForceSensor as Section
 from hilcal.errors import InputError
 from hilcal.measuring.devices import Losses, Report, WrenchSample
@@ -20,11 +19,11 @@ class StreamingSensor:
 
     def __init__(
         self,
-        port: serial.Serial,
+        port: Port,
         stream: ForceStream,
         name: str,
         facts: tuple[tuple[str, str], ...] = (),
-        before_close: Callable[[serial.Serial], None] = lambda port: None,
+        before_close: Callable[[], None] = lambda: None,
     ) -> None:
         """Own an open port and the stream on it.
 
@@ -77,7 +76,7 @@ class StreamingSensor:
         if self._open:
             self._open = False
             self._stream.stop()
-            self._before_close(self._port)
+            self._before_close()
             close_port(self._port)
 
 
@@ -92,10 +91,11 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> Streami
     Raises:
         DeviceError: no such port, in use, nothing or nothing sensible comes.
     """
-    port = open_port(DEVICE, section.port, section.baud or baud)
+    path = serial_port(section)
+    port = open_port(DEVICE, path, section.baud or baud)
     stream: ForceStream | None = None
     try:
-        with line_failures(DEVICE, section.port):
+        with line_failures(DEVICE, path):
             drain(port, quiet=OLD_S, limit=OLD_S)  # adapters keep some of what came before
         stream = ForceStream(port, sensor)
         stream.wait_for_first(FIRST_FRAME_S)
@@ -105,6 +105,17 @@ def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> Streami
         close_port(port)
         raise
     return StreamingSensor(port, stream, sensor.name)
+
+
+def serial_port(section: Section) -> str:
+    """Return the serial port of a sensor that needs one.
+
+    Raises:
+        InputError: there is none.
+    """
+    if section.port is None:
+        raise InputError(f'[force_sensor] driver = "{section.driver}" lacks "port": {PORT}')
+    return section.port
 
 
 def checked_config(config: CellConfig, options: tuple[str, ...] = ()) -> Section:

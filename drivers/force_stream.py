@@ -7,11 +7,11 @@ One thread takes what waits on the line every few milliseconds (the kernel keeps
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
-import serial
 
 from drivers.frame_losses import LossCounter
 from drivers.frames import Deframer, FrameFormat
@@ -41,7 +41,7 @@ class SensorFormat:
 
     Attributes:
         name: the maker's, for people.
-        frame: its frames.
+        frame: its frames; of no meaning where they come as datagrams.
         body: what is between header and checksum; field `wrench` (6), and where it gives them
             `status`, `ticks` (device clock) and `temperature` (°C).
         unit: (6,) N and N·m per count of `wrench`.
@@ -57,14 +57,61 @@ class SensorFormat:
     overload: Callable[[Floats, int], str]
 
 
+class Port(Protocol):
+    """What a stream is read from: a serial port, or datagrams behind the same few names."""
+
+    @property
+    def port(self) -> Any:
+        """Its name."""
+
+    @property
+    def baudrate(self) -> int:
+        """Rate of the line, Bd; 0 where there is none."""
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes that have come."""
+
+    def read(self, size: int) -> bytes:
+        """Return so many of them."""
+
+    def close(self) -> None:
+        """Give it back."""
+
+
+class Frames(Protocol):
+    """What takes frames out of bytes, and counts; see `frames.Deframer`."""
+
+    frames: int
+    corrupt: int
+    skipped: int
+
+    def push(self, data: bytes) -> list[bytes]:
+        """Take bytes, return the bodies of the frames in them."""
+        ...
+
+
 class ForceStream:
     """Reads a sensor that is sending, until `stop`; it uses the port and does not close it."""
 
-    def __init__(self, port: serial.Serial, sensor: SensorFormat) -> None:
-        """Start to read."""
-        self._port, self._sensor = port, sensor
+    def __init__(
+        self,
+        port: Port,
+        sensor: SensorFormat,
+        deframer: Frames | None = None,
+        failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
+    ) -> None:
+        """Start to read.
+
+        Args:
+            port: open.
+            sensor: what it sends.
+            deframer: takes the frames out of the bytes where `sensor.frame` does not tell how.
+            failures: turns what the port raises into DeviceError, from the device and its place.
+        """
+        self._port, self._sensor, self._failures = port, sensor, failures
         self._path = str(port.port)
-        self._deframer = Deframer(sensor.frame)
+        self._deframer: Frames = Deframer(sensor.frame) if deframer is None else deframer
         self._counter = sensor.losses()
         self._lock = threading.Lock()
         self._failure = ""
@@ -194,7 +241,7 @@ class ForceStream:
     def _read(self) -> None:
         """Take what waits on the line, again and again (the thread)."""
         try:
-            with line_failures(DEVICE, self._path):
+            with self._failures(DEVICE, self._path):
                 while self._running:
                     time.sleep(POLL_S)
                     waiting = self._port.in_waiting
@@ -263,7 +310,9 @@ class ForceStream:
             return f"{where}: nothing came {since}; check the sensor's power and cable"
         if self._impossible and self._deframer.frames:
             return f"{where}: frames come, but their values or their clock were impossible {since}"
+        rate = self._port.baudrate
+        at, wrong = (f" at {rate} Bd", "the rate is wrong, ") if rate else ("", "")
         return (
-            f"{where}: bytes come at {self._port.baudrate} Bd, but no whole frame {since}; the "
-            f"rate is wrong, the line is disturbed, or it is no {self._sensor.name}"
+            f"{where}: bytes come{at}, but no whole frame {since}; {wrong}the line is disturbed, "
+            f"or it is no {self._sensor.name}"
         )

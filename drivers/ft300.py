@@ -12,7 +12,7 @@ import termios
 import numpy as np
 import serial
 
-from drivers.force_sensor import StreamingSensor, checked_config
+from drivers.force_sensor import StreamingSensor, checked_config, serial_port
 from drivers.force_stream import DEVICE, ForceStream, SensorFormat
 from drivers.frame_losses import ByArrival
 from drivers.frames import FrameFormat, crc_modbus
@@ -69,10 +69,11 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         InputError: no [force_sensor], or an unknown option.
     """
     section = checked_config(config)
-    port = open_port(DEVICE, section.port, section.baud or BAUD, timeout=0.1)
+    path = serial_port(section)
+    port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
     stream: ForceStream | None = None
     try:
-        with line_failures(DEVICE, section.port):
+        with line_failures(DEVICE, path):
             firmware, number = _begin(port)
         stream = ForceStream(port, SENSOR)
         stream.wait_for_first(FIRST_FRAME_S)
@@ -83,7 +84,7 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         close_port(port)
         raise
     name = f"{SENSOR.name}, serial number {number}"
-    return StreamingSensor(port, stream, name, (("firmware", firmware),), _end)
+    return StreamingSensor(port, stream, name, (("firmware", firmware),), lambda: _end(port))
 
 
 def _begin(port: serial.Serial) -> tuple[str, str]:

@@ -13,6 +13,7 @@ import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Protocol
 
 import serial
 
@@ -90,7 +91,14 @@ def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
     return False
 
 
-def close_port(port: serial.Serial) -> None:
+class Closable(Protocol):
+    """What can be closed."""
+
+    def close(self) -> None:
+        """Close it."""
+
+
+def close_port(port: Closable) -> None:
     """Give the port back, whatever state it is in. Never raises, may be called twice."""
     with contextlib.suppress(OSError, termios.error):
         port.close()

@@ -133,7 +133,13 @@ UR_PORTS = (29999, 30001, 30003, 30004)
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ARM_DRIVER = "drivers.simulated.arm:open_arm"
 """Of every other arm, by its place: it is of use in a simulated cell alone."""
-FORCE_SENSORS = ("ft300", "bota", "hex")
+EMSCON_PORT = 7000
+"""Of the simulated tracker: the real one, 700, is for the administrator alone."""
+RDT_PORT, WEB_PORT = 49152, 8080
+PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
+NATNET_PORT = 1510
+TRACKERS = ("geocom", "emscon", "natnet")
+FORCE_SENSORS = ("ft300", "bota", "hex", "netft")
 _STALE = (
     "world.json",
     "world.bin",
@@ -216,7 +222,7 @@ class SimulatedCell:
             try:
                 cell._begin(devices.values())
             except BaseException as error:
-                taken = devices["arm"].ended and "in use" in str(error)
+                taken = "in use" in str(error) and any(d.ended for d in devices.values())
                 cell.close()
                 if attempt == _HOSTS or not taken:
                     raise
@@ -311,7 +317,7 @@ class SimulatedCell:
 
 
 def free_host() -> str:
-    """Return a loopback address whose robot ports are free now.
+    """Return a loopback address whose ports of devices are free now.
 
     Raises:
         DeviceError: none was found.
@@ -321,7 +327,7 @@ def free_host() -> str:
         host = f"{host}.{secrets.randbelow(254) + 1}"
         try:
             with contextlib.ExitStack() as stack:
-                for port in UR_PORTS:
+                for port in PORTS:
                     line = stack.enter_context(socket.socket())
                     line.bind((host, port))
         except OSError:
@@ -329,7 +335,7 @@ def free_host() -> str:
         return host
     raise DeviceError(
         "simulated arm: no free loopback address 127.x.y.z with the ports "
-        f"{', '.join(map(str, UR_PORTS))}; is the loopback network up?"
+        f"{', '.join(map(str, PORTS))}; is the loopback network up?"
     )
 
 
@@ -340,6 +346,11 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
             "simulated cell: a station measures from where it stands, but the readings' origin "
             'lies within the arm\'s reach; valid: [tracker] frame = "tracker", with a base that '
             "is unknown or farther away than the arm reaches"
+        )
+    tracker = config.tracker.driver or TRACKERS[0]
+    if tracker not in TRACKERS:
+        raise InputError(
+            f"simulated cell: no simulated tracker {tracker!r}; valid: {', '.join(TRACKERS)}"
         )
     sensor = config.force_sensor
     if sensor is not None and sensor.driver not in FORCE_SENSORS:
@@ -365,6 +376,19 @@ def _devices(
     noise = world.noise
     file = config.robot.calibration
     calibration = () if file is None else ("--calibration", str(base_dir / file))
+    tracker = config.tracker.driver or TRACKERS[0]
+    stated = (
+        *("--range-std", *map(repr, map(float, noise.range_std))),
+        *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
+    )
+    of_tracker = {
+        "geocom": stated,
+        "emscon": (
+            *("--host", host, "--port", str(EMSCON_PORT), *stated),
+            *("--orientation-std", repr(float(noise.orientation_std))),
+        ),
+        "natnet": ("--host", host, "--port", str(NATNET_PORT)),  # its errors are its own
+    }[tracker]
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
         return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
@@ -385,15 +409,17 @@ def _devices(
         ),
         "tracker": device(
             "tracker",
-            "geocom_server",
-            *("--range-std", *map(repr, map(float, noise.range_std))),
-            *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
+            f"{tracker}_server",
+            *of_tracker,
             *("--seed", str(seed + 1)),
         ),
     }
     if config.force_sensor is not None:
-        kind = ("--kind", config.force_sensor.driver)
-        out["force"] = device("force", "force_server", *kind, "--seed", str(seed + 2))
+        server, *kind = ("force_server", "--kind", config.force_sensor.driver)
+        if config.force_sensor.driver == "netft":
+            server, *kind = "netft_server", "--host", host, "--port", str(RDT_PORT)
+            kind += ("--web-port", str(WEB_PORT))
+        out["force"] = device("force", server, *kind, "--seed", str(seed + 2))
     return out
 
 
@@ -421,7 +447,12 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
     robot: dict[str, Any] = {"host": host, "driver": driver, "options": options}
     if not ur:
         robot = {"driver": ARM_DRIVER, "options": {"socket": str(directory / "arm.sock")}}
-    tracker = {"port": str(directory / "tracker"), "driver": config.tracker.driver or "geocom"}
+    tracker = {"driver": config.tracker.driver or TRACKERS[0]}
+    ports = {"emscon": EMSCON_PORT, "natnet": NATNET_PORT}
+    if tracker["driver"] in ports:
+        tracker["host"] = f"{host}:{ports[tracker['driver']]}"
+    else:
+        tracker["port"] = str(directory / "tracker")
     operator = {**config.operator.options, "socket": str(directory / "world.sock")}
     changes: dict[str, Any] = {
         "robot": config.robot.model_copy(update=robot),
@@ -429,6 +460,9 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
         "operator": config.operator.model_copy(update={"driver": "simulated", "options": operator}),
     }
     if config.force_sensor is not None:
-        port = {"port": str(directory / "force")}
-        changes["force_sensor"] = config.force_sensor.model_copy(update=port)
+        where: dict[str, Any] = {"port": str(directory / "force")}
+        if config.force_sensor.driver == "netft":
+            web = {**config.force_sensor.options, "web_port": WEB_PORT}
+            where = {"host": f"{host}:{RDT_PORT}", "options": web}
+        changes["force_sensor"] = config.force_sensor.model_copy(update=where)
     return config.model_copy(update=changes)

@@ -213,6 +213,16 @@ def _set(section: str, key: str, read: Callable[[str], object]) -> Callable[[Dra
     return lambda draft, words: draft.set(section, **{key: read(words)})
 
 
+def _connection(section: str) -> Callable[[Draft, str], None]:
+    """Take a serial port, which is a path, or an address."""
+
+    def take(draft: Draft, words: str) -> None:
+        draft.data[section].pop("port", None)
+        draft.set(section, **{"port" if "/" in words else "host": words})
+
+    return take
+
+
 def _metres(words: str) -> list[float]:
     return vector(words, "m")
 
@@ -241,8 +251,8 @@ def items() -> tuple[Item, ...]:
         ),
         Item(
             "--tracker-port",
-            "Its serial port",
-            _set("tracker", "port", str),
+            "Its serial port, or its address in the network",
+            _connection("tracker"),
             needs="tracker",
             without="not connected yet",
         ),
@@ -261,8 +271,8 @@ def items() -> tuple[Item, ...]:
         ),
         Item(
             "--force-port",
-            "Its serial port",
-            _set("force_sensor", "port", str),
+            "Its serial port, or its address in the network",
+            _connection("force_sensor"),
             needs="force_sensor",
             without="the simulated one, for a rehearsal",
         ),
@@ -329,7 +339,9 @@ def init(
         option("--repeatability LENGTH", 'As the maker states it (ISO 9283), e.g. "0.05 mm".'),
     ] = None,
     tracker: Annotated[str | None, option("--tracker", "The tracker's driver.")] = None,
-    tracker_port: Annotated[str | None, option("--tracker-port", "Its serial port.")] = None,
+    tracker_port: Annotated[
+        str | None, option("--tracker-port", "Its serial port, or its address in the network.")
+    ] = None,
     tracker_accuracy: Annotated[
         str | None,
         option("--tracker-accuracy LENGTH", 'Standard deviation of a point, e.g. "8 um + 3 um/m".'),
@@ -337,7 +349,9 @@ def init(
     force_sensor: Annotated[
         str | None, option("--force-sensor", "The force sensor's driver.")
     ] = None,
-    force_port: Annotated[str | None, option("--force-port", "Its serial port.")] = None,
+    force_port: Annotated[
+        str | None, option("--force-port", "Its serial port, or its address in the network.")
+    ] = None,
     target: Annotated[str | None, option("--target X,Y,Z", "The target in flange axes, m.")] = None,
     load_point: Annotated[
         str | None, option("--load-point X,Y,Z", "Where loads act, flange axes, m.")
@@ -408,7 +422,8 @@ _OPTIONS = frozenset(
 
 def _lacking(draft: Draft) -> str:
     """Say which keys the cell still needs before it can be measured."""
-    keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", "port"))
+    connection = "host" if "host" in draft.data.get("tracker", {}) else "port"
+    keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", connection))
     wanted = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
     return f", once it has {' and '.join(wanted)}" if wanted else ""
 

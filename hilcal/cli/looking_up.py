@@ -9,7 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from drivers.emscon import Options as EmsconOptions
 from drivers.geocom import Options as GeoComOptions
+from drivers.natnet import Options as NatNetOptions
+from drivers.netft import Options as NetFtOptions
 from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import (
     EffectsFrom,
@@ -186,6 +189,9 @@ def template_of(name: str) -> str:
 DRIVERS_OWN: dict[str, type[Section]] = {
     "robot.options": UrOptions,
     "tracker.options": GeoComOptions,
+    "tracker.options (emscon)": EmsconOptions,
+    "tracker.options (natnet)": NatNetOptions,
+    "force_sensor.options": NetFtOptions,
 }
 """Keys of the drivers that come with the program, by section."""
 

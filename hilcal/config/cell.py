@@ -11,6 +11,7 @@ from hilcal.config.loads import Limits, Load
 from hilcal.config.observers import Gauge, Point
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
+    HOST,
     OPTIONS,
     PORT,
     ROTVEC,
@@ -210,7 +211,7 @@ class Tracker(Section):
     driver: str | None = Field(
         None,
         min_length=1,
-        description='the name of a tracker\'s driver, e.g. "geocom"',
+        description='the name of a tracker\'s driver, e.g. "geocom" or "emscon"',
         examples=["geocom"],
     )
     port: str | None = Field(
@@ -219,6 +220,7 @@ class Tracker(Section):
     baud: Whole | None = Field(
         None, description="the line's rate in Bd; the driver's own if absent", examples=[115200]
     )
+    host: str | None = Field(None, min_length=1, description=HOST, examples=["192.168.0.1"])
     options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
     frame: Literal["tracker", "base"] = Field(
         "tracker", description='"tracker" or "base": the axes in which positions are given'

@@ -29,6 +29,8 @@ _UNITS = (
     ("_share", "1"),
     ("baud", "Bd"),
     ("samples", "readings"),
+    ("frames", "frames"),
+    ("web_port", "TCP"),
     ("candidates", "poses"),
     ("clock", "times real time"),
     ("singularity", "1"),
@@ -79,7 +81,7 @@ def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[Table, .
     """Return all sections, in the order of the configuration.
 
     Args:
-        options: sections of drivers' own keys, by name, e.g. "tracker.options".
+        options: sections of drivers' own keys, by name, e.g. "tracker.options (emscon)".
     """
     found: list[Table] = []
     for name, field in CellConfig.model_fields.items():
@@ -121,7 +123,7 @@ def _tables(name: str, section: type[Section], several: bool) -> Iterator[Table]
 def _table(name: str, section: type[Section], several: bool) -> Table:
     about = (section.__doc__ or "").split("\n")[0].split(": ", 1)[-1]
     keys = tuple(_key(key, field) for key, field in section.model_fields.items())
-    header = f"[[{name}]]" if several else f"[{name}]"
+    header = f"[[{name}]]" if several else f"[{name.split()[0]}]"
     return Table(name, header, about[:1].upper() + about[1:], keys)
 
 

@@ -10,6 +10,8 @@ Whole = Annotated[int, Strict(), Field(ge=1)]
 OPTIONS = "a table of the driver's own keys"
 VECTOR_M = "three finite numbers in m, e.g. [0.0, 0.0, 0.1]"
 ROTVEC = "a rotation vector: three finite numbers in rad, e.g. [0.0, 0.0, 1.57]"
+HOST = 'the address in the network, e.g. "192.168.0.1"; another port as "192.168.0.1:7000"'
+"""Of an instrument that is connected by Ethernet."""
 PORT = 'the serial port, e.g. "/dev/serial/by-id/usb-FTDI_..."'
 
 
@@ -37,11 +39,14 @@ class ForceSensor(Section):
     """[force_sensor]: the wrench sensor between flange and tool."""
 
     driver: str = Field(
-        min_length=1, description='the name of a driver, e.g. "ft300" or "bota"', examples=["ft300"]
+        min_length=1,
+        description='the name of a driver, e.g. "ft300", "bota" or "netft"',
+        examples=["ft300"],
     )
-    port: str = Field(
-        min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-Silicon_Labs_..."]
+    port: str | None = Field(
+        None, min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-Silicon_Labs_..."]
     )
+    host: str | None = Field(None, min_length=1, description=HOST, examples=["192.168.1.1"])
     baud: Whole | None = Field(
         None, description="the line's rate in Bd; the driver's own if absent", examples=[19200]
     )
@@ -64,6 +69,12 @@ class ForceSensor(Section):
         examples=["all"],
     )
     options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
+
+    @model_validator(mode="after")
+    def _connected(self) -> "ForceSensor":
+        if self.port is None and self.host is None:
+            raise ValueError(f'lacks "port": it must be {PORT}; or "host": {HOST}')
+        return self
 
 
 class Operator(Section):

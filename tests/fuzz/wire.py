@@ -23,7 +23,7 @@ from drivers.geocom import GeoComTracker, Options
 from drivers.geocom_line import Link
 from hilcal.config.cell import Tracker
 from hilcal.measuring.devices import Clock
-from tests.fuzz import controller
+from tests.fuzz import controller, network
 from tests.fuzz.damage import NUMBERS, bytes_damaged
 from tests.fuzz.harness import Accepted, Parser, passed
 from tests.fuzz.stand_ins import Port, Time, finite, instead
@@ -261,4 +261,5 @@ def parsers() -> list[Parser]:
         controller.dashboard_server(),
         controller.primary_port(),
         controller.packet(),
+        *network.parsers(),
     ]

@@ -94,14 +94,24 @@ class Site:
 
 
 @contextmanager
-def site(directory: Path, *, clock: float = 20.0, poses: int = 3, seed: int = 5) -> Iterator[Site]:
-    """Run a simulated cell with two loads and a plan of few poses."""
+def site(
+    directory: Path,
+    *,
+    clock: float = 20.0,
+    poses: int = 3,
+    seed: int = 5,
+    tracker: dict[str, Any] | None = None,
+    force_sensor: dict[str, Any] | None = None,
+) -> Iterator[Site]:
+    """Run a simulated cell with two loads and a plan of few poses; other instruments as given."""
     base_dir = configs_dir() / "cells"
     config = load_config(base_dir / "demo_ur10e.toml")
     changes = {
         "simulation": config.simulation.model_copy(update={"clock": clock}),
         "operator": config.operator.model_copy(update={"options": {"hand_s": HAND_S}}),
         "loads": config.loads[:2],
+        "tracker": config.tracker.model_copy(update=tracker),
+        "force_sensor": config.force_sensor and config.force_sensor.model_copy(update=force_sensor),
     }
     config = config.model_copy(update=changes)
     cell = cell_from_config(config)

@@ -1,0 +1,546 @@
+"""Leica laser trackers by emScon over TCP: AT40x, AT901, LTD; reflectors, and 6-D targets.
+
+Readings are Cartesian in the tracker's own axes, in m. The covariance of each is the one that the
+tracker expects of it (a priori, one standard deviation), that of its orientation stated of rotation
+angles about x, y and z; with the angles a and the rotation R(a),
+
+    Cov(small rotation about the tracker's axes) = J Cov(a) Jᵀ,    J_k = log(R(a + h e_k) Rᵀ) / h
+
+Source: Leica Geosystems, emScon TPI V3.6 (`emscon_packets`).
+"""
+
+import math
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import Any, Literal, NoReturn
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from drivers import emscon_packets as es
+from drivers.network import address, network_failures
+from hilcal.config import CellConfig
+from hilcal.config.cell import Tracker as TrackerConfig
+from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
+from hilcal.readings.covariance import tracker_covariance, tracker_noise
+from hilcal.toml import Positive, Section, check_section
+from hilcal.types import Floats
+
+DEVICE = "tracker"
+CONNECT_S = 2.0
+"""How long the connection may take, real s."""
+DEADLINE_S = 4.0
+"""How long a command may take beside what is measured or moved, real s."""
+SEARCHING_S = 30.0
+"""How long turning or a search for the reflector may take, cell s; at least `_LEAST_S` real s."""
+HOMING_S = 120.0
+"""How long the tracker may take to find its zeros, cell s."""
+HOMED = "the tracker was initialised again before this reading: its axes may have moved"
+_LEAST_S, _PAUSE_S = 1.0, 0.1
+_FARTHEST_M = 500.0
+"""Beyond the reach of any tracker."""
+_UNITS = struct.pack("<5I", 0, 0, 0, 0, 0)  # m, rad, °C, mbar, % of relative humidity
+_ORDERS = ("xyz", "XYZ")
+_STEP, _SAME = 1e-6, 1e-4
+
+
+class Options(Section):
+    """[tracker.options]: keys of the driver "emscon"."""
+
+    target: Literal["position", "pose"] = Field(
+        "position",
+        description='"position" (a reflector) or "pose" (a 6-D target: T-Probe, T-Mac)',
+    )
+    reflector: str | None = Field(
+        None,
+        min_length=1,
+        description="the name of the reflector in the tracker's list; the one that is set if "
+        "absent",
+        examples=["RRR 1.5in"],
+    )
+    measuring_s: Positive = Field(
+        0.5, description="how long the tracker averages for one measurement in s, over 0"
+    )
+    search_m: Positive = Field(
+        0.1, description="radius in m in which the reflector is searched, over 0"
+    )
+
+
+class Connection:
+    """One connection to an emScon server: commands, results, and what it sends by itself.
+
+    Attributes:
+        changes: changes of its state that nobody has looked at yet.
+        open: whether it can still be used.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        """Connect.
+
+        Raises:
+            DeviceError: nobody answers there, within `CONNECT_S`.
+        """
+        self.where = f"{host}:{port}"
+        with network_failures(DEVICE, self.where):
+            self._socket = socket.create_connection((host, port), CONNECT_S)
+        self._came = bytearray()
+        self.changes: list[int] = []
+        self.open = True
+
+    def close(self) -> None:
+        """Close it. Never raises, may be called twice."""
+        self.open = False
+        self._socket.close()
+
+    def ask(self, command: int, parameters: bytes = b"", *, until: float) -> tuple[int, bytes]:
+        """Send a command; return its status and what it returns. Waits while the server is busy.
+
+        Raises:
+            DeviceError: no answer in time, or the connection failed; it is closed then.
+        """
+        while True:
+            body = struct.pack("<I", command) + parameters
+            self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
+            status, returned = self.answer(command, until=until)
+            if status != es.BUSY or time.monotonic() + _PAUSE_S > until:
+                return status, returned
+            time.sleep(_PAUSE_S)
+
+    def answer(self, command: int, *, until: float) -> tuple[int, bytes]:
+        """Return the next answer to a command; late ones to others are left out."""
+        while True:
+            kind, body = self._packet(until)
+            if kind in (es.COMMAND, es.ERROR):
+                number, status = self._two(body)
+                if number == command or (kind == es.ERROR and number == es.UNKNOWN):
+                    return status, body[8:]
+
+    def result(self, *, until: float) -> tuple[int, int, bytes]:
+        """Return type, status and content of the result of the measurement that was started."""
+        while True:
+            kind, body = self._packet(until)
+            if kind in (es.SINGLE, es.SINGLE2, es.PROBE):
+                if len(body) < 4:
+                    self._strange("a packet that is cut short")
+                return kind, int.from_bytes(body[:4], "little"), body[4:]
+            if kind == es.ERROR and self._two(body)[0] in (es.START_MEASUREMENT, es.UNKNOWN):
+                return kind, self._two(body)[1], b""
+
+    def drain(self) -> None:
+        """Take what the server has sent by itself; an old result among it is thrown away."""
+        while True:
+            try:
+                self._packet(0.0)
+            except BlockingIOError:
+                return
+
+    def unpack(self, layout: str, body: bytes) -> tuple[Any, ...]:
+        """Unpack what a command returned; it may be longer."""
+        try:
+            return struct.unpack_from(layout, body)
+        except struct.error:
+            self._strange("an answer that is too short")
+
+    def _two(self, body: bytes) -> tuple[int, int]:
+        if len(body) < 8:
+            self._strange("a packet that is cut short")
+        number, status = struct.unpack_from("<II", body)
+        return number, status
+
+    def _send(self, data: bytes) -> None:
+        try:
+            with network_failures(DEVICE, self.where):
+                self._socket.settimeout(DEADLINE_S)
+                self._socket.sendall(data)
+        except DeviceError:
+            self.close()
+            raise
+
+    def _packet(self, until: float) -> tuple[int, bytes]:
+        """Return type and content of the next packet; changes of state are kept aside.
+
+        Raises:
+            BlockingIOError: until is 0 and none waits.
+            DeviceError: as `ask`.
+        """
+        while True:
+            if len(self._came) >= es.HEADER.size:
+                size, kind = es.HEADER.unpack_from(self._came)
+                if not es.HEADER.size <= size <= es.LARGEST:
+                    self._strange("what is no packet of emScon")
+                if len(self._came) >= size:
+                    body = bytes(self._came[es.HEADER.size : size])
+                    del self._came[:size]
+                    if kind == es.CHANGE and len(body) == 4:
+                        self.changes.append(int.from_bytes(body, "little"))
+                        continue
+                    return kind, body
+            self._receive(until)
+
+    def _receive(self, until: float) -> None:
+        try:
+            with network_failures(DEVICE, self.where):
+                left = until - time.monotonic()
+                if until and left <= 0.0:
+                    raise TimeoutError
+                self._socket.settimeout(left if until else 0.0)
+                try:
+                    data = self._socket.recv(es.LARGEST)
+                except BlockingIOError:
+                    if until:
+                        raise TimeoutError from None
+                    data = None
+        except DeviceError:
+            self.close()
+            raise
+        if data is None:
+            raise BlockingIOError
+        if not data:
+            self.close()
+            raise DeviceError(f"{DEVICE} at {self.where}: the tracker has closed the connection")
+        self._came += data
+
+    def _strange(self, what: str) -> NoReturn:
+        self.close()
+        raise DeviceError(
+            f"{DEVICE} at {self.where}: {what} comes; is an emScon server at this address?"
+        )
+
+
+class EmsconTracker:
+    """An emScon tracker as a `hilcal.measuring.devices.PointingTracker`; m = 3, or 6 of poses."""
+
+    def __init__(
+        self,
+        connect: Callable[[], Connection],
+        config: TrackerConfig,
+        options: Options,
+        clock: Clock,
+    ) -> None:
+        """Connect and set units, axes and mode; nothing turns.
+
+        Raises:
+            DeviceError: nobody answers, or the tracker cannot be used.
+            InputError: the reflector is not in its list.
+        """
+        self._connect, self._config, self._options, self._clock = connect, config, options, clock
+        self._reflector: tuple[int, str] | None = None
+        self._remarks: list[str] = []
+        self._distance = 2.0
+        self._line = connect()
+        try:
+            self._set_up(self._soon())
+        except BaseException:
+            self._line.close()
+            raise
+
+    def measure(self) -> TrackerSample:
+        """Measure once, see `hilcal.measuring.devices.TrackerDevice.measure`.
+
+        Raises:
+            TargetLostError: beam broken, no reflector, or zeros lost.
+            DeviceError: the tracker or the connection failed, or another reflector is set.
+        """
+        found = self._measure()
+        self._distance = float(np.linalg.norm(found.position))
+        stated = found.covariance
+        if not _positive(stated):
+            stated = tracker_covariance(found.position[None], tracker_noise(self._config))[0]
+        value, covariance = found.position, stated
+        if found.quaternion is not None:
+            turn = Rotation.from_quat(np.roll(found.quaternion, -1))  # scalar last
+            value = np.concatenate([value, turn.as_rotvec()])
+            covariance = np.zeros((6, 6))
+            covariance[:3, :3], covariance[3:, 3:] = stated, self._turn_covariance(found, turn)
+        remarks, self._remarks = "; ".join(dict.fromkeys(self._remarks)), []
+        return TrackerSample(time.monotonic_ns(), value, covariance, remarks)
+
+    def aim(self, position: Floats, radius: float) -> None:
+        """Turn to where a reflector is expected and hold the one that is there.
+
+        Args:
+            position: (3,) the tracker's axes, m.
+            radius: a reflector farther from there is another one, m.
+
+        Raises:
+            TargetLostError: there is none.
+            DeviceError: the tracker or the connection failed.
+        """
+        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
+        until = self._ready(moving)
+        self._search(min(radius, self._options.search_m), until)
+        place = struct.pack("<3di", *map(float, position), 1)
+        self._find("turning to the target", es.GO_POSITION, place, until)
+
+    def find_target(self) -> None:
+        """Find the zeros again where they are lost, and search for the reflector.
+
+        Raises:
+            TargetLostError: not found.
+            DeviceError: the tracker or the connection failed.
+        """
+        moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
+        until = self._ready(moving)
+        if self._system(until)[1] != es.INITIALIZED:
+            homing = until + max(_LEAST_S, self._clock.real(HOMING_S))
+            self._do("finding its zeros", es.INITIALIZE, until=homing)
+            self._remarks.append(HOMED)
+            until = self._ready(moving)
+        self._search(self._options.search_m, until)
+        self._find(
+            "searching for the reflector",
+            es.FIND_REFLECTOR,
+            struct.pack("<d", self._distance),
+            until,
+        )
+
+    def report(self) -> Report:
+        """Ask the tracker who it is and how it is, and measure once; nothing turns.
+
+        Raises:
+            DeviceError: the connection failed.
+        """
+        until = self._ready()
+        status, body = self._line.ask(es.GET_TRACKER_INFO, until=until)
+        name, serial = "emScon tracker", 0
+        if status == es.OK:
+            _, words, number = self._line.unpack("<I64si", body)
+            name, serial = es.text(words) or name, number
+        facts: list[tuple[str, str]] = []
+        fields: list[tuple[str, object]] = [("name", name), ("serial_number", serial or None)]
+        problems: list[str] = []
+        if self._reflector is not None:
+            facts.append(("reflector", self._reflector[1]))
+            fields.append(("reflector", self._reflector[1]))
+        body = self._do("reading the environment", es.GET_ENVIRONMENT, until=until)
+        celsius, mbar, humid = self._line.unpack("<3d", body)
+        facts.append(("environment", f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"))
+        fields += [("temperature_degC", celsius), ("pressure_mbar", mbar), ("humidity", humid)]
+        _, state, _, _, *version, weather, _, _ = self._system(until)
+        firmware = ".".join(map(str, version))
+        station = dict(enumerate(es.WEATHER)).get(weather, f"state {weather}")
+        facts += [("emScon", firmware), ("weather station", station)]
+        fields += [("emscon", firmware), ("weather_station", station)]
+        if state != es.INITIALIZED:
+            problems.append("it has not found its zeros (it is not initialised); initialise it")
+        elif self._options.target == "pose" or self._holds_reflector(until):
+            try:
+                sample = self.measure()
+                std = 1e6 * float(np.sqrt(np.trace(sample.covariance[:3, :3])))
+                where = f"{self._distance:.4f} m away; standard deviation of a point {std:.1f} µm"
+                facts.append(("target", where))
+                fields += [("distance_m", self._distance), ("std_m", 1e-6 * std)]
+                facts += [("remark", sample.warning)] * bool(sample.warning)
+            except DeviceError as error:
+                if not self._line.open:
+                    raise
+                problems.append(str(error).removeprefix(f"{DEVICE}: "))
+        else:
+            problems.append("it holds no reflector; put the beam on it")
+        full = f"{name}, serial {serial}" if serial else name
+        return Report(DEVICE, full, tuple(facts), tuple(problems), tuple(fields))
+
+    def close(self) -> None:
+        """Close the connection; the tracker stays as it is. Never raises, may be called twice."""
+        self._line.close()
+
+    def _measure(self) -> es.Measurement:
+        until = self._ready(self._clock.real(self._options.measuring_s))
+        self._do("measuring", es.START_MEASUREMENT, until=until)
+        return self._sound(*self._line.result(until=until))
+
+    def _sound(self, kind: int, status: int, body: bytes) -> es.Measurement:
+        """Return a result that can be.
+
+        Raises:
+            DeviceError: it failed, or is none that the tracker can give.
+        """
+        if status != es.OK or kind == es.ERROR:
+            raise es.failure("measuring", status)
+        wanted = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
+        try:
+            found = es.measurement(kind, body)
+        except struct.error:
+            self._line.close()
+            raise DeviceError(
+                f"{DEVICE}: measuring: a result of {len(body)} bytes comes; is this emScon?"
+            ) from None
+        if (found.quaternion is None) == (wanted == es.STATIONARY_6D):
+            raise DeviceError(f"{DEVICE}: measuring: the tracker measures in another mode than set")
+        size = float(np.linalg.norm(found.position))
+        turn = 1.0 if found.quaternion is None else float(np.linalg.norm(found.quaternion))
+        if not (0.0 < size < _FARTHEST_M and abs(turn - 1.0) < 0.01):
+            raise DeviceError(
+                f"{DEVICE}: measuring: the tracker gives a target {size:.4g} m away with a "
+                f"quaternion of length {turn:.3g}; are its units or its mode being changed?"
+            )
+        return found
+
+    def _turn_covariance(self, found: es.Measurement, turn: Rotation) -> Floats:
+        """(3, 3) of a small rotation about the tracker's axes, rad²."""
+        stated = found.angle_covariance
+        if not (_positive(stated) and np.isfinite(found.angles).all()):
+            return self._config.orientation_std_rad**2 * np.eye(3)
+        for order in _ORDERS:
+            there = Rotation.from_euler(order, found.angles)
+            if (there * turn.inv()).magnitude() < _SAME:
+                moved = Rotation.from_euler(order, found.angles + _STEP * np.eye(3))
+                J = (moved * there.inv()).as_rotvec().T / _STEP
+                C = J @ stated @ J.T
+                return np.asarray(0.5 * (C + C.T))
+        return float(np.linalg.eigvalsh(stated)[-1]) * np.eye(3)  # angles of another kind
+
+    def _soon(self, seconds: float = 0.0) -> float:
+        return time.monotonic() + DEADLINE_S + seconds
+
+    def _ready(self, seconds: float = 0.0) -> float:
+        """See that the tracker is there and set as at first; return a deadline so much later.
+
+        A connection that failed is made anew; where the server says that something was changed,
+        settings are looked at again.
+        """
+        until = self._soon(seconds)
+        again = not self._line.open
+        if again:
+            self._line = self._connect()
+            self._remarks.append("the connection to the tracker was lost and made again")
+        self._line.drain()
+        changes, self._line.changes = self._line.changes, []
+        for change in changes:
+            if change in es.CLOSING:
+                self._line.close()
+                raise DeviceError(f"{DEVICE}: {es.CLOSING[change]}; is it switched off?")
+            if change in es.RESTARTED:
+                self._remarks.append(f"{es.RESTARTED[change]}: its axes may have moved")
+            again |= change in es.SETTINGS_CHANGED or change in es.RESTARTED
+            if change == es.INITIALIZATION_CHANGED:
+                self._remarks.append(HOMED)
+        if again:
+            self._set_up(until)
+        elif es.REFLECTOR_CHANGED in changes:
+            self._check_reflector(until)
+        return until
+
+    def _set_up(self, until: float) -> None:
+        """Set units, axes, statistics and mode where they are not what is needed."""
+        mode = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
+        measuring = struct.pack("<2i", max(1, math.ceil(1e3 * self._options.measuring_s)), 1)
+        for what, get, put, wanted in (
+            ("units", es.GET_UNITS, es.SET_UNITS, _UNITS),
+            ("coordinate system", es.GET_COORDINATES, es.SET_COORDINATES, struct.pack("<I", 0)),
+            ("statistics", es.GET_STATISTICS, es.SET_STATISTICS, struct.pack("<2I", 1, 1)),
+            ("mode", es.GET_MODE, es.SET_MODE, struct.pack("<I", mode)),
+            ("time of a measurement", es.GET_STATIONARY, es.SET_STATIONARY, measuring),
+        ):
+            if self._do(f"reading its {what}", get, until=until) != wanted:
+                self._do(f"setting its {what}", put, wanted, until=until)
+        body = self._do("reading its settings", es.GET_SETTINGS, until=until)
+        old = self._line.unpack("<I8i", body)
+        # own axes, not those of a station or of an object; tells changes; single results only
+        new = (old[0], 0, 0, old[3], 1, 0, 0, *old[7:])
+        if new != old:
+            packed = struct.pack("<I8i", *new)
+            self._do("setting its settings", es.SET_SETTINGS, packed, until=until)
+        if self._options.target == "position":
+            self._check_reflector(until)
+        self._line.drain()
+        self._line.changes = [c for c in self._line.changes if c in es.CLOSING]
+
+    def _check_reflector(self, until: float) -> None:
+        """Set the reflector at first; later refuse another one, whose centre is elsewhere."""
+        body = self._do("reading its reflector", es.GET_REFLECTOR, until=until)
+        (number,) = self._line.unpack("<i", body)
+        names = self._reflectors(until)
+        if self._reflector is None:
+            wanted = self._options.reflector
+            if wanted is not None and names.get(number) != wanted:
+                known = {name: k for k, name in names.items()}
+                if wanted not in known:
+                    raise InputError(
+                        f'[tracker] options: the tracker has no reflector "{wanted}"; valid: '
+                        f"{', '.join(known)}"
+                    )
+                number = known[wanted]
+                packed = struct.pack("<i", number)
+                self._do("setting its reflector", es.SET_REFLECTOR, packed, until=until)
+            self._reflector = number, names.get(number, f"number {number}")
+        elif number != self._reflector[0]:
+            self._line.changes.append(es.REFLECTOR_CHANGED)  # asked again at the next call
+            raise DeviceError(
+                f'{DEVICE}: its reflector was changed to "{names.get(number, number)}", '
+                f'readings so far are of "{self._reflector[1]}"; set that one again'
+            )
+
+    def _reflectors(self, until: float) -> dict[int, str]:
+        """Names of the reflectors in the tracker's list; it answers with one packet for each."""
+        found: dict[int, str] = {}
+        body = self._do("reading its reflectors", es.GET_REFLECTORS, until=until)
+        for left in range(es.LARGEST):
+            total, number, _, _, name = self._line.unpack("<iiId64s", body)
+            found[number] = es.text(name)
+            if left + 1 >= total:
+                break
+            status, body = self._line.answer(es.GET_REFLECTORS, until=until)
+            if status != es.OK:
+                raise es.failure("reading its reflectors", status)
+        return found
+
+    def _system(self, until: float) -> tuple[int, ...]:
+        """Last status, state of tracker, laser and distance meter, version (3), weather, 2 more."""
+        body = self._do("reading its state", es.GET_SYSTEM_STATUS, until=until)
+        return self._line.unpack("<4I3iI2i", body)
+
+    def _holds_reflector(self, until: float) -> bool:
+        body = self._do("reading its state", es.GET_STATUS_INFO, until=until)
+        return bool(self._line.unpack("<Ii", body)[1] & es.REFLECTOR_FOUND)
+
+    def _search(self, radius: float, until: float) -> None:
+        seconds = max(_LEAST_S, self._clock.real(SEARCHING_S))
+        packed = struct.pack("<di", radius, math.ceil(1e3 * seconds))
+        self._do("setting the search", es.SET_SEARCH, packed, until=until)
+
+    def _find(self, doing: str, command: int, parameters: bytes, until: float) -> None:
+        status, _ = self._line.ask(command, parameters, until=until)
+        if status == es.NOT_IMPLEMENTED or status in (1, 35, 38):
+            raise es.failure(doing, status)
+        if status != es.OK:
+            raise TargetLostError(f"{DEVICE}: {doing}: it is not found (status {status})")
+
+    def _do(self, doing: str, command: int, parameters: bytes = b"", *, until: float) -> bytes:
+        """Carry out a command and return what it returns.
+
+        Raises:
+            DeviceError: it did not work.
+        """
+        status, body = self._line.ask(command, parameters, until=until)
+        if status not in es.GOOD:
+            raise es.failure(doing, status)
+        return body
+
+
+def _positive(covariance: Floats) -> bool:
+    """Whether it is a covariance of something that scatters in all directions."""
+    return bool(np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0.0)
+
+
+def open_tracker(config: CellConfig) -> EmsconTracker:
+    """Connect to the tracker that [tracker] names; nothing turns.
+
+    Raises:
+        InputError: [tracker] lacks the host, has another frame, or an unknown option.
+        DeviceError: nobody answers there.
+    """
+    tracker = config.tracker
+    host, port = address("[tracker]", "emscon", tracker.host, es.PORT)
+    if tracker.frame != "tracker":
+        raise InputError(
+            f'[tracker] frame = "{tracker.frame}": a laser tracker gives positions in its own axes;'
+            ' it must be "tracker"'
+        )
+    options = check_section(tracker.options, Options, "[tracker] options")
+    clock = Clock(config.simulation.clock)
+    return EmsconTracker(lambda: Connection(host, port), tracker, options, clock)

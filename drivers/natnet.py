@@ -1,0 +1,318 @@
+"""OptiTrack (Motive) by NatNet as a tracker: a rigid body's pose, or the position of its pivot.
+
+A measurement is the mean of the frames that come after it was asked for; its covariance is what
+these frames scatter, divided by their number. That is no statement of its accuracy: a camera system
+errs by the same amount in all frames of one pose. Leave the noise in [tracker] open, so that it is
+estimated from the campaign. Frames of 3.0 to 4.2; a server that knows later ones is asked for 4.2.
+
+Source: see `natnet_frames`.
+"""
+
+import socket
+import struct
+import time
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+from scipy.spatial.transform import Rotation
+
+from drivers import natnet_frames as nn
+from drivers.network import address, network_failures
+from hilcal.config import CellConfig
+from hilcal.config.rig import Whole
+from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
+from hilcal.toml import Section, check_section
+
+DEVICE = "tracker"
+ANSWER_S, TRIES = 0.5, 4
+"""How long an answer may take, real s, and how often it is asked for: datagrams may be lost."""
+DEADLINE_S = 4.0
+"""How long frames may take, real s."""
+SLOWEST_HZ = 20.0
+LOST_S = 1.0
+"""A body that is not seen for so long is lost, real s."""
+FLOOR = 1e-7
+"""Least standard deviation of a frame, m and rad: frames are in single precision."""
+
+
+class Options(Section):
+    """[tracker.options]: keys of the driver "natnet"."""
+
+    rigid_body: str | None = Field(
+        None,
+        min_length=1,
+        description="the name of the rigid body in Motive, or its streaming ID; may be absent "
+        "where there is one only",
+        examples=["tool"],
+    )
+    target: Literal["position", "pose"] = Field(
+        "pose", description='"pose" (position and orientation) or "position" (of its pivot)'
+    )
+    frames: Whole = Field(20, description="frames averaged for one measurement, 2 or more")
+    local: str = Field(
+        "0.0.0.0",  # noqa: S104 - of a multicast group
+        min_length=1,
+        description="the address of this computer in the cameras' network, for multicast",
+    )
+
+
+class NatNetTracker:
+    """A rigid body as a `hilcal.measuring.devices.TrackerDevice`; m = 6, or 3."""
+
+    def __init__(self, host: str, port: int, options: Options) -> None:
+        """Connect, agree on a version, find the rigid body.
+
+        Raises:
+            DeviceError: nobody answers, or in no known version.
+            InputError: there is no such rigid body.
+        """
+        self._options, self._to = options, (host, port)
+        self.where = f"{host}:{port}"
+        self._data: socket.socket | None = None
+        self._newest = -1
+        with network_failures(DEVICE, self.where):
+            self._line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            try:
+                self._line.connect(self._to)
+                self._server = self._greet()
+                if self._server.group:
+                    self._data = self._joined(self._server)
+                self._body, self._name = self._found()
+            except BaseException:
+                self.close()
+                raise
+
+    def measure(self) -> TrackerSample:
+        """Average the next frames, see the module.
+
+        Raises:
+            TargetLostError: the rigid body is not seen.
+            DeviceError: no frames come, or the same one again and again.
+        """
+        bodies = self._frames(self._options.frames)
+        position = np.array([b.position for b in bodies])
+        turns = Rotation.from_quat(np.array([b.quaternion for b in bodies]))
+        if len(bodies) > 1 and not np.any(np.ptp(position, axis=0)):
+            raise DeviceError(
+                f"{DEVICE} at {self.where}: all frames are the same to the last digit; is Motive "
+                "paused, or does it play a recording?"
+            )
+        turn = turns.mean()
+        off = (turns * turn.inv()).as_rotvec()
+        K = len(bodies)
+        covariance = np.zeros((6, 6))
+        for part, scatter in ((slice(0, 3), position - position.mean(axis=0)), (slice(3, 6), off)):
+            variance = max(float(np.sum(scatter**2)) / (3 * max(K - 1, 1)), FLOOR**2)
+            covariance[part, part] = variance / K * np.eye(3)
+        value = np.concatenate([position.mean(axis=0), turn.as_rotvec()])
+        m = 6 if self._options.target == "pose" else 3
+        return TrackerSample(time.monotonic_ns(), value[:m], covariance[:m, :m])
+
+    def find_target(self) -> None:
+        """Wait until the rigid body is seen; cameras do not turn.
+
+        Raises:
+            TargetLostError: it is not.
+            DeviceError: no frames come.
+        """
+        self._frames(1)
+
+    def report(self) -> Report:
+        """Say who answered, and measure once.
+
+        Raises:
+            DeviceError: no frames come.
+        """
+        s = self._server
+        version = f"{s.version[0]}.{s.version[1]}"
+        sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
+        facts = [("NatNet", version), ("frames", sent), ("rigid body", self._name)]
+        fields: list[tuple[str, object]] = [("name", s.name), ("natnet", version)]
+        fields.append(("rigid_body", self._name))
+        problems: list[str] = []
+        try:
+            sample = self.measure()
+            std = float(np.sqrt(self._options.frames * sample.covariance[0, 0]))
+            facts.append(("target", f"a frame scatters by {1e6 * std:.0f} µm along each axis"))
+            fields.append(("frame_std_m", std))
+        except TargetLostError as error:
+            problems.append(str(error).removeprefix(f"{DEVICE} at {self.where}: "))
+        return Report(DEVICE, f"{s.name} {s.program}", tuple(facts), tuple(problems), tuple(fields))
+
+    def close(self) -> None:
+        """Close the sockets. Never raises, may be called twice."""
+        self._line.close()
+        if self._data is not None:
+            self._data.close()
+
+    def _frames(self, count: int) -> list[nn.Body]:
+        """Return the rigid body in the next `count` frames in which it is seen."""
+        line = self._data or self._line
+        with network_failures(DEVICE, self.where):
+            self._send(nn.message(nn.KEEP_ALIVE))
+            _drain(line)
+            self._newest = -1
+            begun = heard = seen = time.monotonic()
+            until = begun + DEADLINE_S + count / SLOWEST_HZ
+            asked = begun
+            found: list[nn.Body] = []
+            others: set[int] = set()
+            while len(found) < count:
+                now = time.monotonic()
+                if now - heard > DEADLINE_S or now > until:
+                    raise DeviceError(
+                        f"{DEVICE} at {self.where}: no frames come; is streaming switched on, and "
+                        "does a firewall let them through?"
+                    )
+                if now - max(heard, asked) > ANSWER_S:  # it may have forgotten this client
+                    asked = now
+                    self._send(nn.connect(nn.NEWEST))
+                if now - seen > LOST_S and heard > seen:
+                    there = f"; in the frames: {sorted(others)}" if others else ""
+                    raise TargetLostError(
+                        f"{DEVICE} at {self.where}: the rigid body {self._name} is not seen{there}"
+                    )
+                bodies = self._next(line)
+                if bodies is None:
+                    continue
+                heard = time.monotonic()
+                others |= {b.number for b in bodies if b.number != self._body}
+                for body in bodies:
+                    if body.number == self._body and body.tracked:
+                        seen = heard
+                        found.append(body)
+        return found
+
+    def _next(self, line: socket.socket) -> list[nn.Body] | None:
+        """Return the rigid bodies of the next frame that is newer; None where none came."""
+        content = self._receive(line, nn.FRAME, 0.1)
+        if content is None:
+            return None
+        try:
+            number, bodies = nn.frame(content, self._server.version)
+        except struct.error:
+            raise DeviceError(
+                f"{DEVICE} at {self.where}: frames are not of NatNet "
+                f"{'.'.join(map(str, self._server.version))}; was the version changed in Motive?"
+            ) from None
+        if number == self._newest:
+            return None
+        self._newest = number
+        if not all(np.isfinite([*b.position, *b.quaternion]).all() for b in bodies):
+            return None
+        return bodies
+
+    def _greet(self) -> nn.Server:
+        content = self._ask(nn.connect(nn.NEWEST), nn.SERVER_INFO)
+        try:
+            server = nn.server(content)
+        except struct.error:
+            raise DeviceError(
+                f"{DEVICE} at {self.where}: what answers is no NatNet server; is this its command "
+                "port?"
+            ) from None
+        if server.version > nn.NEWEST:
+            words = f"Bitstream,{nn.NEWEST[0]}.{nn.NEWEST[1]}".encode() + b"\0"
+            answer = self._ask(nn.message(nn.REQUEST, words), nn.RESPONSE)
+            if server.group or answer[:4] not in (bytes(4), words[:4]):
+                self._refuse(server)
+            version = nn.NEWEST
+            server = nn.Server(server.name, server.program, version, server.data_port, server.group)
+        if server.version < nn.OLDEST:
+            self._refuse(server)
+        return server
+
+    def _refuse(self, server: nn.Server) -> None:
+        raise DeviceError(
+            f"{DEVICE} at {self.where}: it sends frames of NatNet {server.version[0]}."
+            f"{server.version[1]}; valid: 3.0 to {nn.NEWEST[0]}.{nn.NEWEST[1]} (set it in Motive)"
+        )
+
+    def _joined(self, server: nn.Server) -> socket.socket:
+        """Return a socket to which the frames of a multicast group come."""
+        line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            line.bind((server.group, server.data_port or nn.DATA_PORT))
+            member = socket.inet_aton(server.group) + socket.inet_aton(self._options.local)
+            line.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, member)
+        except BaseException:
+            line.close()
+            raise
+        return line
+
+    def _found(self) -> tuple[int, str]:
+        """Return streaming ID and name of the rigid body."""
+        content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
+        try:
+            names = nn.names(content, self._server.version)
+        except struct.error:
+            raise DeviceError(
+                f"{DEVICE} at {self.where}: its descriptions are not of NatNet "
+                f"{'.'.join(map(str, self._server.version))}"
+            ) from None
+        wanted = self._options.rigid_body
+        if wanted is None and len(names) == 1:
+            return next(iter(names.items()))
+        for number, name in names.items():
+            if wanted in (name, str(number)):
+                return number, name
+        listed = ", ".join(f'"{name}"' for name in names.values()) or "none is streamed"
+        what = "rigid_body is missing" if wanted is None else f'no rigid body "{wanted}"'
+        raise InputError(f"[tracker] options: {what}; valid: {listed}")
+
+    def _ask(self, request: bytes, answer: int) -> bytes:
+        """Ask until it is answered; the frames that come meanwhile are left out."""
+        for _ in range(TRIES):
+            self._send(request)
+            end = time.monotonic() + ANSWER_S
+            while (left := end - time.monotonic()) > 0.0:
+                content = self._receive(self._line, answer, left)
+                if content is not None:
+                    return content
+        raise TimeoutError
+
+    def _send(self, data: bytes) -> None:
+        self._line.setblocking(True)
+        self._line.send(data)
+
+    def _receive(self, line: socket.socket, wanted: int, seconds: float) -> bytes | None:
+        """Return the content of the next message where it is one that is wanted."""
+        line.settimeout(max(seconds, 1e-3))
+        try:
+            number, content = nn.opened(line.recv(nn.LARGEST))
+        except (TimeoutError, struct.error):
+            return None
+        return content if number == wanted else None
+
+
+def _drain(line: socket.socket) -> None:
+    """Throw away what has come."""
+    line.setblocking(False)
+    while True:
+        try:
+            line.recv(nn.LARGEST)
+        except BlockingIOError:
+            return
+
+
+def open_tracker(config: CellConfig) -> NatNetTracker:
+    """Connect to the server that [tracker] names.
+
+    Raises:
+        InputError: [tracker] lacks the host, has another frame, or an unknown option.
+        DeviceError: nobody answers there.
+    """
+    tracker = config.tracker
+    host, port = address("[tracker]", "natnet", tracker.host, nn.PORT)
+    if tracker.frame != "tracker":
+        raise InputError(
+            f'[tracker] frame = "{tracker.frame}": cameras give poses in their own axes; it must '
+            'be "tracker"'
+        )
+    options = check_section(tracker.options, Options, "[tracker] options")
+    if options.frames < 2:
+        raise InputError("[tracker] options: frames = 1; valid: 2 or more, which show the scatter")
+    return NatNetTracker(host, port, options)

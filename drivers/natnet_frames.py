@@ -1,0 +1,227 @@
+"""OptiTrack NatNet 3.0 to 4.2: messages, and the rigid bodies in them.
+
+A message is little-endian: number (uint16), bytes that follow (uint16), content. From 4.1 on each
+list in a frame or in the descriptions also tells its length in bytes.
+
+Source: OptiTrack, NatNet SDK 4.x (NatNetTypes.h and the depacketization samples).
+"""
+
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.types import Floats
+
+PORT, DATA_PORT = 1510, 1511
+GROUP = "239.255.42.99"
+CONNECT, SERVER_INFO, REQUEST, RESPONSE = 0, 1, 2, 3
+REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
+Version = tuple[int, int]
+OLDEST: Version = (3, 0)
+NEWEST: Version = (4, 2)
+SIZED: Version = (4, 1)
+"""From here on lists tell their length in bytes."""
+LARGEST = 1 << 16
+MARKER_SET, RIGID_BODY = 0, 1
+_HEAD = struct.Struct("<HH")
+_BODY = struct.Struct("<I3f4ffH")
+_SERVER = struct.Struct("<256s4B4B")
+_CONNECTION = struct.Struct("<QHB4B")
+
+
+def message(number: int, content: bytes = b"") -> bytes:
+    """Return a message."""
+    return _HEAD.pack(number, len(content)) + content
+
+
+def opened(data: bytes) -> tuple[int, bytes]:
+    """Return number and content of a message.
+
+    Raises:
+        struct.error: it is cut short.
+    """
+    number, size = _HEAD.unpack_from(data)
+    if len(data) < _HEAD.size + size:
+        raise struct.error("cut short")
+    return number, data[_HEAD.size :]
+
+
+def connect(version: Version) -> bytes:
+    """Return the request to connect that asks for frames of a version."""
+    content = bytearray(271)
+    content[:4] = b"Ping"
+    content[265:267] = bytes(version)
+    return message(CONNECT, bytes(content))
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """Who answered, and how it sends frames.
+
+    Attributes:
+        name: of the program.
+        program: its version.
+        version: of NatNet in which it sends frames.
+        data_port: where it sends frames to; 0 where it does not tell.
+        group: multicast address; empty where it sends to each client.
+    """
+
+    name: str
+    program: str
+    version: Version
+    data_port: int = 0
+    group: str = ""
+
+
+def server(content: bytes) -> Server:
+    """Return what the answer to a connection says.
+
+    Raises:
+        struct.error: it is cut short.
+    """
+    name, *numbers = _SERVER.unpack_from(content)
+    version = numbers[4], numbers[5]
+    known = Server(_text(name), ".".join(map(str, numbers[:4])), version)
+    if len(content) < _SERVER.size + _CONNECTION.size:
+        return known
+    _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
+    where = ".".join(map(str, group)) if multicast else ""
+    return Server(known.name, known.program, version, port, where)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """A rigid body in a frame.
+
+    Attributes:
+        number: its streaming ID.
+        position: (3,) of its pivot, m.
+        quaternion: (4,) scalar last.
+        error: mean distance of its markers from where they should be, m.
+        tracked: whether it was seen in this frame.
+    """
+
+    number: int
+    position: Floats
+    quaternion: Floats
+    error: float
+    tracked: bool
+
+
+class Reader:
+    """Reads a content from its beginning on."""
+
+    def __init__(self, content: bytes, version: Version) -> None:
+        """Begin."""
+        self.content, self.version, self.at = content, version, 0
+
+    def take(self, layout: struct.Struct) -> tuple[float, ...]:
+        """Return the next numbers.
+
+        Raises:
+            struct.error: it ends before.
+        """
+        values = layout.unpack_from(self.content, self.at)
+        self.at += layout.size
+        return values
+
+    def count(self) -> int:
+        """Return the next number.
+
+        Raises:
+            struct.error: it ends before.
+        """
+        return int(self.take(_COUNT)[0])
+
+    def listed(self) -> tuple[int, int]:
+        """Return how many elements a list has, and where it ends (0: it does not tell)."""
+        count = self.count()
+        size = self.count() if self.version >= SIZED else 0
+        return count, self.at + size if size else 0
+
+    def text(self) -> str:
+        """Return the next text.
+
+        Raises:
+            struct.error: it does not end.
+        """
+        end = self.content.find(b"\0", self.at)
+        if end < 0:
+            raise struct.error("a text without an end")
+        words = self.content[self.at : end].decode("utf-8", "replace")
+        self.at = end + 1
+        return words
+
+    def skip(self, size: int) -> None:
+        """Leave bytes out.
+
+        Raises:
+            struct.error: it ends before.
+        """
+        self.at += size
+        if not 0 <= self.at <= len(self.content):
+            raise struct.error("cut short")
+
+
+_COUNT = struct.Struct("<I")
+
+
+def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
+    """Return a frame's number and its rigid bodies.
+
+    Raises:
+        struct.error: it is cut short, or of another version.
+    """
+    r = Reader(content, version)
+    number = r.count()
+    sets, end = r.listed()
+    if end:
+        r.skip(end - r.at)
+    else:
+        for _ in range(sets):
+            r.text()
+            r.skip(12 * r.count())
+    others, _ = r.listed()
+    r.skip(12 * others)
+    bodies = []
+    for _ in range(r.listed()[0]):
+        known, *v = r.take(_BODY)
+        tracked = bool(int(v[8]) & 1)
+        bodies.append(Body(int(known), np.array(v[:3]), np.array(v[3:7]), v[7], tracked))
+    return number, bodies
+
+
+def names(content: bytes, version: Version) -> dict[int, str]:
+    """Return the names of the rigid bodies by their streaming IDs, from the descriptions.
+
+    Raises:
+        struct.error: they are cut short, or of another version.
+    """
+    r = Reader(content, version)
+    found: dict[int, str] = {}
+    for _ in range(r.count()):
+        kind = r.count()
+        end = r.count() + r.at if version >= SIZED else 0
+        if kind == RIGID_BODY:
+            name = r.text()
+            found[r.count()] = name
+            if not end:
+                r.skip(16)
+                markers = r.count()
+                r.skip(16 * markers)
+                for _ in range(markers if version >= (4, 0) else 0):
+                    r.text()
+        elif kind == MARKER_SET and not end:
+            r.text()
+            for _ in range(r.count()):
+                r.text()
+        elif not end:
+            break  # skeletons, plates, cameras: they come last, and tell no length
+        if end:
+            r.skip(end - r.at)
+    return found
+
+
+def _text(field: bytes) -> str:
+    return field.split(b"\0")[0].decode("utf-8", "replace")

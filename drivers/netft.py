@@ -1,0 +1,265 @@
+"""ATI Net F/T and Ethernet Axia: force and moment by UDP (Raw Data Transfer, RDT).
+
+A request is `>HHI`: 1234 hex, command (2: send at the sensor's rate, 0: stop), count (0: without
+end). Each datagram is a record `>3I6i`: number of the record, number of the measurement, status,
+force and moment in counts. Counts per unit, the units and the rate are on the sensor's page
+`netftapi2.xml`.
+
+Source: ATI Industrial Automation, Net F/T manual 9620-05-NET FT, sections 9 to 11 and 17; Ethernet
+Axia manual 9610-05, table 4.7.
+"""
+
+import contextlib
+import http.client
+import re
+import socket
+import struct
+import time
+
+import numpy as np
+from pydantic import Field
+
+from drivers.force_sensor import FIRST_FRAME_S, StreamingSensor, checked_config
+from drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from drivers.frame_losses import ByDeviceClock
+from drivers.frames import FrameFormat
+from drivers.network import address, network_failures
+from hilcal.config import CellConfig
+from hilcal.config.rig import Whole
+from hilcal.errors import DeviceError
+from hilcal.measuring.devices import ForceSensorDevice
+from hilcal.toml import Positive, Section, check_section
+from hilcal.types import Floats
+
+PORT = 49152
+RECORD = 36
+START, STOP = 2, 0
+AGAIN_S = 0.3
+"""Silence after which the sensor is told again to send: the request may be lost, it may restart."""
+_PAGE_S = 2.0
+_LARGEST = 1 << 16
+_BUFFER = 1 << 22
+ERROR, LATCHED, SATURATED = 1 << 31, 1 << 16, (1 << 17, 1 << 27 | 1 << 30)
+"""Bits of the status: any error; a threshold was passed once (none); gages over their range, of a
+Net F/T and of an Axia."""
+_LBF, _KGF, _INCH = 4.4482216152605, 9.80665, 0.0254
+_FORCE = {
+    **{"1": _LBF, "2": 1.0, "3": 1e3 * _LBF, "4": 1e3, "5": _KGF},
+    **{"lbf": _LBF, "n": 1.0, "klbf": 1e3 * _LBF, "kn": 1e3, "kg": _KGF, "kgf": _KGF},
+}
+_MOMENT = {
+    **{"1": _LBF * _INCH, "2": 12 * _LBF * _INCH, "3": 1.0, "4": 1e-3, "5": 0.01 * _KGF, "6": 1e3},
+    **{"lbfin": _LBF * _INCH, "lbfft": 12 * _LBF * _INCH, "nm": 1.0, "nmm": 1e-3, "knm": 1e3},
+    **{"kgcm": 0.01 * _KGF, "kgfcm": 0.01 * _KGF},
+}
+"""N and N·m per unit, by its name without hyphen, or its number on the page."""
+
+
+class Options(Section):
+    """[force_sensor.options]: keys of the driver "netft"."""
+
+    web_port: Whole = Field(80, description="the port of the sensor's page, 1 to 65535")
+    rate_hz: Positive | None = Field(
+        None,
+        description="records per second, over 0, where the sensor's page does not tell",
+        examples=[1000.0],
+    )
+
+
+class Datagrams:
+    """Records as they come, behind the names of a port and of a deframer (`force_stream`).
+
+    Attributes:
+        port: where the sensor is.
+        baudrate: 0, there is none.
+        frames: good records.
+        corrupt: datagrams of a wrong length.
+        skipped: 0.
+    """
+
+    baudrate = 0
+    skipped = 0
+
+    def __init__(self, host: str, port: int) -> None:
+        """Ask the sensor to send.
+
+        Raises:
+            DeviceError: there is no way to this address.
+        """
+        self.port = f"{host}:{port}"
+        self.frames = self.corrupt = 0
+        self._came = bytearray()
+        self._heard = time.monotonic()
+        with network_failures(DEVICE, self.port):
+            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            try:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER)
+                self._socket.connect((host, port))
+                self._socket.setblocking(False)
+                self._ask(START)
+            except BaseException:
+                self._socket.close()
+                raise
+
+    @property
+    def in_waiting(self) -> int:
+        """Bytes of the records that have come; asks again where none come."""
+        while True:
+            try:
+                data = self._socket.recv(_LARGEST)
+            except BlockingIOError:
+                break
+            except ConnectionRefusedError:  # nobody listens there yet, or no longer
+                break
+            self._heard = time.monotonic()
+            if data and len(data) % RECORD == 0:
+                self._came += data
+            else:
+                self.corrupt += 1
+        if time.monotonic() - self._heard > AGAIN_S:
+            self._heard = time.monotonic()
+            with contextlib.suppress(ConnectionRefusedError):
+                self._ask(START)
+        return len(self._came)
+
+    def read(self, size: int) -> bytes:
+        """Return the first bytes that have come."""
+        data = bytes(self._came[:size])
+        del self._came[:size]
+        return data
+
+    def push(self, data: bytes) -> list[bytes]:
+        """Return the records in whole ones."""
+        self.frames += len(data) // RECORD
+        return [data[at : at + RECORD] for at in range(0, len(data), RECORD)]
+
+    def close(self) -> None:
+        """Ask the sensor to be silent. Never raises, may be called twice."""
+        with contextlib.suppress(OSError):
+            self._ask(STOP)
+        self._socket.close()
+
+    def _ask(self, command: int) -> None:
+        self._socket.send(struct.pack(">HHI", 0x1234, command, 0))
+
+
+def _overload(wrench: Floats, status: int) -> str:
+    """The status in words; a threshold that was passed once (bit 16) does not make it wrong."""
+    if status in (0, LATCHED, ERROR | LATCHED) or not status & (ERROR | SATURATED[0]):
+        return ""  # an Axia also tells in other bits that it changes a setting
+    over = any(status & bits for bits in SATURATED)
+    hint = "is it loaded over its range?" if over else "see the status on its page"
+    return f"the sensor reports an error (status {status:#010x}); {hint}"
+
+
+def page(host: str, port: int) -> str:
+    """Return the sensor's page.
+
+    Raises:
+        DeviceError: nobody answers, or there is no such page.
+    """
+    where = f"{host}:{port}"
+    line = http.client.HTTPConnection(host, port, timeout=_PAGE_S)
+    with network_failures(DEVICE, where), contextlib.closing(line):
+        try:
+            line.request("GET", "/netftapi2.xml")
+            answer = line.getresponse()
+            words = answer.read(_LARGEST).decode("utf-8", "replace")
+        except http.client.HTTPException as error:
+            raise DeviceError(
+                f"{DEVICE} at {where}: what comes is no web page ({type(error).__name__}); is this "
+                "a Net F/T?"
+            ) from None
+    if answer.status != http.client.OK:
+        raise DeviceError(
+            f"{DEVICE} at {where}: it has no page netftapi2.xml (HTTP status {answer.status}); is "
+            "this a Net F/T?"
+        )
+    return words
+
+
+def _value(words: str, *names: str) -> str:
+    """Return the text of the first of the elements that there is, or nothing."""
+    for name in names:
+        match = re.search(rf"<{name}>\s*([^<]*?)\s*</{name}>", words)
+        if match:
+            return match[1]
+    return ""
+
+
+def _number(words: str, *names: str) -> float:
+    try:
+        number = float(_value(words, *names))
+    except ValueError:
+        return 0.0
+    return number if np.isfinite(number) and number > 0.0 else 0.0
+
+
+def sensor_format(words: str, options: Options, where: str) -> SensorFormat:
+    """Return what the sensor sends, by its page.
+
+    Raises:
+        DeviceError: counts, units or rate are missing or unknown.
+    """
+    counts = [_number(words, name) for name in ("cfgcpf", "cfgcpt")]
+    names = [_value(words, f"s{name}", name) for name in ("cfgfu", "cfgtu")]
+    units = [
+        known.get(name.lower().replace("-", ""), 0.0)
+        for name, known in zip(names, (_FORCE, _MOMENT), strict=True)
+    ]
+    if not all(counts) or not all(units):
+        raise DeviceError(
+            f"{DEVICE} at {where}: its page tells no counts per unit, or in units that are not "
+            f'known ("{names[0]}" and "{names[1]}"); set N and N-m there'
+        )
+    rate = options.rate_hz or _number(words, "comrdtrate")
+    if not rate:
+        raise DeviceError(
+            f"{DEVICE} at {where}: its page does not tell its rate; give [force_sensor.options] "
+            "rate_hz, records per second"
+        )
+    return SensorFormat(
+        name=_value(words, "prodname") or "ATI Net F/T",
+        frame=FrameFormat(b"", RECORD, lambda record: b""),
+        body=np.dtype(
+            [("ticks", ">u4"), ("number", ">u4"), ("status", ">u4"), ("wrench", ">i4", 6)]
+        ),
+        unit=np.repeat([units[0] / counts[0], units[1] / counts[1]], 3),
+        losses=lambda: ByDeviceClock(1.0 / rate, 32),
+        overload=_overload,
+    )
+
+
+def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
+    """Read the sensor's page, ask it to send, and wait for the first record.
+
+    Raises:
+        DeviceError: nobody answers, it is no Net F/T, or no record comes.
+        InputError: no [force_sensor], no host, or an unknown option.
+    """
+    section = checked_config(config, tuple(Options.model_fields))
+    options = check_section(section.options, Options, "[force_sensor] options")
+    host, port = address("[force_sensor]", "netft", section.host, PORT)
+    words = page(host, options.web_port)
+    sensor = sensor_format(words, options, f"{host}:{options.web_port}")
+    if _value(words, "comrdte").lower() in ("disabled", "0"):
+        raise DeviceError(
+            f"{DEVICE} at {host}: its RDT interface is disabled; enable it (page Communications)"
+        )
+    facts = [("calibration", _value(words, "cfgcalsn", "setserial"))]
+    moved = _value(words, "cfgtfx")
+    if moved.strip("0;. "):
+        units = f"{_value(words, 'scfgtdu')}, {_value(words, 'scfgtau')}"
+        facts.append(
+            ("tool transformation", f"{moved} ({units}): origin_m and rotvec_rad must include it")
+        )
+    line = Datagrams(host, port)
+    stream = ForceStream(line, sensor, line, network_failures)
+    try:
+        stream.wait_for_first(FIRST_FRAME_S)
+    except BaseException:
+        stream.stop()
+        line.close()
+        raise
+    known = tuple((what, told) for what, told in facts if told)
+    return StreamingSensor(line, stream, sensor.name, known)

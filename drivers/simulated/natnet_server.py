@@ -1,0 +1,268 @@
+"""Simulated OptiTrack cameras: NatNet on UDP; admin `tracker.sock`.
+
+    python -m drivers.simulated.natnet_server --directory DIR --host 127.A.B.C [--port 1510]
+        [--version 4.1] [--multicast GROUP] [--frame-std M] [--distortion M] --seed N
+
+Its errors are those of a camera system: a frame scatters by `--frame-std`, and waves of the
+amplitude `--distortion` and a length of 0.4 m distort the volume, the same in all frames of a pose.
+Orientations err by the same, on 0.1 m.
+
+Admin operations: `beam {on}` hides the rigid body, `stall {on}` sends no frames, `pause {on}` the
+same one again and again, `lose {share}` of the frames, `forget` all clients, `rename {name}`,
+`bodies {count}` others beside it, `insist {on}` on its version when a client connects, `state`.
+
+Source: as `drivers.natnet_frames`. natnet, a client of others, is tested against it.
+"""
+
+import contextlib
+import select
+import socket
+import struct
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from drivers.natnet_frames import (
+    CONNECT,
+    DATA_PORT,
+    DESCRIPTIONS,
+    FRAME,
+    KEEP_ALIVE,
+    REQUEST,
+    REQUEST_DESCRIPTIONS,
+    RESPONSE,
+    SERVER_INFO,
+    SIZED,
+    Version,
+    message,
+    opened,
+)
+from drivers.simulated import admin
+from drivers.simulated.blackboard import Blackboard, settled_truth
+from hilcal.types import Floats
+
+NAME, BODY = "SIM Motive", 7
+RATE_HZ, FASTEST_HZ = 120.0, 240.0
+"""Frames per second of world time, and the most per second of real time."""
+WAVE_M, ARM_M = 0.4, 0.1
+FORGOTTEN_S = 10.0
+_COUNT = struct.Struct("<I")
+
+
+@dataclass(slots=True, eq=False)
+class Cameras:
+    """What the cameras see and whom they tell.
+
+    Attributes:
+        board: the one physical world.
+        rng: generator.
+        line: UDP socket of commands.
+        version: of NatNet that it can.
+        frame_std: of a frame, m.
+        waves: (6, 4) per coordinate and turn: direction and phase of the distortion.
+        distortion: its amplitude, m.
+        group: multicast group; empty for none.
+        clients: version and when it was heard of last, by address.
+        name: of the rigid body.
+        others: rigid bodies beside it.
+        number: of the last frame.
+        hidden: whether the rigid body is not seen.
+        stalled: whether no frames are sent.
+        paused: whether the same frame is sent again and again.
+        lose: share of frames that are lost.
+        insist: whether the version that a client asks for when it connects is not heard.
+        seen: the pose in the last frame.
+    """
+
+    board: Blackboard
+    rng: np.random.Generator
+    line: socket.socket
+    version: Version
+    frame_std: float
+    waves: Floats
+    distortion: float
+    group: str = ""
+    clients: dict[tuple[str, int], tuple[Version, float]] = field(default_factory=dict)
+    name: str = "tool"
+    others: int = 0
+    number: int = 0
+    hidden: bool = False
+    stalled: bool = False
+    paused: bool = False
+    lose: float = 0.0
+    insist: bool = False
+    seen: tuple[Floats, Floats] | None = None
+
+    def pose(self) -> tuple[Floats, Floats]:
+        """Return position (m) and quaternion (scalar last) in a new frame."""
+        if self.paused and self.seen is not None:
+            return self.seen
+        truth = settled_truth(self.board)
+        at, rotation = truth["target"], truth["target_rotation"]
+        wave = self.distortion * np.sin(
+            2 * np.pi / WAVE_M * self.waves[:, :3] @ at + self.waves[:, 3]
+        )
+        off = wave + self.frame_std * self.rng.standard_normal(6)
+        proper = np.linalg.det(rotation) > 0.5  # the world has begun
+        turn = Rotation.from_matrix(rotation if proper else np.eye(3))
+        turned = Rotation.from_rotvec(off[3:] / ARM_M) * turn
+        self.seen = at + off[:3], turned.as_quat()
+        return self.seen
+
+    def frame(self, version: Version) -> bytes:
+        """Return the content of a frame."""
+        at, turn = self.pose()
+        own = struct.pack("<I3f4ffH", BODY, *at, *turn, 2e-4, 0 if self.hidden else 1)
+        bodies = own + b"".join(
+            struct.pack("<I3f4ffH", BODY + 1 + k, k, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1e-4, 1)
+            for k in range(self.others)
+        )
+        markers = b"all\0" + struct.pack("<I6f", 2, *range(6))
+        lists = [(1, markers), (1, struct.pack("<3f", 9, 9, 9)), (1 + self.others, bodies)]
+        lists += [(0, b"")] * (2 if version >= SIZED else 1)  # skeletons, assets
+        lists += [(1, struct.pack("<I3ffHf", 1, 0, 0, 0, 0.01, 2, 1e-4)), (0, b""), (0, b"")]
+        out = _COUNT.pack(self.number)
+        for count, content in lists:
+            out += _COUNT.pack(count)
+            out += (_COUNT.pack(len(content)) if version >= SIZED else b"") + content
+        suffix = struct.pack("<IId3Q", 0, 0, self.board.time, 0, 0, 0)
+        precise = struct.pack("<II", 0, 0) if version >= (4, 0) else b""
+        return out + suffix + precise + struct.pack("<HI", 0, 0)
+
+    def descriptions(self, version: Version) -> bytes:
+        """Return the content of the descriptions: a marker set, then the rigid bodies."""
+        parts = [(0, b"all\0" + _COUNT.pack(2) + b"a\0b\0")]
+        names = {BODY: self.name} | {BODY + 1 + k: f"other {k}" for k in range(self.others)}
+        for number, name in names.items():
+            content = name.encode() + b"\0" + struct.pack("<Ii3f", number, -1, 0, 0, 0)
+            content += struct.pack("<4f", 0, 0, 0, 1) if version >= (4, 2) else b""
+            content += struct.pack("<I6f2I", 2, *range(6), 0, 0)
+            content += b"m1\0m2\0" if version >= (4, 0) else b""
+            parts.append((1, content))
+        if version < SIZED:  # something that comes after the rigid bodies
+            parts.append((5, b"camera\0" + struct.pack("<7f", *range(7))))
+        out = _COUNT.pack(len(parts))
+        for kind, content in parts:
+            size = _COUNT.pack(len(content)) if version >= SIZED else b""
+            out += _COUNT.pack(kind) + size + content
+        return out
+
+    def step(self, wait: float) -> None:
+        """Serve a request, if one comes within so many seconds."""
+        if not select.select([self.line], [], [], max(wait, 0.0))[0]:
+            return
+        data, sender = self.line.recvfrom(1 << 16)
+        with contextlib.suppress(struct.error):
+            self._serve(*opened(data), sender)
+
+    def _serve(self, number: int, content: bytes, sender: tuple[str, int]) -> None:
+        version, _ = self.clients.get(sender, (self.version, 0.0))
+        if number == CONNECT:
+            wanted = (content[265], content[266]) if len(content) > 266 else self.version
+            version = self.version
+            if version >= (4, 0) and not self.group and not self.insist:
+                version = min(wanted, version)
+            name = NAME.encode().ljust(256, b"\0")
+            group = bytes(map(int, self.group.split("."))) if self.group else bytes(4)
+            told = struct.pack("<4B4B", 3, 1, 0, 0, *version, 0, 0)
+            told += struct.pack("<QHB4B", 10_000_000, DATA_PORT, bool(self.group), *group)
+            self._answer(sender, message(SERVER_INFO, name + told))
+        elif number == REQUEST_DESCRIPTIONS:
+            self._answer(sender, message(DESCRIPTIONS, self.descriptions(version)))
+        elif number == REQUEST:
+            words = content.split(b"\0")[0].decode("ascii", "replace")
+            asked = words.removeprefix("Bitstream,").split(".")
+            good = words.startswith("Bitstream,") and self.version >= (4, 0) and not self.group
+            if good:
+                version = int(asked[0]), int(asked[1])
+            self._answer(sender, message(RESPONSE, struct.pack("<i", 0 if good else 1)))
+        elif number != KEEP_ALIVE or sender not in self.clients:
+            return
+        self.clients[sender] = version, time.monotonic()
+
+    def _answer(self, sender: tuple[str, int], data: bytes) -> None:
+        with contextlib.suppress(OSError):
+            self.line.sendto(data, sender)
+
+    def send(self) -> None:
+        """Send a frame to all clients, or to the group."""
+        self.number += not self.paused
+        if self.stalled or self.rng.random() < self.lose:
+            return
+        if self.group:
+            self._answer((self.group, DATA_PORT), message(FRAME, self.frame(self.version)))
+            return
+        now = time.monotonic()
+        self.clients = {
+            who: (v, heard) for who, (v, heard) in self.clients.items() if now - heard < FORGOTTEN_S
+        }
+        for who, (version, _) in self.clients.items():
+            self._answer(who, message(FRAME, self.frame(version)))
+
+
+def operations(cameras: Cameras) -> admin.Operations:
+    """Return what can be asked of the cameras."""
+
+    def put(name: str) -> Callable[..., None]:
+        return lambda on: setattr(cameras, name, bool(on))
+
+    def state() -> dict[str, Any]:
+        versions = [list(version) for version, _ in cameras.clients.values()]
+        return {"frames": cameras.number, "clients": versions, "hidden": cameras.hidden}
+
+    own: dict[str, Callable[..., object]] = {
+        "beam": put("hidden"),
+        "stall": put("stalled"),
+        "pause": put("paused"),
+        "insist": put("insist"),
+        "lose": lambda share: setattr(cameras, "lose", float(share)),
+        "forget": lambda: cameras.clients.clear(),
+        "rename": lambda name: setattr(cameras, "name", str(name)),
+        "bodies": lambda count: setattr(cameras, "others", int(count)),
+    }
+    return admin.Operations(own, state)
+
+
+def main() -> None:
+    """Run until the parent ends."""
+    parser = admin.device_parser(__doc__)
+    parser.add_argument("--host", required=True)
+    parser.add_argument("--port", type=int, default=1510)
+    parser.add_argument("--version", default="4.1")
+    parser.add_argument("--multicast", default="")
+    parser.add_argument("--frame-std", type=float, default=5e-5)
+    parser.add_argument("--distortion", type=float, default=1e-4)
+    options = parser.parse_args()
+    admin.end_with_parent()
+    seeing, drawn = np.random.default_rng(options.seed).spawn(2)
+    board = Blackboard.attach(options.directory / "world.bin")
+    line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    line.bind((options.host, options.port))
+    if options.multicast:
+        here = socket.inet_aton(options.host)
+        line.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, here)
+    direction = drawn.standard_normal((6, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    waves = np.column_stack([direction, drawn.uniform(0.0, 2 * np.pi, 6)])
+    major, minor = map(int, options.version.split("."))
+    cameras = Cameras(
+        *(board, seeing, line, (major, minor), options.frame_std, waves, options.distortion),
+        options.multicast,
+    )
+    admin.serve(options.directory / "tracker.sock", operations(cameras))
+    period = 1.0 / min(RATE_HZ * board.scale, FASTEST_HZ)
+    due = time.monotonic()
+    while True:
+        cameras.step(due - time.monotonic())
+        now = time.monotonic()
+        if now >= due:
+            cameras.send()
+            due = max(due + period, now)
+
+
+if __name__ == "__main__":
+    main()
