@@ -60,7 +60,8 @@ def urdf_of(maker: str, limit: float = 2.9, wrist: float = 5.9) -> str:
             f"<limit lower='{-far}' upper='{far}' effort='100' velocity='3'/></joint>"
         )
     out.append(
-        f"<joint name='flange' type='fixed'>{tip}<parent link='link_6'/><child link='tool0'/></joint>"
+        f"<joint name='flange' type='fixed'>{tip}<parent link='link_6'/><child link='tool0'/>"
+        "</joint>"
     )
     return "\n".join([*out, "</robot>"])
 

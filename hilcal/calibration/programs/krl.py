@@ -213,7 +213,7 @@ class _State:
         )
 
 
-_NOT_SET = "the program does not set {} before it"
+_NOT_SET = "the program does not set {} before it in the same subprogram"
 
 
 @dataclass(slots=True, eq=False)
@@ -250,10 +250,10 @@ class _Reader:
             elif word in _CLOSES and blocks:
                 block = blocks.pop()
                 if not all(s.same(self.state) for s in (*block.ends, block.begin)):
-                    self._forget(f"the block that ends in line {line} sets it on some ways only")
+                    self._forget(f"the block that ends in line {line} sets them on some ways only")
             elif word in _OPENS:
                 if word in _LOOPS and _sets(lines[k + 1 :]):
-                    self._forget(f"the loop of line {line} sets it later")
+                    self._forget(f"the loop of line {line} sets them later")
                 blocks.append(_Block(self.state))
             elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
                 self._forget(f"line {line} is a label, which may be reached from elsewhere")
@@ -263,7 +263,8 @@ class _Reader:
             raise InputError(f"{self.files[0]}: no motions; valid: PTP, LIN, CIRC and their S…")
         return tuple(self.found.values())
 
-    def _forget(self, why: str) -> None:
+    def _forget(self, because: str) -> None:
+        why = f"its tool and base are not known: {because}"
         self.state = _State(why, why)
 
     def _statement(self, line: int, at: int, code: str, used: Mapping[str, int]) -> None:
@@ -281,14 +282,14 @@ class _Reader:
             elif what in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
                 self._of_form(self.form, line)
             elif what == "INITMOV":
-                self._forget(f"BAS(#INITMOV) of line {line} sets it to what $config.dat has")
+                self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
         elif m := _FORBIDDEN.search(code):
             raise InputError(
                 f"{self.files[0]}: line {line}: '{m[0].strip()}' changes what points mean; valid: "
                 "$TOOL and $BASE as a whole, a tool on the flange"
             )
         elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
-            self._forget(f"{m[1][:40]} of line {line} may set it")
+            self._forget(f"{m[1][:40]} of line {line} may set them")
 
     def _of_form(self, name: str | None, line: int, only: str = "") -> None:
         """Set tool and base of an inline form."""
