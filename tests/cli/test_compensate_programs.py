@@ -1,0 +1,137 @@
+"""A lab with a KUKA and a measured table: from the table to corrected KRL points.
+
+The arm that was measured has links that are some tenths of a millimetre and milliradian off. Its
+corrected program, as other eyes read it, is executed as a controller does: by the nominal arm's
+inverse kinematics, which the arm that was measured then follows.
+"""
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilcal.calibration.points import solutions
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+from tests.support.cli_cases import ok, refused
+from tests.support.maker_arms import maker_arm
+
+EXAMPLES = Path(__file__).parents[1] / "unit" / "calibration" / "programs" / "examples"
+TOOL = np.array([0.1205, -0.0032, 0.21])  # the reflector at the tool's centre point
+POSES = 60
+CELL = """[robot]
+model = "krl.urdf"
+[tool]
+target_m = [0.1205, -0.0032, 0.21]
+load_point_m = [0.0, 0.0, 0.1]
+mass_kg = 0.0
+com_m = [0.0, 0.0, 0.0]
+[tracker]
+frame = "base"
+range_std_m = 1e-5
+transverse_std_m = 1e-5
+"""
+
+
+def flanges(arm: Arm, q: Floats) -> Floats:
+    chain = evaluate(arm, q)
+    return se3.matrix(chain.rotation[-1], chain.position[-1])
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
+    """The table, the nominal arm, and the arm as it is."""
+    folder, rng = tmp_path_factory.mktemp("lab"), np.random.default_rng(3)
+    nominal = maker_arm("krl", folder)
+    off = se3.matrix(*se3.exp(3e-4 * rng.standard_normal((7, 6))))
+    off[[0, -1]] = np.eye(4)
+    true = replace(nominal, links=nominal.links @ off)
+    low, high = (
+        np.radians([-60, -110, 60, -180, -80, -210]),
+        np.radians([60, -30, 120, 60, 80, 170]),
+    )
+    q = low + rng.random((POSES, 6)) * (high - low)
+    seen = flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
+    at = seen[:, :3, 3] + 1e-5 * rng.standard_normal((POSES, 3))
+    lines = ["Punkt;A1;A2;A3;A4;A5;A6;X [mm];Y [mm];Z [mm]"]
+    for k in range(POSES):
+        numbers = [f"{v:.5f}" for v in (*np.degrees(q[k]), *(1e3 * at[k]))]
+        lines.append(";".join([f"P{k}", *numbers]).replace(".", ","))
+    (folder / "faro.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    (folder / "CELL.toml").write_text(CELL, encoding="utf-8")
+    return folder, nominal, true
+
+
+def test_from_a_table_to_corrected_krl_points(
+    lab: tuple[Path, Arm, Arm], capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, nominal, true = lab
+    run, cell = folder / "run.hilcal", folder / "CELL.toml"
+    ok(
+        capsys,
+        "import",
+        folder / "faro.csv",
+        "--config",
+        cell,
+        "--preview",
+        "-o",
+        folder / "m.toml",
+    )
+    ok(
+        capsys,
+        *("import", folder / "faro.csv", "--config", cell, "--format", folder / "m.toml"),
+        *("-o", run),
+    )
+    ok(capsys, "identify", run, "--effects", "link_geometry")
+    out = folder / "corrected"
+    out.mkdir()
+    frames = ("--frames", EXAMPLES / "config.dat")
+    said = refused(capsys, 2, "compensate", run, EXAMPLES / "weld.src", "-o", out / "weld.src")
+    assert "TOOL_DATA[1] is not in the program; give it by --frames" in said
+    assert not list(out.iterdir())
+    told = ok(
+        capsys,
+        *("compensate", run, EXAMPLES / "weld.src", *frames, "-o", out / "weld.src", "--json"),
+    ).document
+    assert [w["done"] for w in told["waypoints"]] == ["corrected"] * 7
+    assert sorted(p.name for p in out.iterdir()) == ["weld.dat", "weld.src"]
+    again = ("compensate", run, EXAMPLES / "weld.src", *frames, "-o", out / "weld.src")
+    assert "--force" in refused(capsys, 2, *again)
+    base, tool = pose([800, -200, 150, 30, 0, 0]), pose([120.5, -3.2, 210, 10, 20, -30])
+    before, after = points(EXAMPLES / "weld.dat"), points(out / "weld.dat")
+    errors = []
+    for name, frame in (("XP1", base), ("XP2", base), ("XP3", np.eye(4))):
+        asked, commanded = frame @ before[name], frame @ after[name]
+        near = next(np.array(p["q_command"]) for p in told["points"] if p["name"].startswith(name))
+        reached = [
+            flanges(true, solutions(nominal, tool, near[None], goal))[0] @ tool
+            for goal in (asked, commanded)
+        ]
+        errors.append([np.linalg.norm((r - asked)[:3, 3]) for r in reached])
+    was, now = np.array(errors).T
+    bands = [p["band_m"] for p in told["points"][:3]]
+    assert was.min() > 3e-4
+    assert np.all(now < bands)
+    assert now.max() < 0.1 * was.min()
+    text = (out / "weld.src").read_bytes().decode("latin-1")
+    assert "; geprüft:" in text
+    assert text.count("\r\n") == (EXAMPLES / "weld.src").read_bytes().count(b"\r\n")
+
+
+def pose(values: list[float]) -> Floats:
+    turn = Rotation.from_euler("ZYX", values[3:], degrees=True).as_matrix()
+    return se3.matrix(turn, 1e-3 * np.array(values[:3]))
+
+
+def points(path: Path) -> dict[str, Floats]:
+    """Points of a .dat file, as other eyes have them."""
+    text = path.read_bytes().decode("latin-1")
+    found = re.findall(
+        r"E6POS (\w+)=\{X (\S+?),Y (\S+?),Z (\S+?),A (\S+?),B (\S+?),C (\S+?),", text
+    )
+    return {name: pose([float(v) for v in values]) for name, *values in found}
