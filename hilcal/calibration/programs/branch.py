@@ -208,7 +208,8 @@ def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: I
 
 def _agree(arm: Arm, language: Language, q: Floats, stated: Ints) -> Bools:
     """(K, F) which flags joint values (K, 6) have, those of a border on both of its sides."""
-    near = (flags_of(arm, language, q + d) for d in (0.0, -BORDER, BORDER))
+    formed = shape(arm, q)
+    near = (language.flags(q + d, formed) for d in (0.0, -BORDER, BORDER))
     return np.asarray(np.any([have == stated for have in near], axis=0))
 
 

@@ -35,7 +35,7 @@ from hilcal.calibration.programs.program import (
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
 
-_NUMBER = r"\s*[-+]?(?:\d+\.?\d*|\.\d+)"
+_NUMBER = r"[ \t]*[-+]?(?:\d+\.?\d*|\.\d+)"
 _POSITION = re.compile(r'P\s*\[\s*(\d+)\s*(?::\s*"[^"]*"\s*)?\]\s*\{(.*?)\}\s*;', re.DOTALL)
 _GROUP = re.compile(r"GP1\s*:(.*?)(?=GP\d\s*:|\Z)", re.DOTALL)
 _FIELD = re.compile(rf"\b([XYZWPR]|[JE]\d)\s*=({_NUMBER})\s*(mm|deg)")

@@ -454,6 +454,10 @@ class _Reader:
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements use which are no motions to them, with their lines."""
         out: dict[str, int] = {}
+        keys: dict[str, list[str]] = {}
+        for key in self.data:
+            for name in {key, key.partition("[")[0]}:
+                keys.setdefault(name, []).append(key)
         for line, _, code in lines:
             if m := _MOTION.match(code):
                 targets = [t.strip() for _, t in _arguments(code[m.end() :])]
@@ -462,9 +466,8 @@ class _Reader:
             else:
                 texts = [] if _DATA.match(code) or _INERT.match(code) else [code]
             for name in (_key(n) for text in texts for n in _NAME.findall(text)):
-                for key in (name, *(k for k in self.data if k.startswith(f"{name}["))):
-                    if key in self.data:
-                        out.setdefault(key, line)
+                for key in keys.get(name, ()):
+                    out.setdefault(key, line)
         return out
 
 

@@ -14,6 +14,7 @@ from hilcal.calibration.programs.krl import read_krl
 from hilcal.calibration.programs.program import UNSTATED, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
 from hilcal.errors import InputError
+from hilcal.names import escaped
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
@@ -96,7 +97,15 @@ def understood(
     Raises:
         InputError: it cannot be read, or a point is not understood; names the line.
     """
-    program = READERS[path.suffix.lower()](path, frames, tool)
+    try:
+        program = READERS[path.suffix.lower()](path, frames, tool)
+    except InputError as error:
+        raise InputError(escaped(str(error))) from None
+    points = tuple(
+        p if np.isfinite(p.values).all() else replace(p, left="numbers that are too large")
+        for p in program.points
+    )
+    program = replace(program, points=points)
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
     longest, more = longest_tool(program.understood)
@@ -112,4 +121,5 @@ def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
         p = left[0]
         where = p.name if "line" in p.name else f"{p.name}, line {p.line}"
         rest = f"; and {len(left) - 1} more" if len(left) > 1 else ""
-        raise InputError(f"{path}: {where}: {p.left}{rest}; --leave keeps such points as they are")
+        said = escaped(f"{where}: {p.left}{rest}")
+        raise InputError(f"{path}: {said}; --leave keeps such points as they are")

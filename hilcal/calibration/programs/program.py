@@ -9,8 +9,11 @@ with, has the corrected joint values:
     T_frame_tool = T_base_frame⁻¹ T_base_flange(q) T_flange_tool
 """
 
+import re
+from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -242,7 +245,13 @@ def read_text(path: Path) -> tuple[str, str]:
 
 def line_of(text: str, at: int) -> int:
     """Line of a place in a text, from 1."""
-    return text.count("\n", 0, at) + 1
+    return bisect_left(_ends(text), at) + 1
+
+
+@lru_cache(maxsize=4)
+def _ends(text: str) -> list[int]:
+    """Where the lines of a text end."""
+    return [m.start() for m in re.finditer("\n", text)]
 
 
 class _FramesFile(Section):

@@ -61,6 +61,8 @@ _REFUSED = re.compile(
     re.IGNORECASE,
 )
 _CONF = re.compile(r"\b(ConfJ|ConfL)\s*\\\s*(On|Off)\b", re.IGNORECASE)
+_ASSIGNED = re.compile(r"\b([A-Za-z]\w*)(?:\.\w+|\{[^}]*\})*\s*:=")
+_NO_ASSIGNMENT = re.compile(r"(\b(CONST|PERS|VAR)\s[^;]*|\\\s*)$", re.IGNORECASE)
 _MADE = re.compile(r"^(Offs|RelTool)\s*\((.*)\)$", re.IGNORECASE | re.DOTALL)
 _NAME = re.compile(r"[A-Za-z]\w*")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -176,6 +178,7 @@ class _Reader:
             self._collect(at, code, self.data)
         for at, code in _statements(more):
             self._collect(at, code, self.frames)
+        self.assigned = dict(self._assignments())
         self.found: dict[str, ProgramPoint] = {}
 
     def _collect(self, at: int, code: str, into: dict[str, list[tuple[str, str, int]]]) -> None:
@@ -186,6 +189,13 @@ class _Reader:
                 place = at + m.start() + (d.start(4) if d[4] is not None else 0)
                 into.setdefault(d[2].upper(), []).append((d[1].lower(), value, place))
                 return
+
+    def _assignments(self) -> Iterator[tuple[str, int]]:
+        """Yield names that get another value, wholly or in part, with the line."""
+        for at, code in self.statements:
+            for m in _ASSIGNED.finditer(code):
+                if not _NO_ASSIGNMENT.search(code[: m.start()]):
+                    yield m[1].upper(), line_of(self.text, at + m.start())
 
     def points(self) -> tuple[ProgramPoint, ...]:
         """All points; raises as `read_rapid` does."""
@@ -252,8 +262,8 @@ class _Reader:
                 f"the {what} '{name[:40]}' is not in the module; give it by --frames (a module "
                 f"with its {kind}, or TOML){other}"
             )
-        if self._assigned(name):
-            return f"line {self._assigned(name)} changes the {what} '{name[:40]}'"
+        if key in self.assigned:
+            return f"line {self.assigned[key]} changes the {what} '{name[:40]}'"
         text = values[0][1]
         numbers = np.array([n.value for n in _numbers(text, 0)])
         start = re.sub(r"\s", "", text).upper()
@@ -264,15 +274,6 @@ class _Reader:
         if not start.startswith("[FALSE,TRUE,") or len(numbers) != 2 * POSE:
             return f"the work object '{name[:40]}' is not fixed, or not of numbers"
         return of_quaternion(numbers[:POSE]) @ of_quaternion(numbers[POSE:])
-
-    def _assigned(self, name: str) -> int:
-        """Line in which a name, or a part of it, gets another value; 0 where none does."""
-        change = re.compile(rf"\b{re.escape(name)}\b(?:\.\w+|\{{[^}}]*\}})*\s*:=", re.IGNORECASE)
-        for at, code in self.statements:
-            m = change.search(code)
-            if m and not re.search(r"(\b(CONST|PERS|VAR)\s[^;]*|\\\s*)$", code[: m.start()], re.I):
-                return line_of(self.text, at + m.start())
-        return 0
 
     def _target(
         self,
@@ -350,10 +351,12 @@ class _Reader:
         bare = ProgramPoint(line, f"line {line}")
         base, *moves = [part.strip() for _, part in _split(re.sub(r"\\", ",\\\\", made[2]))]
         values = self.data.get(base.upper(), [])
-        plain = all(
-            re.fullmatch(rf"(\\\s*R[xyz]\s*:=\s*)?{_NUMBER.pattern}", m, re.I) for m in moves if m
+        turn = rf"\\\s*R[xyz]\s*:=\s*{_NUMBER.pattern}" if made[1].upper() == "RELTOOL" else "-"
+        shift = [m for m in moves if _NUMBER.fullmatch(m)]
+        plain = len(shift) == 3 and all(
+            re.fullmatch(turn, m, re.I) for m in moves if m and m not in shift
         )
-        if len(values) != 1 or not values[0][1] or not plain or self._assigned(base):
+        if len(values) != 1 or not values[0][1] or not plain or base.upper() in self.assigned:
             return replace(bare, left=f"the point '{text[:40]}' is computed while the program runs")
         point = self._value(values[0][1], values[0][2], f"line {line}", False)
         if point.left:

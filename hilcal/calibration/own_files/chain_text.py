@@ -1,0 +1,192 @@
+"""A chain as somebody's description file draws it, and the same chain with a corrected arm.
+
+A file has steps from its base link to its tip link: a place, and behind it a joint or none. Its
+frames are not those of the arm (a mesh wants its own), but where it is the same arm, they lie on
+the same axes: with M_k the links of the nominal arm, C_k of the corrected one, N_k of the file, all
+with the joints' axes along z,
+
+    N_k = G_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·) for k = 0 … n − 1,   N'_k = G_{k−1}⁻¹ C_k G_k
+
+with G_{−1} from the base of the arm to that of the file, the identity or half a turn about z (as
+between `base` and `base_link` of a UR arm), and G_n from the flange to the tip. Each N'_k is made
+by one place: that of its joint, behind the last joint that of the first step there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.calibration.programs.program import Span
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.numbers import length
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.conventions import as_drawn
+from hilcal.types import Floats
+
+SAME = 1e-6
+"""m, rad; frames that differ by less are the same: descriptions are written with six decimals."""
+LEFT = 1e-9
+"""m, rad; a place that moves less is left as it is."""
+Edits = list[tuple[Span, str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One place of a chain.
+
+    Attributes:
+        name: of the element, for people.
+        line: of it, from 1.
+        place: (4, 4) in the frame before it.
+        joint: (4, 4) where the axis is behind it, z along the axis; None where nothing turns.
+        write: edits that give it another place; raises `InputError` where it cannot have one.
+    """
+
+    name: str
+    line: int
+    place: Floats
+    joint: Floats | None
+    write: Callable[[Floats], Edits]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Redrawn:
+    """A chain with a corrected arm.
+
+    Attributes:
+        places: (4, 4) the new place of each step.
+        tip: (4, 4) from the flange of the arm to the tip of the file.
+        lost: (4, 4) what the file has no place for, behind its last joint.
+    """
+
+    places: tuple[Floats, ...]
+    tip: Floats
+    lost: Floats
+
+
+def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn:
+    """Return the places that a corrected arm has in a file.
+
+    Args:
+        steps: of the file, base to tip.
+        nominal: the arm that the campaign began with.
+        arm: the corrected one.
+        file: its name, for messages.
+
+    Raises:
+        InputError: the file is of another arm; says which axis lies elsewhere.
+    """
+    turning = [k for k, s in enumerate(steps) if s.joint is not None]
+    if len(turning) != arm.n:
+        names = ", ".join(escaped(steps[k].name) for k in turning)
+        raise InputError(
+            f"{file}: {len(turning)} joints from base to tip ({names}), {nominal.name} has "
+            f"{arm.n}; valid: --base-link and --tip-link that are the ends of the arm"
+        )
+    old, new = as_drawn(nominal).links, as_drawn(arm).links
+    drawn, before, after = [], [], []
+    last, joint = 0, np.eye(4)
+    for k in (*turning, len(steps)):
+        end = steps[k].joint if k < len(steps) else np.eye(4)
+        fixed = _product([s.place for s in steps[last:k]])
+        own = steps[k].place if k < len(steps) else np.eye(4)
+        assert end is not None  # noqa: S101 - `turning` has joints alone
+        drawn.append(se3.inverse(joint) @ fixed @ own @ end)
+        before.append((joint, fixed))
+        after.append(end)
+        last, joint = k + 1, end
+    frames = _frames(steps, turning, old, drawn, file, nominal.name)
+    places = [s.place for s in steps]
+    lost = np.eye(4)
+    for k, (joint, fixed) in enumerate(before):
+        wanted = se3.inverse(frames[k]) @ new[k] @ frames[k + 1]
+        if k < len(turning):
+            places[turning[k]] = se3.inverse(fixed) @ joint @ wanted @ se3.inverse(after[k])
+        elif len(steps) > turning[-1] + 1:
+            rest = _product([s.place for s in steps[turning[-1] + 2 :]])
+            places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
+        else:
+            lost = joint @ wanted
+    return Redrawn(tuple(places), frames[-1], lost)
+
+
+def _frames(
+    steps: Sequence[Step],
+    turning: Sequence[int],
+    old: Floats,
+    drawn: Sequence[Floats],
+    file: str,
+    name: str,
+) -> list[Floats]:
+    """G_{−1} … G_n; raises as `redrawn` does."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    found: list[list[Floats]] = []
+    misses: list[tuple[int, float, float]] = []
+    for base in (np.eye(4), half):
+        frames, missed = [base], None
+        for k in range(len(turning)):
+            g = se3.inverse(old[k]) @ frames[-1] @ drawn[k]
+            away = float(np.hypot(*g[:2, 3]))
+            tilt = float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
+            if max(away, tilt) > SAME:
+                missed = (k, away, tilt)
+                break
+            frames.append(g)
+        if missed is None:
+            found.append([*frames, se3.inverse(old[-1]) @ frames[-1] @ drawn[-1]])
+        else:
+            misses.append(missed)
+    if not found:
+        k, away, tilt = max(misses)
+        step = steps[turning[k]]
+        raise InputError(
+            f"{file}: line {step.line}: the axis of {escaped(step.name)} lies {length(away)} and "
+            f"{np.degrees(tilt):.3g}° from that of joint {k + 1} of {name}; valid: a description "
+            "of the arm that was measured, before any correction, from the link of its base on "
+            "(--base-link)"
+        )
+    return found[0]
+
+
+def edits_of(steps: Sequence[Step], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
+    """Edits of all steps that move, and the names of these.
+
+    Raises:
+        InputError: a place cannot be written; names the line.
+    """
+    out: Edits = []
+    names = []
+    for step, place in zip(steps, places, strict=True):
+        if moved(step.place, place) > LEFT:
+            out += step.write(place)
+            names.append(step.name)
+    return out, names
+
+
+def moved(a: Floats, b: Floats) -> float:
+    """By how much places differ, m or rad, whichever is more."""
+    turn = se3.rotation_vector(a[:3, :3].T @ b[:3, :3])
+    return float(max(np.linalg.norm(a[:3, 3] - b[:3, 3]), np.linalg.norm(turn)))
+
+
+def z_to(axis: Floats) -> Floats:
+    """(4, 4) a rotation that takes z to an axis."""
+    z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return se3.matrix(np.stack([x, np.cross(z, x), z], axis=1), np.zeros(3))
+
+
+def numbers(values: Floats) -> str:
+    """Numbers as a description has them, to a nanometre and better."""
+    return " ".join(f"{0.0 if abs(v) < 1e-13 else v:.12g}" for v in values.tolist())
+
+
+def _product(places: Sequence[Floats]) -> Floats:
+    out = np.eye(4)
+    for place in places:
+        out = out @ place
+    return out
