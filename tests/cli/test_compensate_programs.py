@@ -17,6 +17,7 @@ from hilcal.calibration.points import solutions
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.robot.urdf import arm_from_urdf
 from hilcal.types import Floats
 from tests.support.cli_cases import ok, refused
 from tests.support.maker_arms import maker_arm
@@ -121,6 +122,39 @@ def test_from_a_table_to_corrected_krl_points(
     text = (out / "weld.src").read_bytes().decode("latin-1")
     assert "; geprüft:" in text
     assert text.count("\r\n") == (EXAMPLES / "weld.src").read_bytes().count(b"\r\n")
+
+
+def test_into_the_labs_own_urdf(
+    lab: tuple[Path, Arm, Arm], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same table: the URDF that the cell names, corrected, is the arm that was measured."""
+    folder, _, true = lab
+    run, mine = folder / "into.hilcal", folder / "mine.urdf"
+    cell = folder / "CELL.toml"
+    more = ("--config", cell, "--preview", "-o", folder / "into.toml")
+    ok(capsys, "import", folder / "faro.csv", *more)
+    more = ("--config", cell, "--format", folder / "into.toml", "-o", run)
+    ok(capsys, "import", folder / "faro.csv", *more)
+    ok(capsys, "identify", run, "--effects", "link_geometry")
+    text = f"<!-- bay 3 -->{(folder / 'krl.urdf').read_text()}"
+    mine.write_text(text)
+    assert "mine.urdf: the file exists" in refused(capsys, 2, "export", run, "--into", mine)
+    assert mine.read_text() == text
+    shown = ok(capsys, "export", run, "--into", mine, "--matlab", folder / "arm.m", "--force").out
+    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in " ".join(shown.split())
+    assert mine.read_text().startswith("<!-- bay 3 -->")
+    assert (folder / "arm.m").read_text().startswith("function robot = arm()")
+    q = np.radians([[10, -70, 100, 20, -60, 30], [-20, -80, 110, 15, 50, 160]])
+    made = flanges(arm_from_urdf(mine), q) @ se3.matrix(np.eye(3), TOOL)
+    there = flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
+    assert np.linalg.norm((made - there)[:, :3, 3], axis=1).max() < 6e-5
+    for given, words in (
+        (("--urdf", folder / "n.urdf", "--tip-link", "x"), "--tip-link is about --into"),
+        (("--into", folder / "no.urdf"), "no.urdf: no such file; valid: a URDF"),
+        (("--into", mine, "--force", "--tip-link", "x"), "link 'x' is there 0 times; valid: base"),
+        (("--matlab", folder / "1.m"), "valid: a name that MATLAB calls"),
+    ):
+        assert words in refused(capsys, 2, "export", run, *given)
 
 
 def pose(values: list[float]) -> Floats:

@@ -5,11 +5,12 @@ frames are not those of the arm (a mesh wants its own), but where it is the same
 the same axes: with M_k the links of the nominal arm, C_k of the corrected one, N_k of the file, all
 with the joints' axes along z,
 
-    N_k = G_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·) for k = 0 … n − 1,   N'_k = G_{k−1}⁻¹ C_k G_k
+    N_k = H_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·),   H_k = Rz(o_k) G_k,   N'_k = H_{k−1}⁻¹ C_k G_k
 
-with G_{−1} from the base of the arm to that of the file, the identity or half a turn about z (as
-between `base` and `base_link` of a UR arm), and G_n from the flange to the tip. Each N'_k is made
-by one place: that of its joint, behind the last joint that of the first step there.
+with o_k where the file has another zero of the joint than the controller, H_{−1} from the base of
+the arm to that of the file, the identity or half a turn about z (as between `base` and `base_link`
+of a UR arm), and G_n from the flange to the tip. Each N'_k is made by one place: that of its joint,
+behind the last joint that of the first step there.
 """
 
 from collections.abc import Callable, Sequence
@@ -98,11 +99,11 @@ def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn
         before.append((joint, fixed))
         after.append(end)
         last, joint = k + 1, end
-    frames = _frames(steps, turning, old, drawn, file, nominal.name)
+    left, right = _frames(steps, turning, old, drawn, file, nominal.name)
     places = [s.place for s in steps]
     lost = np.eye(4)
     for k, (joint, fixed) in enumerate(before):
-        wanted = se3.inverse(frames[k]) @ new[k] @ frames[k + 1]
+        wanted = se3.inverse(left[k]) @ new[k] @ right[k]
         if k < len(turning):
             places[turning[k]] = se3.inverse(fixed) @ joint @ wanted @ se3.inverse(after[k])
         elif len(steps) > turning[-1] + 1:
@@ -110,7 +111,7 @@ def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn
             places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
         else:
             lost = joint @ wanted
-    return Redrawn(tuple(places), frames[-1], lost)
+    return Redrawn(tuple(places), right[-1], lost)
 
 
 def _frames(
@@ -120,35 +121,52 @@ def _frames(
     drawn: Sequence[Floats],
     file: str,
     name: str,
-) -> list[Floats]:
-    """G_{−1} … G_n; raises as `redrawn` does."""
+) -> tuple[list[Floats], list[Floats]]:
+    """H_{−1} … H_{n−1} and G_0 … G_n; raises as `redrawn` does."""
     half = np.diag([-1.0, -1.0, 1.0, 1.0])
-    found: list[list[Floats]] = []
+    found: list[tuple[list[Floats], list[Floats]]] = []
     misses: list[tuple[int, float, float]] = []
     for base in (np.eye(4), half):
-        frames, missed = [base], None
+        left, right = [base], []
         for k in range(len(turning)):
-            g = se3.inverse(old[k]) @ frames[-1] @ drawn[k]
-            away = float(np.hypot(*g[:2, 3]))
-            tilt = float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
-            if max(away, tilt) > SAME:
-                missed = (k, away, tilt)
+            g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
+            if k > 0 and max(_off(g)) > SAME:
+                left[-1] = _other_zero(old[k], left[-1], drawn[k])
+                g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
+            if max(_off(g)) > SAME:
+                misses.append((k, *_off(g)))
                 break
-            frames.append(g)
-        if missed is None:
-            found.append([*frames, se3.inverse(old[-1]) @ frames[-1] @ drawn[-1]])
+            right.append(g)
+            left.append(g)
         else:
-            misses.append(missed)
+            found.append((left, [*right, se3.inverse(old[-1]) @ left[-1] @ drawn[-1]]))
     if not found:
         k, away, tilt = max(misses)
         step = steps[turning[k]]
         raise InputError(
             f"{file}: line {step.line}: the axis of {escaped(step.name)} lies {length(away)} and "
-            f"{np.degrees(tilt):.3g}° from that of joint {k + 1} of {name}; valid: a description "
-            "of the arm that was measured, before any correction, from the link of its base on "
-            "(--base-link)"
+            f"{round(float(np.degrees(tilt)), 4):g}° from that of joint {k + 1} of {name}; valid: "
+            "a description of the arm that was measured, before any correction, from the link of "
+            "its base on (--base-link)"
         )
     return found[0]
+
+
+def _off(g: Floats) -> tuple[float, float]:
+    """Distance and angle of the z axis of a frame from that which it is seen from, m and rad."""
+    return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
+
+
+def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
+    """H with the turn about z by which the next axis of the file lies on that of the arm."""
+    seen = before @ drawn
+    column = 2 if np.hypot(link[0, 2], link[1, 2]) > SAME else 3  # parallel axes: by where they are
+    turn = np.arctan2(link[1, column], link[0, column])
+    turn -= np.arctan2(seen[1, column], seen[0, column])
+    c, s = np.cos(turn), np.sin(turn)
+    about = np.eye(4)
+    about[:2, :2] = [[c, -s], [s, c]]
+    return about @ before
 
 
 def edits_of(steps: Sequence[Step], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
