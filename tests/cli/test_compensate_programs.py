@@ -6,6 +6,7 @@ inverse kinematics, which the arm that was measured then follows.
 """
 
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,26 +18,18 @@ from hilcal.calibration.points import solutions
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
+from hilcal.robot.se3 import of_six
 from hilcal.robot.urdf import arm_from_urdf
 from hilcal.types import Floats
 from tests.support.cli_cases import ok, refused
-from tests.support.maker_arms import maker_arm
+from tests.support.maker_arms import EXAMPLES, maker_arm
+from tests.support.paths import ROOT
 
-EXAMPLES = Path(__file__).parents[1] / "unit" / "calibration" / "programs" / "examples"
 TOOL = np.array([0.1205, -0.0032, 0.21])  # the reflector at the tool's centre point
 POSES = 60
-CELL = """[robot]
-model = "krl.urdf"
-[tool]
-target_m = [0.1205, -0.0032, 0.21]
-load_point_m = [0.0, 0.0, 0.1]
-mass_kg = 0.0
-com_m = [0.0, 0.0, 0.0]
-[tracker]
-frame = "base"
-range_std_m = 1e-5
-transverse_std_m = 1e-5
-"""
+GUIDE = ROOT / "docs" / "how-to" / "correct-a-program.md"
+SEEN = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.6, -0.5]))
+"""The arm's base as the tracker stands to it."""
 
 
 def flanges(arm: Arm, q: Floats) -> Floats:
@@ -49,6 +42,9 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
     """The table, the nominal arm, and the arm as it is."""
     folder, rng = tmp_path_factory.mktemp("lab"), np.random.default_rng(3)
     nominal = maker_arm("krl", folder)
+    (folder / "krl.urdf").rename(folder / "kuka.urdf")
+    for name in ("weld.src", "weld.dat", "config.dat"):
+        shutil.copy(EXAMPLES / name, folder)
     off = se3.matrix(*se3.exp(3e-4 * rng.standard_normal((7, 6))))
     off[[0, -1]] = np.eye(4)
     true = replace(nominal, links=nominal.links @ off)
@@ -57,71 +53,56 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
         np.radians([60, -30, 120, 60, 80, 170]),
     )
     q = low + rng.random((POSES, 6)) * (high - low)
-    seen = flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
+    seen = SEEN @ flanges(true, q) @ se3.matrix(np.eye(3), TOOL)
     at = seen[:, :3, 3] + 1e-5 * rng.standard_normal((POSES, 3))
     lines = ["Punkt;A1;A2;A3;A4;A5;A6;X [mm];Y [mm];Z [mm]"]
     for k in range(POSES):
         numbers = [f"{v:.5f}" for v in (*np.degrees(q[k]), *(1e3 * at[k]))]
         lines.append(";".join([f"P{k}", *numbers]).replace(".", ","))
     (folder / "faro.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    (folder / "CELL.toml").write_text(CELL, encoding="utf-8")
+    (cell,) = re.findall(r"^```toml\n(\[robot\].*?)^```$", GUIDE.read_text(), re.M | re.S)
+    (folder / "CELL.toml").write_text(cell, encoding="utf-8")
     return folder, nominal, true
 
 
-def test_from_a_table_to_corrected_krl_points(
-    lab: tuple[Path, Arm, Arm], capsys: pytest.CaptureFixture[str]
+def test_the_guide_leads_from_a_table_to_corrected_krl_points(
+    lab: tuple[Path, Arm, Arm],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     folder, nominal, true = lab
-    run, cell = folder / "run.hilcal", folder / "CELL.toml"
-    ok(
-        capsys,
-        "import",
-        folder / "faro.csv",
-        "--config",
-        cell,
-        "--preview",
-        "-o",
-        folder / "m.toml",
-    )
-    ok(
-        capsys,
-        *("import", folder / "faro.csv", "--config", cell, "--format", folder / "m.toml"),
-        *("-o", run),
-    )
-    ok(capsys, "identify", run, "--effects", "link_geometry")
-    out = folder / "corrected"
-    out.mkdir()
-    frames = ("--frames", EXAMPLES / "config.dat")
-    said = refused(capsys, 2, "compensate", run, EXAMPLES / "weld.src", "-o", out / "weld.src")
-    assert "TOOL_DATA[1] is not in the program; give it by --frames" in said
-    assert not list(out.iterdir())
-    told = ok(
-        capsys,
-        *("compensate", run, EXAMPLES / "weld.src", *frames, "-o", out / "weld.src", "--json"),
-    ).document
+    monkeypatch.chdir(folder)
+    (folder / "corrected").mkdir()
+    (lines,) = re.findall(r"^```sh\n(.*?)^```$", GUIDE.read_text(), re.M | re.S)
+    *first, last = [line.split()[1:] for line in lines.splitlines()]
+    for arguments in first:
+        ok(capsys, *arguments)
+    without = [word for word in last if word not in ("--frames", "config.dat")]
+    assert "TOOL_DATA[1] is not in the program; give it by --frames" in refused(capsys, 2, *without)
+    assert not list(Path("corrected").iterdir())
+    told = ok(capsys, *last, "--json").document
     assert [w["done"] for w in told["waypoints"]] == ["corrected"] * 7
-    assert sorted(p.name for p in out.iterdir()) == ["weld.dat", "weld.src"]
-    again = ("compensate", run, EXAMPLES / "weld.src", *frames, "-o", out / "weld.src")
-    assert "--force" in refused(capsys, 2, *again)
+    assert sorted(p.name for p in Path("corrected").iterdir()) == ["weld.dat", "weld.src"]
+    assert "--force" in refused(capsys, 2, *last)
     base, tool = pose([800, -200, 150, 30, 0, 0]), pose([120.5, -3.2, 210, 10, 20, -30])
-    before, after = points(EXAMPLES / "weld.dat"), points(out / "weld.dat")
+    before, after = points(Path("weld.dat")), points(Path("corrected/weld.dat"))
+    to_base = se3.inverse(of_six(told["base_in_tracker"])) @ SEEN
     errors = []
     for name, frame in (("XP1", base), ("XP2", base), ("XP3", np.eye(4))):
         asked, commanded = frame @ before[name], frame @ after[name]
         near = next(np.array(p["q_command"]) for p in told["points"] if p["name"].startswith(name))
         reached = [
-            flanges(true, solutions(nominal, tool, near[None], goal))[0] @ tool
+            to_base @ flanges(true, solutions(nominal, tool, near[None], goal))[0] @ tool
             for goal in (asked, commanded)
         ]
         errors.append([np.linalg.norm((r - asked)[:3, 3]) for r in reached])
     was, now = np.array(errors).T
-    bands = [p["band_m"] for p in told["points"][:3]]
     assert was.min() > 3e-4
-    assert np.all(now < bands)
+    assert np.all(now < [p["band_m"] for p in told["points"][:3]])
     assert now.max() < 0.1 * was.min()
-    text = (out / "weld.src").read_bytes().decode("latin-1")
+    text = Path("corrected/weld.src").read_bytes().decode("latin-1")
     assert "; geprüft:" in text
-    assert text.count("\r\n") == (EXAMPLES / "weld.src").read_bytes().count(b"\r\n")
+    assert text.count("\r\n") == Path("weld.src").read_bytes().count(b"\r\n")
 
 
 def test_into_the_labs_own_urdf(
@@ -129,14 +110,18 @@ def test_into_the_labs_own_urdf(
 ) -> None:
     """The same table: the URDF that the cell names, corrected, is the arm that was measured."""
     folder, _, true = lab
-    run, mine = folder / "into.hilcal", folder / "mine.urdf"
-    cell = folder / "CELL.toml"
+    run, mine, cell = folder / "into.hilcal", folder / "mine.urdf", folder / "BASE.toml"
+    stated = (
+        'frame = "tracker"\nbase_xyz_m = [2.4, -1.6, -0.5]\nbase_rotvec_rad = [0.02, -0.03, 2.1]'
+    )
+    text = (folder / "CELL.toml").read_text()
+    cell.write_text(text.replace('frame = "tracker"', stated), encoding="utf-8")
     more = ("--config", cell, "--preview", "-o", folder / "into.toml")
     ok(capsys, "import", folder / "faro.csv", *more)
     more = ("--config", cell, "--format", folder / "into.toml", "-o", run)
     ok(capsys, "import", folder / "faro.csv", *more)
     ok(capsys, "identify", run, "--effects", "link_geometry")
-    text = f"<!-- bay 3 -->{(folder / 'krl.urdf').read_text()}"
+    text = f"<!-- bay 3 -->{(folder / 'kuka.urdf').read_text()}"
     mine.write_text(text)
     assert "mine.urdf: the file exists" in refused(capsys, 2, "export", run, "--into", mine)
     assert mine.read_text() == text

@@ -5,6 +5,7 @@ from pathlib import Path
 from hilcal.robot.arm import Arm
 from hilcal.robot.urdf import arm_from_urdf
 
+EXAMPLES = Path(__file__).parents[1] / "unit" / "calibration" / "programs" / "examples"
 Joint = tuple[str, str]
 ARMS: dict[str, tuple[list[Joint], str]] = {
     # KR 10 R1420, as ROS-Industrial's kuka_experimental has it

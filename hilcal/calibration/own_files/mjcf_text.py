@@ -103,7 +103,7 @@ def _step(document: Document, node: Node) -> Step:
             )
         axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
         at = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
-        turn = se3.matrix(np.eye(3), at) @ z_to(axis)
+        turn = se3.matrix(np.eye(3), at) @ z_to(document.direction(joint, axis))
 
     def write(new: Floats) -> Edits:
         out: Edits = []
@@ -142,21 +142,21 @@ def _rotation(document: Document, node: Node) -> Floats:
     radian = bool(compiler) and compiler[-1].attributes["angle"] == "radian"
     unit = 1.0 if radian else np.pi / 180
     if key == "quat":
-        k = se3.skew(v[1:] / np.linalg.norm(v))
-        return np.asarray(np.eye(3) + 2 * v[0] / np.linalg.norm(v) * k + 2 * k @ k)
+        q = document.direction(node, v)
+        k = se3.skew(q[1:])
+        return np.asarray(np.eye(3) + 2 * q[0] * k + 2 * k @ k)
     if key == "axisangle":
-        return se3.rotation(unit * v[3] * v[:3] / np.linalg.norm(v[:3]))
+        return se3.rotation(unit * v[3] * document.direction(node, v[:3]))
     if key == "zaxis":
-        z = v / np.linalg.norm(v)
+        z = document.direction(node, v)
         about = np.cross([0.0, 0.0, 1.0], z)
         size = float(np.linalg.norm(about))
         if size < 1e-12:
             return np.eye(3) if z[2] > 0 else np.diag([1.0, -1.0, -1.0])
         return se3.rotation(np.arctan2(size, z[2]) * about / size)
     if key == "xyaxes":
-        x = v[:3] / np.linalg.norm(v[:3])
-        y = v[3:] - (x @ v[3:]) * x
-        y /= np.linalg.norm(y)
+        x = document.direction(node, v[:3])
+        y = document.direction(node, v[3:] - (x @ v[3:]) * x)
         return np.stack([x, y, np.cross(x, y)], axis=1)
     order = [
         c.attributes["eulerseq"]

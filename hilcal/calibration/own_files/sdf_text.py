@@ -223,7 +223,7 @@ def _step(model: _Model, joint: Node) -> Step:
     if kind in ("revolute", "continuous"):
         xyz, other = model.axis(joint)
         along = model.document.numbers(xyz or joint, model.text(xyz) or "0 0 1", 3)
-        at = model.place(name)
+        along, at = model.document.direction(xyz or joint, along), model.place(name)
         if other:
             along = at[:3, :3].T @ model.place(other)[:3, :3] @ along
         turn = se3.inverse(model.place(child)) @ at @ z_to(along)

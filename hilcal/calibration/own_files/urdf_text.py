@@ -129,7 +129,10 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> Step:
     given = {} if origin is None else origin.attributes
     xyz, rpy = (_values(document, origin or joint, given.get(k, "0 0 0")) for k in ("xyz", "rpy"))
     place = se3.matrix(_of_rpy(rpy), xyz)
-    turn = None if kind == _FIXED else z_to(_values(document, axis or joint, along))
+    turn = None
+    if kind != _FIXED:
+        node = axis or joint
+        turn = z_to(document.direction(node, _values(document, node, along)))
 
     def write(new: Floats) -> Edits:
         if turned:

@@ -14,6 +14,8 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.types import Floats
 
+LARGEST, SMALLEST = 1e6, 1e-6
+"""Of numbers, and of the length of a direction; choices."""
 _TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
 
 
@@ -93,12 +95,25 @@ class Document:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
             values = np.empty(0)
-        if len(values) != count or not np.isfinite(values).all():
+        if len(values) != count or not (np.abs(values) <= LARGEST).all():
             raise InputError(
-                f"{self.name}: line {node.line}: <{node.tag}> has '{escaped(text[:40])}'; valid: "
-                f"{count} numbers"
+                f"{self.name}: line {node.line}: <{escaped(node.tag)}> has '{escaped(text[:40])}'; "
+                f"valid: {count} numbers"
             )
         return values
+
+    def direction(self, node: Node, values: Floats) -> Floats:
+        """Return a vector of length 1.
+
+        Raises:
+            InputError: it has no direction.
+        """
+        size = float(np.linalg.norm(values))
+        if size < SMALLEST:
+            raise InputError(
+                f"{self.name}: line {node.line}: <{escaped(node.tag)}> has a direction of length 0"
+            )
+        return np.asarray(values / size)
 
 
 def read_xml(path: Path) -> Document:

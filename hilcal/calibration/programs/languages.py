@@ -18,6 +18,8 @@ from hilcal.names import escaped
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
+LARGEST = 1e7
+"""Of a number of a point: mm, degrees or pulses; a choice."""
 READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
     ".src": read_krl,
     ".mod": read_rapid,
@@ -102,7 +104,7 @@ def understood(
     except InputError as error:
         raise InputError(escaped(str(error))) from None
     points = tuple(
-        p if np.isfinite(p.values).all() else replace(p, left="numbers that are too large")
+        p if _usable(p) else replace(p, left="numbers that are none, in it, its tool or its base")
         for p in program.points
     )
     program = replace(program, points=points)
@@ -112,6 +114,12 @@ def understood(
     found = Understood(program, arm, q, longest, said + more).without(doubts)
     _refuse(path, found.program.points, leave)
     return found
+
+
+def _usable(p: ProgramPoint) -> bool:
+    """Whether its numbers are such that an arm has."""
+    every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
+    return bool((np.abs(every) < LARGEST).all())
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:

@@ -344,7 +344,8 @@ def frame_of(known: Frames, what: str, number: str) -> Floats | str:
 
 def of_euler(values: Floats) -> Floats:
     """T (4, 4) of x, y, z in mm and turns about z, then y, then x in degrees: Rz(A) Ry(B) Rx(C)."""
-    (ca, cb, cc), (sa, sb, sc) = (f(np.radians(values[3:6])) for f in (np.cos, np.sin))
+    with np.errstate(invalid="ignore"):  # what is not finite is refused by its line
+        (ca, cb, cc), (sa, sb, sc) = (f(np.radians(values[3:6])) for f in (np.cos, np.sin))
     r = np.array(
         [
             [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],

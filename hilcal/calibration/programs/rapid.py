@@ -39,6 +39,8 @@ from hilcal.types import Floats, Ints
 
 POSE = 7
 """Numbers of a pose."""
+LEAST = 4
+"""Arguments that a motion has: point, speed, zone, tool."""
 UNUSED = 8e8
 """A number from which on an external axis is none: 9E9."""
 _STATEMENT = re.compile(r"[^;]*;")
@@ -71,7 +73,9 @@ _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 def of_quaternion(values: Floats) -> Floats:
     """T (4, 4) of x, y, z in mm and a unit quaternion, its real part first."""
     q = np.asarray(values[3:7], dtype=float)
-    w, v = q[0] / np.linalg.norm(q), q[1:] / np.linalg.norm(q)
+    with np.errstate(all="ignore"):  # what is not finite is refused by its line
+        q = q / np.linalg.norm(q)
+    w, v = q[0], q[1:]
     k = se3.skew(v)
     return se3.matrix(np.eye(3) + 2 * w * k + 2 * k @ k, 1e-3 * np.asarray(values[:3], dtype=float))
 
@@ -236,6 +240,10 @@ class _Reader:
         """Take the targets of a motion."""
         word, line = m[1].upper(), line_of(self.text, at + m.start())
         given, options = self._arguments(code, m)
+        if len(given) < LEAST:
+            left = f"{m[1]} without its arguments"
+            self.found[f"line {line}"] = ProgramPoint(line, f"line {line}", left=left)
+            return
         targets = given[: 2 if word.endswith("C") else 1]
         tool = self._frame("tooldata", given[-1][1], line)
         named = re.search(r"\\\s*WObj\s*:=\s*(\w+)", options, re.I)

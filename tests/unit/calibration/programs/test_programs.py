@@ -28,9 +28,8 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats
-from tests.support.maker_arms import maker_arm, urdf_of
+from tests.support.maker_arms import EXAMPLES, maker_arm, urdf_of
 
-EXAMPLES = Path(__file__).parent / "examples"
 DELTA = 1e-3 * np.array([0.7, -0.4, 0.9, -1.1, 0.5, -0.8])
 
 
