@@ -9,8 +9,9 @@ with the joints' axes along z,
 
 with o_k where the file has another zero of the joint than the controller, H_{−1} from the base of
 the arm to that of the file, the identity or half a turn about z (as between `base` and `base_link`
-of a UR arm), and G_n from the flange to the tip. Each N'_k is made by one place: that of its joint,
-behind the last joint that of the first step there.
+of a UR arm), and G_n from the flange to the tip. What a file has wrong by millimetres is left out
+of G and H, so that N' is exact. Each N'_k is made by one place: that of its joint, behind the last
+joint that of the first step there.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilcal.calibration.dh_table import screw
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -29,6 +31,9 @@ from hilcal.types import Floats
 
 SAME = 1e-6
 """m, rad; frames that differ by less are the same: descriptions are written with six decimals."""
+NEAR_M, NEAR_RAD = 5e-3, 1e-2
+"""m, rad; a file whose axes lie as near as this is of the same arm: many are rounded to
+millimetres, others are corrected already. A choice; what is written is exact in any case."""
 LEFT = 1e-9
 """m, rad; a place that moves less is left as it is."""
 Edits = list[tuple[Span, str]]
@@ -61,11 +66,13 @@ class Redrawn:
         places: (4, 4) the new place of each step.
         tip: (4, 4) from the flange of the arm to the tip of the file.
         lost: (4, 4) what the file has no place for, behind its last joint.
+        rough: by how much its axes lay elsewhere than those of the nominal arm, m.
     """
 
     places: tuple[Floats, ...]
     tip: Floats
     lost: Floats
+    rough: float
 
 
 def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn:
@@ -99,7 +106,7 @@ def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn
         before.append((joint, fixed))
         after.append(end)
         last, joint = k + 1, end
-    left, right = _frames(steps, turning, old, drawn, file, nominal.name)
+    left, right, rough = _frames(steps, turning, old, drawn, file, nominal.name)
     places = [s.place for s in steps]
     lost = np.eye(4)
     for k, (joint, fixed) in enumerate(before):
@@ -111,7 +118,7 @@ def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn
             places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
         else:
             lost = joint @ wanted
-    return Redrawn(tuple(places), right[-1], lost)
+    return Redrawn(tuple(places), right[-1], lost, rough)
 
 
 def _frames(
@@ -121,35 +128,43 @@ def _frames(
     drawn: Sequence[Floats],
     file: str,
     name: str,
-) -> tuple[list[Floats], list[Floats]]:
-    """H_{−1} … H_{n−1} and G_0 … G_n; raises as `redrawn` does."""
+) -> tuple[list[Floats], list[Floats], float]:
+    """H_{−1} … H_{n−1}, G_0 … G_n, and how rough the file is; raises as `redrawn` does."""
     half = np.diag([-1.0, -1.0, 1.0, 1.0])
-    found: list[tuple[list[Floats], list[Floats]]] = []
+    found: list[tuple[int, list[Floats], list[Floats], float]] = []
     misses: list[tuple[int, float, float]] = []
     for base in (np.eye(4), half):
-        left, right = [base], []
+        left, right, zeros, rough = [base], [], 0, 0.0
         for k in range(len(turning)):
             g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
-            if k > 0 and max(_off(g)) > SAME:
-                left[-1] = _other_zero(old[k], left[-1], drawn[k])
+            if k > 0 and not _near(g):
+                left[-1], zeros = _other_zero(old[k], left[-1], drawn[k]), zeros + 1
                 g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
-            if max(_off(g)) > SAME:
+            if not _near(g):
                 misses.append((k, *_off(g)))
                 break
-            right.append(g)
-            left.append(g)
+            rough = max(rough, _off(g)[0])
+            turn = np.arctan2(g[1, 0] - g[0, 1], g[0, 0] + g[1, 1])
+            right.append(screw(turn, g[2, 3]))
+            left.append(right[-1])
         else:
-            found.append((left, [*right, se3.inverse(old[-1]) @ left[-1] @ drawn[-1]]))
+            tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
+            tip = np.eye(4) if moved(tip, np.eye(4)) < NEAR_M else tip
+            found.append((zeros, left, [*right, tip], rough))
     if not found:
         k, away, tilt = max(misses)
         step = steps[turning[k]]
         raise InputError(
             f"{file}: line {step.line}: the axis of {escaped(step.name)} lies {length(away)} and "
             f"{round(float(np.degrees(tilt)), 4):g}° from that of joint {k + 1} of {name}; valid: "
-            "a description of the arm that was measured, before any correction, from the link of "
-            "its base on (--base-link)"
+            "a description of the arm that was measured, from the link of its base on (--base-link)"
         )
-    return found[0]
+    return min(found, key=lambda f: f[0])[1:]
+
+
+def _near(g: Floats) -> bool:
+    away, tilt = _off(g)
+    return away < NEAR_M and tilt < NEAR_RAD
 
 
 def _off(g: Floats) -> tuple[float, float]:
@@ -160,13 +175,12 @@ def _off(g: Floats) -> tuple[float, float]:
 def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
     """H with the turn about z by which the next axis of the file lies on that of the arm."""
     seen = before @ drawn
-    column = 2 if np.hypot(link[0, 2], link[1, 2]) > SAME else 3  # parallel axes: by where they are
+    column = (
+        2 if np.hypot(link[0, 2], link[1, 2]) > NEAR_RAD else 3
+    )  # parallel axes: by where they are
     turn = np.arctan2(link[1, column], link[0, column])
     turn -= np.arctan2(seen[1, column], seen[0, column])
-    c, s = np.cos(turn), np.sin(turn)
-    about = np.eye(4)
-    about[:2, :2] = [[c, -s], [s, c]]
-    return about @ before
+    return screw(float(turn), 0.0) @ before
 
 
 def edits_of(steps: Sequence[Step], places: Sequence[Floats]) -> tuple[Edits, list[str]]:

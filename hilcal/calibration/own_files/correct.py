@@ -9,7 +9,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.calibration.corrected import Corrected
 from hilcal.calibration.dh_table import dh_rows
-from hilcal.calibration.own_files.chain_text import LEFT, edits_of, moved, redrawn
+from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, redrawn
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
 from hilcal.calibration.own_files.sdf_text import sdf_chain
 from hilcal.calibration.own_files.urdf_text import urdf_steps
@@ -70,12 +70,14 @@ def correct_file(
         new = redrawn(steps, nominal, found.arm, document.name)
         edits, names = edits_of(steps, new.places)
     said = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
+    if new.rough > SAME:
+        said += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
     if (away := moved(new.lost, np.eye(4))) > LEFT:
         said += (
             f"; its tip is the last moving one, which has no place for the flange's own shift "
             f"({length(away)}): --tip-link"
         )
-    if moved(new.tip, np.eye(4)) > 1e-6:
+    if moved(new.tip, np.eye(4)) > SAME:
         said += (
             f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
             f"{nominal.name}, and keeps that"

@@ -142,6 +142,13 @@ def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm: Arm, tmp_path: Path) -> 
     assert len(lines_changed(MJCF, after)) == 7
     assert "<!-- the arm of bay 3 -->" in after
     assert "1 places have" not in found.said
+    rounded = MJCF.replace("0.61 0.1 0", "0.612 0.1 0").replace("0 0 0.66", "0 0 0.663")
+    path.write_text(rounded)
+    found = correct(path, arm, new, "base", "flange")
+    assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.said
+    path.write_bytes(found.content)
+    again = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
+    np.testing.assert_allclose(again, flanges(new), atol=NM)
     lost = correct(path, new, changed(new), "base")
     assert "no place for the flange's own shift" in lost.said
 
