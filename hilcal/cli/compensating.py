@@ -170,12 +170,11 @@ def compensate(
     document = found.to_dict(task.points.names)
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
-    for path in output or ():
-        _write(path, task, found, document)
+    written = [made for path in output or () for made in _write(path, task, found, document)]
     t.show(compensation_report(calibration, task.points.names, q, found))
     t.show(waypoints_table(become))
-    _say_written(t, output or [])
-    t.document({**document, "written": [str(path) for path in output or ()]})
+    _say_written(t, written)
+    t.document({**document, "written": [str(path) for path in written]})
 
 
 def _say_written(t: Terminal, paths: list[Path]) -> None:
@@ -331,17 +330,18 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
                 check_new(beside, force)
 
 
-def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> None:
-    """Write the joint values as the file's name asks.
+def _write(path: Path, task: _Task, found: Compensation, document: dict[str, object]) -> list[Path]:
+    """Write the joint values as the file's name asks; returns the files.
 
     Raises:
         InputError: it cannot be written, or the arm is none of UR's.
     """
     names, n = task.points.names, found.q.shape[1]
     if task.other is not None and path.suffix.lower() in READERS:
-        for suffix, file in task.other.corrected(found.q).items():
-            replace_file(path.with_suffix(suffix), file)
-        return
+        files = {path.with_suffix(k): v for k, v in task.other.corrected(found.q).items()}
+        for each, file in files.items():
+            replace_file(each, file)
+        return list(files)
     content: str
     if path.suffix == ".json":
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
@@ -354,6 +354,7 @@ def _write(path: Path, task: _Task, found: Compensation, document: dict[str, obj
     else:
         content = with_joints(task.program, [w for w in task.waypoints if not w.left], found.q)
     replace_file(path, content)
+    return [path]
 
 
 def _csv(names: tuple[str, ...], found: Compensation) -> str:

@@ -82,6 +82,7 @@ def test_the_guide_leads_from_a_table_to_corrected_krl_points(
     assert not list(Path("corrected").iterdir())
     told = ok(capsys, *last, "--json").document
     assert [w["done"] for w in told["waypoints"]] == ["corrected"] * 7
+    assert sorted(told["written"]) == ["corrected/weld.dat", "corrected/weld.src"]
     assert sorted(p.name for p in Path("corrected").iterdir()) == ["weld.dat", "weld.src"]
     assert "--force" in refused(capsys, 2, *last)
     base, tool = pose([800, -200, 150, 30, 0, 0]), pose([120.5, -3.2, 210, 10, 20, -30])

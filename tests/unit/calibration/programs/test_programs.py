@@ -88,9 +88,9 @@ EXAMPLE = {
             (0, -10.5, 20, 0, 30, 0),
             (10, 20, 15, 30, 40, -100),
             (-15, 25, 5, -20, -50, 170),
-            (5, 8.043707, 14.629686, 0.446700, 52.326422, 0.330602),  # Offs
+            (4.9999999, 8.043691, 14.6296544, 0.4466837, 52.3264061, 0.3305581),  # Offs
             (5, 10, 20, 0.5, 45, 0.25),
-            (2.602282, 11.014259, 12.987459, 6.166545, 52.349777, -20.528073),  # RelTool
+            (2.6023405, 11.0143368, 12.9875339, 6.1665176, 52.3497838, -20.5280617),  # RelTool
             (7, 12, 18, 10, 45, 5),
         ),
         "wxyz",
@@ -215,6 +215,19 @@ def test_a_corrected_program_means_the_corrected_joint_values(
             np.testing.assert_allclose(pose, there, atol=10 * e.atol)
     again = read(maker, arms, tmp_path)
     np.testing.assert_allclose(again.q, wanted, atol=3e-5 if maker in ("fanuc", "inform") else 1e-7)
+
+
+def test_offs_and_reltool_move_as_abb_defines_them() -> None:
+    """Offs in the object frame; RelTool in the tool's: about x, the new y, the new z."""
+    e = EXAMPLE["rapid"]
+    offs, p30, relative = (
+        se3.inverse(e.frame) @ flange("rapid", tuple(np.radians(e.q[k]).tolist())) @ e.tool
+        for k in (3, 4, 5)
+    )
+    np.testing.assert_allclose(offs[:3, 3] - p30[:3, 3], [0, 0, 0.04], atol=1e-7)
+    np.testing.assert_allclose(offs[:3, :3], p30[:3, :3], atol=1e-7)
+    step = place("XYZ", [5, 0, -30, 4, 0, -15])
+    np.testing.assert_allclose(relative, p30 @ step, atol=1e-7)
 
 
 @pytest.mark.parametrize("maker", EXAMPLE)
