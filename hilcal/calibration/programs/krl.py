@@ -29,6 +29,7 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    arguments_of,
     frames_of_toml,
     of_euler,
     read_text,
@@ -368,7 +369,9 @@ class _Reader:
             left = f"{word} is not corrected"
         elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
             left = "a circle with CA does not end at the point that is stated"
-        targets = [(b, t) for b, t in _arguments(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)]
+        targets = [
+            (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
+        ]
         for offset, target in targets[: 2 if "CIRC" in word else 1]:
             self._target(line, begin + offset, target, word in ("PTP", "SPTP"), left, used)
         self.state = before
@@ -460,7 +463,7 @@ class _Reader:
                 keys.setdefault(name, []).append(key)
         for line, _, code in lines:
             if m := _MOTION.match(code):
-                targets = [t.strip() for _, t in _arguments(code[m.end() :])]
+                targets = [t.strip() for _, t in arguments_of(code[m.end() :])]
                 plain = not m[1].upper().endswith("_REL")
                 texts = [t for t in targets if not (plain and _PLAIN.match(t))]
             else:
@@ -502,14 +505,3 @@ def _sets(lines: Sequence[tuple[int, int, str]]) -> bool:
         if _SET.match(code) or _BAS.match(code) or (call and call[1].upper() not in _NO_CALLS):
             return True
     return False
-
-
-def _arguments(text: str) -> list[tuple[int, str]]:
-    """Parts between commas that are in no bracket, with their places."""
-    out, depth, begin = [], 0, 0
-    for k, sign in enumerate(text):
-        depth += (sign in "{[(") - (sign in "}])")
-        if sign == "," and depth == 0:
-            out.append((begin, text[begin:k]))
-            begin = k + 1
-    return [*out, (begin, text[begin:])]

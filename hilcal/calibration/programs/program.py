@@ -243,6 +243,17 @@ def read_text(path: Path) -> tuple[str, str]:
         return raw.decode("latin-1"), "latin-1"  # controllers write comments in the local set
 
 
+def arguments_of(text: str) -> list[tuple[int, str]]:
+    """Parts between commas that are in no bracket, with their places."""
+    out, depth, begin = [], 0, 0
+    for k, sign in enumerate(text):
+        depth += (sign in "{[(") - (sign in "}])")
+        if sign == "," and depth == 0:
+            out.append((begin, text[begin:k]))
+            begin = k + 1
+    return [*out, (begin, text[begin:])]
+
+
 def line_of(text: str, at: int) -> int:
     """Line of a place in a text, from 1."""
     return bisect_left(_ends(text), at) + 1

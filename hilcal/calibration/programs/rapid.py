@@ -28,6 +28,7 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    arguments_of,
     frames_of_toml,
     line_of,
     of_euler,
@@ -145,17 +146,6 @@ def _statements(text: str) -> Iterator[tuple[int, str]]:
         yield m.start(), m[0]
 
 
-def _split(text: str) -> list[tuple[int, str]]:
-    """Parts between commas that are in no bracket, with their places."""
-    out, depth, begin = [], 0, 0
-    for k, sign in enumerate(text):
-        depth += (sign in "[(") - (sign in "])")
-        if sign == "," and depth == 0:
-            out.append((begin, text[begin:k]))
-            begin = k + 1
-    return [*out, (begin, text[begin:])]
-
-
 def _numbers(text: str, at: int) -> list[_Number]:
     """All numbers of an aggregate; `at` is its place in the file."""
     return [_Number(float(m[0]), at + m.start(), at + m.end()) for m in _NUMBER.finditer(text)]
@@ -224,7 +214,7 @@ class _Reader:
 
     def _arguments(self, code: str, m: re.Match[str]) -> tuple[list[tuple[int, str]], str]:
         """Positional arguments of a motion with their places in the code, and its options."""
-        parts, options, positional = _split(code[m.end() : code.rindex(";")]), "", []
+        parts, options, positional = arguments_of(code[m.end() : code.rindex(";")]), "", []
         for begin, part in parts:
             outer = re.sub(r"\([^()]*\)", lambda m: "(" + "." * (len(m[0]) - 2) + ")", part)
             cut = outer.find("\\") if "\\" in outer else len(part)
@@ -357,7 +347,7 @@ class _Reader:
     def _made(self, text: str, made: re.Match[str], at: int, line: int) -> ProgramPoint:
         """Return the point that `Offs` or `RelTool` moves, to be written in its place."""
         bare = ProgramPoint(line, f"line {line}")
-        base, *moves = [part.strip() for _, part in _split(re.sub(r"\\", ",\\\\", made[2]))]
+        base, *moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", made[2]))]
         values = self.data.get(base.upper(), [])
         turn = rf"\\\s*R[xyz]\s*:=\s*{_NUMBER.pattern}" if made[1].upper() == "RELTOOL" else "-"
         shift = [m for m in moves if _NUMBER.fullmatch(m)]
@@ -390,7 +380,7 @@ class _Reader:
 
     def _moved(self, p: ProgramPoint, made: re.Match[str]) -> ProgramPoint:
         """Return the point where `Offs` or `RelTool` has it."""
-        moves = [part.strip() for _, part in _split(re.sub(r"\\", ",\\\\", made[2]))][1:]
+        moves = [part.strip() for _, part in arguments_of(re.sub(r"\\", ",\\\\", made[2]))][1:]
         shift = np.array([float(m) for m in moves if m and not m.startswith("\\")])
         turns = {
             m[1:].strip()[:2].lower(): float(m.partition(":=")[2])
