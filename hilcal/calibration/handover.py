@@ -50,7 +50,7 @@ def urdf(arm: Arm, note: str = "") -> str:
         name = "flange" if fixed else escaped(arm.joint_names[k])
         kind = "fixed" if fixed else "prismatic" if arm.slides[k] else "revolute"
         joint = SubElement(root, "joint", name=name, type=kind)
-        xyz, rpy = _origin(place)
+        xyz, rpy = origin_of(place)
         SubElement(joint, "origin", xyz=_numbers(xyz), rpy=_numbers(rpy))
         SubElement(joint, "parent", link=links[k])
         SubElement(joint, "child", link=links[k + 1])
@@ -60,6 +60,55 @@ def urdf(arm: Arm, note: str = "") -> str:
     indent(root)
     comment = f"<!-- {re.sub('-(?=-)', '- ', escaped(note))} -->\n" if note else ""
     return f'<?xml version="1.0"?>\n{comment}{tostring(root, encoding="unicode")}\n'
+
+
+def matlab(arm: Arm, name: str, note: str = "") -> str:
+    """Return a MATLAB function that builds an arm as a `rigidBodyTree` (Robotics System Toolbox).
+
+    Bodies base, link_1 …, tool0; each joint turns about z of its fixed transform.
+
+    Args:
+        arm: without couplings.
+        name: of the function.
+        note: stands in a comment at the top.
+    """
+    out = [f"function robot = {name}()"]
+    out += [f"% {escaped(line)}" for line in note.split("\n")]
+    out += [
+        f"robot = rigidBodyTree('DataFormat', 'row', 'MaxNumBodies', {arm.n + 1});",
+        "robot.Gravity = [0 0 -9.80665];",
+    ]
+    for k, place in enumerate(arm.links):
+        moving = k < arm.n
+        body, kind = (f"link_{k + 1}", "revolute") if moving else ("tool0", "fixed")
+        joint = escaped(arm.joint_names[k]).replace("'", "''") if moving else "flange"
+        out += [
+            "",
+            f"body = rigidBody('{body}');",
+            f"joint = rigidBodyJoint('{joint}', '{kind}');",
+            f"setFixedTransform(joint, [{'; '.join(_numbers(row) for row in place)}]);",
+        ]
+        if moving:
+            low, high = float(arm.q_min[k]), float(arm.q_max[k])
+            known = np.isfinite(low) and np.isfinite(high)
+            limits = (low, high) if known else (-FULL_TURN, FULL_TURN)
+            home = min(max(0.0, limits[0]), limits[1])
+            out += [
+                "joint.JointAxis = [0 0 1];",
+                f"joint.PositionLimits = [{limits[0]:.17g} {limits[1]:.17g}];",
+                f"joint.HomePosition = {home:.17g};",
+            ]
+        mass, com = (float(arm.masses[k]), arm.coms[k]) if moving else (0.0, np.zeros(3))
+        square = mass * (com @ com * np.eye(3) - np.outer(com, com)) + 0.4 * mass * 0.01 * np.eye(3)
+        inertia = square[[0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]]
+        out += [
+            f"body.Mass = {mass:.17g};",
+            f"body.CenterOfMass = [{_numbers(com)}];",
+            f"body.Inertia = [{_numbers(inertia)}];",
+            "body.Joint = joint;",
+            f"addBody(robot, body, '{'base' if k == 0 else f'link_{k}'}');",
+        ]
+    return "\n".join([*out, "end", ""])
 
 
 def ur_kinematics(
@@ -92,7 +141,7 @@ def ur_kinematics(
     for k, name in enumerate(UR_JOINTS):
         before = np.eye(4) if k == 0 else _along(-shift[k - 1])
         after = _along(shift[k]) if k < arm.n - 1 else screw(turn, shift[k])
-        xyz, rpy = _origin(before @ arm.links[k] @ after)
+        xyz, rpy = origin_of(before @ arm.links[k] @ after)
         lines.append(f"  {name}:")
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
         lines += [f"    {key}: {_yaml(v)}" for key, v in zip(keys, (*xyz, *rpy), strict=True)]
@@ -153,7 +202,7 @@ def _along(z: float) -> Floats:
     return out
 
 
-def _origin(place: Floats) -> tuple[Floats, Floats]:
+def origin_of(place: Floats) -> tuple[Floats, Floats]:
     """Position and fixed-axis roll, pitch, yaw of a pose (4, 4), exact also at pitch ±90°."""
     from scipy.spatial.transform import Rotation  # slow to import
 

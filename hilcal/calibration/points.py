@@ -175,11 +175,7 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     if points.wanted is None:
         return points.q
 
-    def poses(at: Floats, rows: Ints) -> Pose:
-        chain = evaluate(arm, at)
-        rotation = se3.product(chain.rotation[-1], tool[:3, :3])
-        return rotation, chain.point(tool[:3, 3]), chain
-
+    poses = _poses_of(arm, tool)
     found: list[Floats] = []
     for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
         start = q if np.isfinite(q).all() else found[-1] if found else near
@@ -194,6 +190,49 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
             start = _nearest(arm, poses, name, start, goal)
         found.append(start)
     return np.stack(found)
+
+
+def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floats:
+    """Return joint values (K, n) at which the nominal arm has the tool at a pose.
+
+    Args:
+        arm: the arm; each joint turns by itself.
+        tool: (4, 4) T_flange_tool.
+        near: (K, n) joint values to search from, rad; all over the range of the joints where None.
+        goal: (4, 4) T_base_tool.
+    """
+    starts = _everywhere(arm) if near is None else near
+    rotation, position = (
+        np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
+    )
+    found = invert(arm, _poses_of(arm, tool), starts, rotation, position)
+    q = found.q[found.solved]
+    if near is not None:
+        return q
+    q = (q + np.pi) % (2 * np.pi) - np.pi
+    kept: list[Floats] = []
+    for one in q:
+        if all(np.abs(np.sin((one - other) / 2)).max() > 1e-6 for other in kept):
+            kept.append(one)
+    return np.array(kept).reshape(-1, arm.n)
+
+
+def _poses_of(arm: Arm, tool: Floats) -> Callable[[Floats, Ints], Pose]:
+    """Where the nominal arm has a tool."""
+
+    def poses(at: Floats, rows: Ints) -> Pose:
+        chain = evaluate(arm, at)
+        rotation = se3.product(chain.rotation[-1], tool[:3, :3])
+        return rotation, chain.point(tool[:3, 3]), chain
+
+    return poses
+
+
+def _everywhere(arm: Arm) -> Floats:
+    """(STARTS, n) joint values all over the range of the joints."""
+    low, high = arm.usual_range
+    spread = np.random.default_rng(0).random((STARTS, arm.n))
+    return arm.complete(low + spread * (high - low))
 
 
 def _nearest(
@@ -223,10 +262,7 @@ def _nearest(
         if far.min() < NEAR:
             break
         if len(starts) == 1:
-            low, high = arm.usual_range
-            spread = np.random.default_rng(0).random((STARTS, arm.n))
-            spread = arm.complete(low + spread * (high - low))
-            starts = np.concatenate([near[None], spread])
+            starts = np.concatenate([near[None], _everywhere(arm)])
     if not np.isfinite(far).any():
         k = int(np.argmin(solved.residual_m / arm.reach + solved.residual_rad))
         raise InputError(

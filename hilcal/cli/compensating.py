@@ -14,6 +14,7 @@ from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
+from hilcal.calibration.programs.languages import READERS, Understood, understood
 from hilcal.calibration.urscript import (
     JOINTS,
     Waypoint,
@@ -65,12 +66,14 @@ class _Task:
         tool: (4, 4) T_flange_tool; the tracked target where None.
         program: text of the program that the points are of.
         waypoints: of that program, those that are left too.
+        other: a program of another maker than UR, in place of the two.
     """
 
     points: Points
     tool: Floats | None
     program: str | None = None
     waypoints: tuple[Waypoint, ...] = ()
+    other: Understood | None = None
 
 
 def compensate(
@@ -78,10 +81,15 @@ def compensate(
         Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
     ],
     points: Annotated[
-        Path, argument("POINTS", "Where to go: a table (CSV, XLSX …) or a UR program (.script).")
+        Path,
+        argument(
+            "POINTS",
+            "Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB .mod, "
+            "FANUC .ls, Yaskawa .jbi.",
+        ),
     ],
     output: Annotated[
-        list[Path] | None, option("-o --output F", "Write CSV, JSON or a UR program; repeatable.")
+        list[Path] | None, option("-o --output F", "Write CSV, JSON or a program; repeatable.")
     ] = None,
     load: Annotated[
         str | None, option("--load NAME", "The load at every point, of [[loads]].")
@@ -104,6 +112,14 @@ def compensate(
         str | None,
         option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees; m of slides."),
     ] = None,
+    frames: Annotated[
+        Path | None,
+        option(
+            "--frames F",
+            "The controller's tools and bases, for programs of other makers than UR: TOML, "
+            "$config.dat or a RAPID module.",
+        ),
+    ] = None,
     outside: Annotated[
         bool, option("--allow-outside", "Also points outside of what was measured.")
     ] = False,
@@ -121,17 +137,18 @@ def compensate(
     """Find the joint values that put the tool where it was asked to be, under a load."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     for path in output or ():
-        _check_output(path, force)
+        _check_output(path, points, force)
     with working(t.progress) as say:
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
-        task = _task(points, calibration, tool, leave, kind)
-        arm = calibration.controller if task.program else calibration.model.cell.arm
-        if task.points.taken:
-            t.notice(f"{points}: {task.points.taken}")
-        given = _wrench(task.points, calibration, load, wrench)
+        arm = calibration.model.cell.arm
         start = None if near is None else _numbers(near, arm.n, "--near")
         start = None if start is None else np.where(arm.slides, start, np.radians(start))
+        task = _task(points, calibration, tool, frames, start, leave, kind)
+        arm = calibration.controller if task.program else arm
+        for said in filter(None, (task.points.taken, *(task.other.said if task.other else ()))):
+            t.notice(f"{points}: {said}")
+        given = _wrench(task.points, calibration, load, wrench)
         say(f"compensating {len(task.points.names)} points")
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
@@ -151,7 +168,7 @@ def compensate(
         )
     refused = refusals(found, outside)
     refused = ["; ".join(filter(None, both)) for both in zip(uncertain, refused, strict=True)]
-    become = fates(task.waypoints, refused)
+    become = fates(task.other.program.points if task.other else task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
     if not leave or not kept:
         _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
@@ -162,12 +179,13 @@ def compensate(
     document = found.to_dict(task.points.names)
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
-    for path in output or ():
-        _write(path, task, found, document, arm.units)
+    written = [
+        made for path in output or () for made in _write(path, task, found, document, arm.units)
+    ]
     t.show(compensation_report(calibration, task.points.names, q, found))
     t.show(waypoints_table(become))
-    _say_written(t, output or [])
-    t.document({**document, "written": [str(path) for path in output or ()]})
+    _say_written(t, written)
+    t.document({**document, "written": [str(path) for path in written]})
 
 
 def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:
@@ -207,7 +225,15 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
         return run.calibration(revision)
 
 
-def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, kind: str) -> _Task:
+def _task(
+    path: Path,
+    calibration: Calibration,
+    tool: str | None,
+    frames: Path | None,
+    near: Floats | None,
+    leave: bool,
+    kind: str,
+) -> _Task:
     """Read what is to be compensated.
 
     Raises:
@@ -218,6 +244,11 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, k
     if tool is not None:
         six = _numbers(tool, 6, "--tool")
         given = se3.matrix(se3.rotation(six[3:]), six[:3])
+    if path.suffix.lower() in READERS:
+        found = understood(path, arm, frames=frames, tool=given, near=near, leave=leave)
+        return _Task(found.points, found.tool, other=found)
+    if frames is not None:
+        raise InputError(f"{path}: --frames is for programs: {', '.join(READERS)}")
     if path.suffix in PROGRAMS:
         if arm.n != JOINTS:
             raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
@@ -241,6 +272,9 @@ def _task(path: Path, calibration: Calibration, tool: str | None, leave: bool, k
 
 def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
     """Return the task of a program without the waypoints that are refused."""
+    if task.other is not None:
+        other = task.other.without(refused)
+        return replace(task, points=other.points, other=other)
     wanted = task.points.wanted
     points = Points(
         tuple(task.points.names[k] for k in kept),
@@ -311,10 +345,16 @@ def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools
     raise CannotAnswerError(f"{words}; measure there, or give --allow-outside")
 
 
-def _check_output(path: Path, force: bool) -> None:
-    if path.suffix not in WRITTEN:
-        raise InputError(f"{path}: unknown kind of file; valid: {', '.join(WRITTEN)}")
+def _check_output(path: Path, points: Path, force: bool) -> None:
+    kind = points.suffix.lower()
+    valid = (".csv", ".json", points.suffix) if kind in READERS else WRITTEN
+    if path.suffix not in valid:
+        raise InputError(f"{path}: unknown kind of file; valid: {', '.join(valid)}")
     check_new(path, force)
+    if kind == ".src" and path.suffix == points.suffix:
+        for beside in path.parent.glob(f"{path.stem}.*"):
+            if beside.suffix.lower() == ".dat":
+                check_new(beside, force)
 
 
 def _write(
@@ -323,13 +363,19 @@ def _write(
     found: Compensation,
     document: dict[str, object],
     units: Sequence[str],
-) -> None:
-    """Write the joint values as the file's name asks.
+) -> list[Path]:
+    """Write the joint values as the file's name asks; returns the files.
 
     Raises:
         InputError: it cannot be written, or the arm is none of UR's.
     """
     names, n = task.points.names, found.q.shape[1]
+    if task.other is not None and path.suffix.lower() in READERS:
+        files = {path.with_suffix(k): v for k, v in task.other.corrected(found.q).items()}
+        for each, file in files.items():
+            replace_file(each, file)
+        return list(files)
+    content: str
     if path.suffix == ".json":
         content = json.dumps(plain(document), allow_nan=False, indent=2) + "\n"
     elif path.suffix == ".csv":
@@ -341,6 +387,7 @@ def _write(
     else:
         content = with_joints(task.program, [w for w in task.waypoints if not w.left], found.q)
     replace_file(path, content)
+    return [path]
 
 
 def _csv(names: tuple[str, ...], found: Compensation, units: Sequence[str]) -> str:

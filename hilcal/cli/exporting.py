@@ -1,6 +1,7 @@
 """`export`: a campaign and what was identified, for other programs, controllers and people."""
 
 import json
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ import tomli_w
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import Corrected, corrected
+from hilcal.calibration.own_files.correct import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, check_new, option
 from hilcal.cli.terminal import Terminal, terminal
@@ -73,6 +75,23 @@ def export(
     frames: Annotated[
         Path | None, option("F.json", "Tool and base as fitted, and as a controller takes them.")
     ] = None,
+    matlab: Annotated[
+        Path | None, option("F.m", "A MATLAB function that builds it as a rigidBodyTree.")
+    ] = None,
+    into: Annotated[
+        list[Path] | None,
+        option(
+            "F",
+            "A description of yours whose numbers are replaced: URDF, xacro, MJCF, SDF, UR's "
+            "calibration.conf; needs --force, repeatable.",
+        ),
+    ] = None,
+    base_link: Annotated[
+        str | None, option("NAME", "Link or body of --into that the arm begins at.")
+    ] = None,
+    tip_link: Annotated[
+        str | None, option("NAME", "Link, body or site of --into that is its flange.")
+    ] = None,
     revision: Revision = None,
     force: Annotated[bool, option("--force", "Replace existing files.")] = False,
     effects_from: EffectsFrom = None,
@@ -80,7 +99,10 @@ def export(
 ) -> None:
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
     t = terminal(as_json)
-    geometry = Geometry(urdf, dh, modified, ur_kinematics, ur_hash, frames)
+    ends = (base_link, tip_link)
+    geometry = Geometry(
+        urdf, dh, modified, ur_kinematics, ur_hash, frames, matlab, tuple(into or ()), ends
+    )
     data = [path for path in (readings, table, cell, revisions) if path is not None]
     of_model = [residuals, parameters, calibration, *geometry.paths]
     wanted = [*data, *(path for path in of_model if path is not None)]
@@ -113,11 +135,15 @@ class Geometry:
     ur_kinematics: Path | None
     ur_hash: str | None
     frames: Path | None
+    matlab: Path | None
+    into: tuple[Path, ...]
+    ends: tuple[str | None, str | None]
 
     @property
     def paths(self) -> list[Path]:
         """Files that are wanted."""
-        every = (self.urdf, self.dh, self.ur_kinematics, self.frames)
+        new = (self.urdf, self.dh, self.ur_kinematics, self.frames, self.matlab)
+        every = (*new, *self.into)
         return [path for path in every if path is not None]
 
 
@@ -133,7 +159,8 @@ def _check(
         raise InputError(
             "nothing to export; give --readings, --table, --residuals or --revisions F.csv or "
             "F.parquet, --cell CELL.toml, --parameters F.json, --calibration F.json, "
-            "--urdf F.urdf, --dh F.toml, --ur-kinematics F.yaml or --frames F.json"
+            "--urdf F.urdf, --dh F.toml, --ur-kinematics F.yaml, --frames F.json, --matlab F.m, or "
+            "--into F of your own"
         )
     for path in tables:
         if path is not None:
@@ -141,18 +168,28 @@ def _check(
     for given, name, valid in (
         (parameters, "--parameters", (".json", ".csv")),
         (geometry.dh, "--dh", (".toml", ".csv")),
+        (geometry.matlab, "--matlab", (".m",)),
     ):
         if given is not None and given.suffix.lower() not in valid:
             raise InputError(f"{name} {given}: unknown kind of file; valid: {' or '.join(valid)}")
     for what, name, needs in (
         (geometry.modified and geometry.dh is None, "--dh-modified", "--dh"),
         (geometry.ur_hash and geometry.ur_kinematics is None, "--ur-hash", "--ur-kinematics"),
+        (geometry.ends[0] is not None and not geometry.into, "--base-link", "--into"),
+        (geometry.ends[1] is not None and not geometry.into, "--tip-link", "--into"),
     ):
         if what:
             raise InputError(f"{name} is about {needs}; give it, too")
     twice = [path for path in wanted if wanted.count(path) > 1]
     if twice:
         raise InputError(f"{twice[0]}: two things cannot be written to one file")
+    if geometry.matlab is not None and not re.fullmatch(r"[A-Za-z]\w{0,62}", geometry.matlab.stem):
+        raise InputError(
+            f"--matlab {geometry.matlab}; valid: a name that MATLAB calls, such as arm.m"
+        )
+    for path in geometry.into:
+        if not path.is_file():
+            raise InputError(f"--into {path}: no such file; valid: {KINDS}")
     for path in wanted:
         check_new(path, force)
 
@@ -303,12 +340,27 @@ def _write_geometry(found: Calibration, wanted: Geometry) -> Iterator[str]:
     if wanted.frames is not None:
         later(wanted.frames, handover.frames(found, arm, beyond))
         said.append(f"{wanted.frames}: tool and base, as fitted and as a controller takes them")
+    if wanted.matlab is not None:
+        later(wanted.matlab, handover.matlab(arm.arm, wanted.matlab.stem, f"{note}. {base}"))
+        said.append(f"{wanted.matlab}: a rigidBodyTree, base to tool0, with {holds}")
+    for path in wanted.into:
+        made = correct_file(path, nominal, arm, *_ends(found, wanted, path))
+        write.append(lambda path=path, made=made: replace_file(path, made.content))  # type: ignore[misc]
+        said.append(made.said)
     for each in write:
         each()
     yield from said
     yield base
     if arm.beyond:
         yield f"Not in it, since not constant: {', '.join(arm.beyond)}; hilcal compensate has it"
+
+
+def _ends(found: Calibration, wanted: Geometry, path: Path) -> tuple[str | None, str | None]:
+    """Base and tip in a file: as given, else as the cell has them for its own file."""
+    config = found.model.cell.config
+    if any(wanted.ends) or config is None or Path(config.robot.model).name != path.name:
+        return wanted.ends
+    return config.robot.base_link, config.robot.tip_link
 
 
 def _ur_note(note: str, base: str, arm: Corrected, digest: str | None) -> str:

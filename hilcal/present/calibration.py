@@ -13,6 +13,7 @@ from hilcal.calibration.conditions import WORDS
 from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND
+from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.acceptance import Acceptance
 from hilcal.present.document import Block, heading, note, table
@@ -372,7 +373,7 @@ class Fate:
     blend_m: float
 
 
-def fates(waypoints: Sequence[Waypoint], refused: Sequence[str]) -> list[Fate]:
+def fates(waypoints: Sequence[Waypoint | ProgramPoint], refused: Sequence[str]) -> list[Fate]:
     """Return what becomes of each waypoint; `refused` says why, of those that are not left."""
     rest, out = iter(refused), []
     for w in waypoints:

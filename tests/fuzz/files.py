@@ -5,14 +5,18 @@ import io
 import shutil
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
 import numpy as np
 
 import hilcal as hc
+from hilcal.calibration.corrected import Corrected
 from hilcal.calibration.handover import urdf
+from hilcal.calibration.own_files.correct import correct_file
 from hilcal.calibration.points import read_points
+from hilcal.calibration.programs.languages import understood
 from hilcal.campaign.campaign import Campaign
 from hilcal.config import CellConfig, load_config
 from hilcal.identification import parameters_document
@@ -29,7 +33,9 @@ from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, toml_dam
 from tests.fuzz.harness import MEMORY_DISK, Accepted, Parser
 from tests.fuzz.packed import packed
 from tests.support.campaigns import configuration
+from tests.support.description_files import MJCF, SDF
 from tests.support.factory_cases import UR5E_YAML, factory_of
+from tests.support.maker_arms import EXAMPLES, maker_arm, urdf_of
 
 
 def _plain(readings: hc.Readings) -> None:
@@ -247,6 +253,47 @@ def _urdf(bench: Bench) -> Parser:
     return Parser("urdf", make, parse)
 
 
+def _text_damaged(data: bytes, by: Random) -> bytes:
+    """A program or description with bytes or words changed."""
+    if by.random() < 0.5:
+        return bytes_damaged(data, by)
+    text = words_damaged(data.decode("latin-1").replace(" ", "\n"), by)
+    return text.replace("\n", " ").encode("latin-1", "replace")
+
+
+def _maker_program(bench: Bench, maker: str, name: str, frames: str | None) -> Parser:
+    """A program of another maker than UR, read and written."""
+    arm, data = maker_arm(maker, bench.folder), (EXAMPLES / name).read_bytes()
+    if maker == "krl":
+        bench.path("weld.dat", (EXAMPLES / "weld.dat").read_bytes())
+
+    def parse(content: bytes) -> bool:
+        path = bench.path(name, content)
+        given = None if frames is None else EXAMPLES / frames
+        found = understood(path, arm, frames=given, leave=True)
+        if not np.all(np.isfinite(found.q)):
+            raise Accepted(f"{maker}: points that are nowhere")
+        if any(path.with_suffix(s).read_bytes() != c for s, c in found.corrected(found.q).items()):
+            raise Accepted(f"{maker}: text that changed without a correction")
+        return True
+
+    return Parser(maker, lambda by: _text_damaged(data, by), parse, limit_s=10.0)
+
+
+def _own_file(bench: Bench, name: str, text: str, ends: tuple[str, str]) -> Parser:
+    """A description that an arm is written into."""
+    arm = maker_arm("krl", bench.folder)
+    links = arm.links.copy()
+    links[2, :3, 3] += 1e-4
+    new = Corrected(replace(arm, links=links), (), ())
+
+    def parse(content: bytes) -> bool:
+        correct_file(bench.path(name, content), arm, new, *ends)
+        return True
+
+    return Parser(name, lambda by: _text_damaged(text.encode(), by), parse)
+
+
 def _campaign_fit(bench: Bench) -> Parser:
     """A damaged campaign, and its fit."""
     work = bench.folder / "mended.hilcal"
@@ -292,6 +339,13 @@ def parsers() -> list[Parser]:
         _document(bench, "parameters", bench.of_run("parameters"), parameters_document.read),
         _factory(bench),
         _urdf(bench),
+        _maker_program(bench, "krl", "weld.src", "config.dat"),
+        _maker_program(bench, "rapid", "weld.mod", None),
+        _maker_program(bench, "fanuc", "weld.ls", "fanuc.toml"),
+        _maker_program(bench, "inform", "weld.jbi", "yaskawa.toml"),
+        _own_file(bench, "own.urdf", urdf_of("krl"), ("base_link", "tool0")),
+        _own_file(bench, "own.xml", MJCF, ("base", "flange")),
+        _own_file(bench, "own.sdf", SDF, ("base", "tool0")),
         campaigns,
         *stored.parsers(bench),
         _chain(bench),

@@ -16,6 +16,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import corrected
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import UR_JOINTS, frames, ur_kinematics, urdf
+from hilcal.calibration.own_files.correct import correct_file
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import frames_to_json
@@ -148,6 +149,10 @@ def test_every_export_puts_the_tool_where_the_tracker_finds_it(
         "DH": flanges(load_arm(str(tmp_path / "a.toml")), states.q) @ tool,
         "UR yaml": by_ur(text, states.q) @ pose(told["tcp_for_ur_kinematics"]),
     }
+    own, nominal = tmp_path / "own.urdf", cal.model.cell.arm
+    own.write_text(urdf(nominal), encoding="utf-8")
+    into = correct_file(own, nominal, corrected(cal)).content.decode()
+    exported["into a URDF"] = by_pinocchio(into, states.q) @ tool
     for name, poses in exported.items():
         off = np.linalg.norm(poses[:, :3, 3] - wanted, axis=1)
         assert np.mean(off <= band) > 0.9, name

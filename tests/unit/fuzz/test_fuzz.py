@@ -27,6 +27,7 @@ FEW = {
     "mat": 20,
     "calibration": 30,
     "cell": 60,
+    **dict.fromkeys(("krl", "rapid", "fanuc", "inform"), 30),
 }
 PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())}
 

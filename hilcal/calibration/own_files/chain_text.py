@@ -1,0 +1,224 @@
+"""A chain as somebody's description file draws it, and the same chain with a corrected arm.
+
+A file has steps from its base link to its tip link: a place, and behind it a joint or none. Its
+frames are not those of the arm (a mesh wants its own), but where it is the same arm, they lie on
+the same axes: with M_k the links of the nominal arm, C_k of the corrected one, N_k of the file, all
+with the joints' axes along z,
+
+    N_k = H_{k−1}⁻¹ M_k G_k,   G_k = Rz(·) Tz(·),   H_k = Rz(o_k) G_k,   N'_k = H_{k−1}⁻¹ C_k G_k
+
+with o_k where the file has another zero of the joint than the controller, H_{−1} from the base of
+the arm to that of the file, the identity or half a turn about z (as between `base` and `base_link`
+of a UR arm), and G_n from the flange to the tip. What a file has wrong by millimetres is left out
+of G and H, so that N' is exact. Each N'_k is made by one place: that of its joint, behind the last
+joint that of the first step there.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.calibration.dh_table import screw
+from hilcal.calibration.programs.program import Span
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.numbers import length
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.conventions import as_drawn
+from hilcal.types import Floats
+
+SAME = 1e-6
+"""m, rad; frames that differ by less are the same: descriptions are written with six decimals."""
+NEAR_M, NEAR_RAD = 5e-3, 1e-2
+"""m, rad; a file whose axes lie as near as this is of the same arm: many are rounded to
+millimetres, others are corrected already. A choice; what is written is exact in any case."""
+LEFT = 1e-9
+"""m, rad; a place that moves less is left as it is."""
+Edits = list[tuple[Span, str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Step:
+    """One place of a chain.
+
+    Attributes:
+        name: of the element, for people.
+        line: of it, from 1.
+        place: (4, 4) in the frame before it.
+        joint: (4, 4) where the axis is behind it, z along the axis; None where nothing turns.
+        write: edits that give it another place; raises `InputError` where it cannot have one.
+    """
+
+    name: str
+    line: int
+    place: Floats
+    joint: Floats | None
+    write: Callable[[Floats], Edits]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Redrawn:
+    """A chain with a corrected arm.
+
+    Attributes:
+        places: (4, 4) the new place of each step.
+        tip: (4, 4) from the flange of the arm to the tip of the file.
+        lost: (4, 4) what the file has no place for, behind its last joint.
+        rough: by how much its axes lay elsewhere than those of the nominal arm, m.
+    """
+
+    places: tuple[Floats, ...]
+    tip: Floats
+    lost: Floats
+    rough: float
+
+
+def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn:
+    """Return the places that a corrected arm has in a file.
+
+    Args:
+        steps: of the file, base to tip.
+        nominal: the arm that the campaign began with.
+        arm: the corrected one.
+        file: its name, for messages.
+
+    Raises:
+        InputError: the file is of another arm; says which axis lies elsewhere.
+    """
+    turning = [k for k, s in enumerate(steps) if s.joint is not None]
+    if len(turning) != arm.n:
+        names = ", ".join(escaped(steps[k].name) for k in turning)
+        raise InputError(
+            f"{file}: {len(turning)} joints from base to tip ({names}), {nominal.name} has "
+            f"{arm.n}; valid: --base-link and --tip-link that are the ends of the arm"
+        )
+    old, new = as_drawn(nominal).links, as_drawn(arm).links
+    drawn, before, after = [], [], []
+    last, joint = 0, np.eye(4)
+    for k in (*turning, len(steps)):
+        end = steps[k].joint if k < len(steps) else np.eye(4)
+        fixed = _product([s.place for s in steps[last:k]])
+        own = steps[k].place if k < len(steps) else np.eye(4)
+        assert end is not None  # noqa: S101 - `turning` has joints alone
+        drawn.append(se3.inverse(joint) @ fixed @ own @ end)
+        before.append((joint, fixed))
+        after.append(end)
+        last, joint = k + 1, end
+    left, right, rough = _frames(steps, turning, old, drawn, file, nominal.name)
+    places = [s.place for s in steps]
+    lost = np.eye(4)
+    for k, (joint, fixed) in enumerate(before):
+        wanted = se3.inverse(left[k]) @ new[k] @ right[k]
+        if k < len(turning):
+            places[turning[k]] = se3.inverse(fixed) @ joint @ wanted @ se3.inverse(after[k])
+        elif len(steps) > turning[-1] + 1:
+            rest = _product([s.place for s in steps[turning[-1] + 2 :]])
+            places[turning[-1] + 1] = joint @ wanted @ se3.inverse(rest)
+        else:
+            lost = joint @ wanted
+    return Redrawn(tuple(places), right[-1], lost, rough)
+
+
+def _frames(
+    steps: Sequence[Step],
+    turning: Sequence[int],
+    old: Floats,
+    drawn: Sequence[Floats],
+    file: str,
+    name: str,
+) -> tuple[list[Floats], list[Floats], float]:
+    """H_{−1} … H_{n−1}, G_0 … G_n, and how rough the file is; raises as `redrawn` does."""
+    half = np.diag([-1.0, -1.0, 1.0, 1.0])
+    found: list[tuple[int, list[Floats], list[Floats], float]] = []
+    misses: list[tuple[int, float, float]] = []
+    for base in (np.eye(4), half):
+        left, right, zeros, rough = [base], [], 0, 0.0
+        for k in range(len(turning)):
+            g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
+            if k > 0 and not _near(g):
+                left[-1], zeros = _other_zero(old[k], left[-1], drawn[k]), zeros + 1
+                g = se3.inverse(old[k]) @ left[-1] @ drawn[k]
+            if not _near(g):
+                misses.append((k, *_off(g)))
+                break
+            rough = max(rough, _off(g)[0])
+            turn = np.arctan2(g[1, 0] - g[0, 1], g[0, 0] + g[1, 1])
+            right.append(screw(turn, g[2, 3]))
+            left.append(right[-1])
+        else:
+            tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
+            tip = np.eye(4) if moved(tip, np.eye(4)) < NEAR_M else tip
+            found.append((zeros, left, [*right, tip], rough))
+    if not found:
+        k, away, tilt = max(misses)
+        step = steps[turning[k]]
+        raise InputError(
+            f"{file}: line {step.line}: the axis of {escaped(step.name)} lies {length(away)} and "
+            f"{round(float(np.degrees(tilt)), 4):g}° from that of joint {k + 1} of {name}; valid: "
+            "a description of the arm that was measured, from the link of its base on (--base-link)"
+        )
+    return min(found, key=lambda f: f[0])[1:]
+
+
+def _near(g: Floats) -> bool:
+    away, tilt = _off(g)
+    return away < NEAR_M and tilt < NEAR_RAD
+
+
+def _off(g: Floats) -> tuple[float, float]:
+    """Distance and angle of the z axis of a frame from that which it is seen from, m and rad."""
+    return float(np.hypot(*g[:2, 3])), float(np.arctan2(np.hypot(g[0, 2], g[1, 2]), g[2, 2]))
+
+
+def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
+    """H with the turn about z by which the next axis of the file lies on that of the arm."""
+    seen = before @ drawn
+    column = (
+        2 if np.hypot(link[0, 2], link[1, 2]) > NEAR_RAD else 3
+    )  # parallel axes: by where they are
+    turn = np.arctan2(link[1, column], link[0, column])
+    turn -= np.arctan2(seen[1, column], seen[0, column])
+    return screw(float(turn), 0.0) @ before
+
+
+def edits_of(steps: Sequence[Step], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
+    """Edits of all steps that move, and the names of these.
+
+    Raises:
+        InputError: a place cannot be written; names the line.
+    """
+    out: Edits = []
+    names = []
+    for step, place in zip(steps, places, strict=True):
+        if moved(step.place, place) > LEFT:
+            out += step.write(place)
+            names.append(step.name)
+    return out, names
+
+
+def moved(a: Floats, b: Floats) -> float:
+    """By how much places differ, m or rad, whichever is more."""
+    turn = se3.rotation_vector(a[:3, :3].T @ b[:3, :3])
+    return float(max(np.linalg.norm(a[:3, 3] - b[:3, 3]), np.linalg.norm(turn)))
+
+
+def z_to(axis: Floats) -> Floats:
+    """(4, 4) a rotation that takes z to an axis."""
+    z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
+    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
+    x /= np.linalg.norm(x)
+    return se3.matrix(np.stack([x, np.cross(z, x), z], axis=1), np.zeros(3))
+
+
+def numbers(values: Floats) -> str:
+    """Numbers as a description has them, to a nanometre and better."""
+    return " ".join(f"{0.0 if abs(v) < 1e-13 else v:.12g}" for v in values.tolist())
+
+
+def _product(places: Sequence[Floats]) -> Floats:
+    out = np.eye(4)
+    for place in places:
+        out = out @ place
+    return out

@@ -1,0 +1,127 @@
+"""A description of the user, corrected: which kind it is, and what changes in it."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hilcal import limits
+from hilcal.calibration.corrected import Corrected
+from hilcal.calibration.dh_table import dh_rows
+from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, redrawn
+from hilcal.calibration.own_files.mjcf_text import mjcf_steps
+from hilcal.calibration.own_files.sdf_text import sdf_chain
+from hilcal.calibration.own_files.urdf_text import urdf_steps
+from hilcal.calibration.own_files.xml_text import read_xml
+from hilcal.calibration.programs.program import Span, edited
+from hilcal.errors import InputError
+from hilcal.numbers import length
+from hilcal.robot.arm import Arm
+from hilcal.types import Floats
+
+KINDS = "a URDF, a xacro, an MJCF, an SDF, or UR's calibration.conf"
+_DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", re.MULTILINE)
+
+
+@dataclass(frozen=True, slots=True)
+class Correction:
+    """A file with another arm in it.
+
+    Attributes:
+        content: the whole file.
+        said: what was changed, and what the file has no place for.
+    """
+
+    content: bytes
+    said: str
+
+
+def correct_file(
+    path: Path, nominal: Arm, found: Corrected, base: str | None = None, tip: str | None = None
+) -> Correction:
+    """Return a file with the corrected geometry in the place of its own.
+
+    Args:
+        path: a file of `KINDS`.
+        nominal: the arm that the campaign began with.
+        found: the corrected arm.
+        base: name of the link or body that the arm begins at.
+        tip: name of the link, body or site that is its flange.
+
+    Raises:
+        InputError: it cannot be read, is of another arm, or a place in it cannot be written.
+    """
+    if path.suffix == ".conf":
+        return _ur_conf(path, nominal, found.arm)
+    document = read_xml(path)
+    kind = document.root.tag
+    if kind == "mujoco":
+        steps = mjcf_steps(document, base, tip)
+    elif kind == "robot":
+        steps = urdf_steps(document, base, tip)
+    elif kind == "sdf":
+        chain = sdf_chain(document, base, tip)
+        new = redrawn(chain.steps, nominal, found.arm, document.name)
+        edits, names = chain.edits(list(new.places))
+    else:
+        raise InputError(f"{path}: an XML file of <{kind[:40]}>; valid: {KINDS}")
+    if kind != "sdf":
+        new = redrawn(steps, nominal, found.arm, document.name)
+        edits, names = edits_of(steps, new.places)
+    said = f"{path}: {len(names)} places changed ({', '.join(names)}), all else as it was"
+    if new.rough > SAME:
+        said += f"; its axes lay up to {length(new.rough)} from those of the nominal {nominal.name}"
+    if (away := moved(new.lost, np.eye(4))) > LEFT:
+        said += (
+            f"; its tip is the last moving one, which has no place for the flange's own shift "
+            f"({length(away)}): --tip-link"
+        )
+    if moved(new.tip, np.eye(4)) > SAME:
+        said += (
+            f"; its tip lies {length(float(np.linalg.norm(new.tip[:3, 3])))} from the flange of "
+            f"{nominal.name}, and keeps that"
+        )
+    return Correction(edited(document.text, edits).encode("latin-1"), said)
+
+
+def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
+    """Return UR's `calibration.conf` with what the arm's DH rows differ by from the catalogue's.
+
+    The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
+    its model.
+
+    Raises:
+        InputError: it is none, or the arm is none of UR's.
+    """
+    try:
+        text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+    found = {m[2]: m for m in _DELTA.finditer(text)}
+    if set(found) != {"theta", "a", "d", "alpha"}:
+        raise InputError(
+            f"{path}: not the four lines delta_theta, delta_a, delta_d, delta_alpha; valid: UR's "
+            "calibration.conf"
+        )
+    if not nominal.name.startswith("ur"):
+        raise InputError(f"{path}: is for UR arms, the campaign has {nominal.name}")
+    old, new = dh_rows(nominal), dh_rows(arm)
+    turn = (new.offset - old.offset + np.pi) % (2 * np.pi) - np.pi
+    bend = (new.alpha - old.alpha + np.pi) % (2 * np.pi) - np.pi
+    values: dict[str, Floats] = {
+        "theta": turn,
+        "a": new.a - old.a,
+        "d": new.d - old.d,
+        "alpha": bend,
+    }
+    edits = [
+        (Span(0, m.start(3), m.end(3)), f" {', '.join(f'{v:.17g}' for v in values[key])}")
+        for key, m in found.items()
+    ]
+    said = (
+        f"{path}: the four lines delta_… changed, all else as it was. The rows have no place for "
+        f"where joint 1's axis lies in the base (up to {length(new.base_moves)}) and how the "
+        f"flange sits on the last axis (up to {length(new.flange_moves)})"
+    )
+    return Correction(edited(text, edits).encode("latin-1"), said)

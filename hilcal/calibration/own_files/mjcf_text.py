@@ -1,0 +1,193 @@
+"""An MJCF of the user (MuJoCo): `pos` and `quat` of the bodies that its joints turn.
+
+Orientations may be written as `quat`, `axisangle`, `euler`, `xyaxes` or `zaxis`, with the angles of
+`<compiler>`; where one has to change, `quat` takes its place. Axes come from the joint, else from
+its class in `<default>`.
+
+Source: MuJoCo, *XML Reference*: body, joint, site, compiler, frame orientations, default settings.
+"""
+
+import re
+
+import numpy as np
+
+from hilcal.calibration.own_files.chain_text import Edits, Step, numbers, z_to
+from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.programs.program import Span
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+_TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
+
+
+def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Step]:
+    """Return the steps from a base body to a tip, a body or a site.
+
+    Args:
+        document: the file.
+        base: name of the body; the one that carries the first hinge where None.
+        tip: name of a body or a site; the last body with a hinge where None.
+
+    Raises:
+        InputError: no such chain, or one that cannot be read.
+    """
+    world = document.root.first("worldbody")
+    if world is None:
+        raise InputError(f"{document.name}: no <worldbody>; valid: an MJCF with the arm in it")
+    for node in document.root.every("include", "attach", "replicate"):
+        raise InputError(
+            f"{document.name}: line {node.line}: <{node.tag}>; valid: the arm in the file itself"
+        )
+    hinged = [b for b in world.every("body") if b.first("joint") is not None]
+    if not hinged:
+        raise InputError(
+            f"{document.name}: no body with a joint; valid: an MJCF with the arm in it"
+        )
+    if tip is None:
+        ends = [b for b in hinged if not any(o is not b and b in _up(o) for o in hinged)]
+        if len(ends) != 1:
+            names = ", ".join(_name(b) for b in ends)
+            raise InputError(f"{document.name}: give --tip-link; its last bodies: {names}")
+        (end,) = ends
+    else:
+        end = _named(document, world, tip, ("body", "site"))
+    start = hinged[0].parent if base is None else _named(document, world, base, ("body",))
+    above = _up(end)
+    if start is None or start not in above:
+        raise InputError(f"{document.name}: no chain from '{base}' to '{tip}'")
+    return [_step(document, b) for b in reversed(above[: above.index(start)])]
+
+
+def _up(node: Node) -> list[Node]:
+    """An element and those that it stands in."""
+    out = [node]
+    while out[-1].parent is not None:
+        out.append(out[-1].parent)
+    return out
+
+
+def _name(node: Node) -> str:
+    return escaped(node.attributes.get("name", f"<{node.tag}> of line {node.line}"))
+
+
+def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) -> Node:
+    found = [n for n in world.every(*tags) if n.attributes.get("name") == name]
+    if len(found) != 1:
+        valid = ", ".join(_name(n) for n in world.every(*tags) if "name" in n.attributes)
+        raise InputError(
+            f"{document.name}: no {' or '.join(tags)} '{escaped(name)}'; valid: {valid}"
+        )
+    return found[0]
+
+
+def _step(document: Document, node: Node) -> Step:
+    """Return the step of a body or a site; raises as `mjcf_steps` does."""
+    joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
+    if node.tag == "frame" or len(joints) > 1:
+        raise InputError(
+            f"{document.name}: line {node.line}: {_name(node)} is a frame or has several joints; "
+            "valid: one hinge in a body"
+        )
+    pos = document.numbers(node, node.attributes.get("pos", "0 0 0"), 3)
+    place = se3.matrix(_rotation(document, node), pos)
+    turn = None
+    if joints:
+        (joint,) = joints
+        kind = _default(document, joint, "type") or "hinge"
+        if joint.tag != "joint" or kind != "hinge":
+            raise InputError(
+                f"{document.name}: line {joint.line}: joint '{_name(joint)}' is no hinge; valid: "
+                "hinges between base and tip"
+            )
+        axis = document.numbers(joint, _default(document, joint, "axis") or "0 0 1", 3)
+        at = document.numbers(joint, _default(document, joint, "pos") or "0 0 0", 3)
+        turn = se3.matrix(np.eye(3), at) @ z_to(document.direction(joint, axis))
+
+    def write(new: Floats) -> Edits:
+        out: Edits = []
+        if np.abs(new[:3, 3] - pos).max() > 1e-12:
+            out.append(document.put(node, "pos", numbers(new[:3, 3])))
+        turned = se3.rotation_vector(new[:3, :3] @ place[:3, :3].T)
+        if np.linalg.norm(turned) > 1e-12:
+            out += _put_quat(document, node, new[:3, :3])
+        return out
+
+    return Step(_name(node), node.line, place, turn, write)
+
+
+def _put_quat(document: Document, node: Node, r: Floats) -> Edits:
+    """Edits that give an element an orientation."""
+    w = se3.rotation_vector(r)
+    angle = float(np.linalg.norm(w))
+    axis = w / angle if angle > 0 else w
+    value = numbers(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))
+    key = next((k for k in _TURNS if k in node.attributes), "quat")
+    at = document.attribute(node, key)
+    if key == "quat" or at is None:
+        return [document.put(node, "quat", value)]
+    head = document.text.rfind(key, node.begin, at.begin)
+    return [(Span(0, head, at.end), f"quat{document.text[head + len(key) : at.begin]}{value}")]
+
+
+def _rotation(document: Document, node: Node) -> Floats:
+    """(3, 3) orientation of an element."""
+    keys = [k for k in _TURNS if k in node.attributes]
+    if not keys:
+        return np.eye(3)
+    key = keys[0]
+    v = document.numbers(node, node.attributes[key], _TURNS[key])
+    compiler = [c for c in document.root.every("compiler") if "angle" in c.attributes]
+    radian = bool(compiler) and compiler[-1].attributes["angle"] == "radian"
+    unit = 1.0 if radian else np.pi / 180
+    if key == "quat":
+        q = document.direction(node, v)
+        k = se3.skew(q[1:])
+        return np.asarray(np.eye(3) + 2 * q[0] * k + 2 * k @ k)
+    if key == "axisangle":
+        return se3.rotation(unit * v[3] * document.direction(node, v[:3]))
+    if key == "zaxis":
+        z = document.direction(node, v)
+        about = np.cross([0.0, 0.0, 1.0], z)
+        size = float(np.linalg.norm(about))
+        if size < 1e-12:
+            return np.eye(3) if z[2] > 0 else np.diag([1.0, -1.0, -1.0])
+        return se3.rotation(np.arctan2(size, z[2]) * about / size)
+    if key == "xyaxes":
+        x = document.direction(node, v[:3])
+        y = document.direction(node, v[3:] - (x @ v[3:]) * x)
+        return np.stack([x, y, np.cross(x, y)], axis=1)
+    order = [
+        c.attributes["eulerseq"]
+        for c in document.root.every("compiler")
+        if "eulerseq" in c.attributes
+    ]
+    sequence = order[-1] if order else "xyz"
+    if not re.fullmatch(r"[xyzXYZ]{3}", sequence):
+        raise InputError(f"{document.name}: eulerseq '{escaped(sequence)}'; valid: such as xyz")
+    out = np.eye(3)
+    for letter, angle in zip(sequence, v, strict=True):
+        turn = se3.rotation(unit * angle * np.eye(3)["xyz".index(letter.lower())])
+        out = out @ turn if letter.islower() else turn @ out
+    return out
+
+
+def _default(document: Document, joint: Node, key: str) -> str | None:
+    """Attribute of a joint, else of its class, of the class of its bodies, of the main class."""
+    if key in joint.attributes:
+        return joint.attributes[key]
+    name = joint.attributes.get("class") or next(
+        (n.attributes["childclass"] for n in _up(joint) if "childclass" in n.attributes), None
+    )
+    classes = list(document.root.every("default"))
+    at = next(
+        (d for d in classes if d.attributes.get("class") == name),
+        next((d for d in classes if d.parent is document.root), None),
+    )
+    while at is not None and at.tag == "default":
+        found = at.first("joint")
+        if found is not None and key in found.attributes:
+            return found.attributes[key]
+        at = at.parent
+    return None

@@ -1,0 +1,235 @@
+"""An SDF of the user (Gazebo): `<pose>` of its joints and links.
+
+A pose counts from what `relative_to` names; without it, that of a link from the model, that of a
+joint from its child link, as the specification says. A joint that has its place from another frame
+than its child has its pose changed, of every other one the pose of the child link.
+
+Source: *SDFormat Specification* 1.7 and later, "Pose frame semantics".
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hilcal.calibration.handover import origin_of
+from hilcal.calibration.own_files.chain_text import LEFT, Edits, Step, moved, numbers, z_to
+from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.programs.program import Span
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+MODEL = "__model__"
+"""The model's own frame."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SdfChain:
+    """A chain of an SDF, and how it is written.
+
+    Attributes:
+        steps: from the base link to the tip link; their `write` is that of `edits`.
+        document: the file.
+        joints: of the steps.
+    """
+
+    steps: list[Step]
+    document: Document
+    joints: list[Node]
+    model: "_Model"
+
+    def edits(self, places: list[Floats]) -> tuple[Edits, list[str]]:
+        """Edits that give the steps other places, and the names of what moves."""
+        new: dict[str, Floats] = {}
+        given = dict(zip(self.joints, places, strict=True))
+        for joint in self.model.ordered():
+            parent, child = self.model.ends(joint)
+            place = given.get(joint)
+            if place is None:
+                if parent not in new:
+                    continue
+                place = se3.inverse(self.model.place(parent)) @ self.model.place(child)
+            from_ = new[parent] if parent in new else self.model.place(parent)
+            name = joint.attributes.get("name", "")
+            behind = se3.inverse(self.model.place(child)) @ self.model.place(name)
+            new[child] = from_ @ place
+            new[name] = new[child] @ behind
+        out: Edits = []
+        names = []
+        for name, at in new.items():
+            node, reference = self.model.nodes[name], self.model.reference(name)
+            pose = se3.inverse(self.model.place(reference, new)) @ at
+            if moved(self.model.own(name), pose) > LEFT:
+                xyz, rpy = origin_of(pose)
+                out.append(_pose_edit(node, f"{numbers(xyz)} {numbers(rpy)}"))
+                names.append(name)
+            along, other = self.model.axis(node)
+            if along is not None and other:  # an axis in another frame turns with its joint
+                was = self.model.document.numbers(along, self.model.text(along), 3)
+                local = self.model.place(name)[:3, :3].T @ self.model.place(other)[:3, :3] @ was
+                now = self.model.place(other, new)[:3, :3].T @ at[:3, :3] @ local
+                if np.abs(now - was).max() > LEFT:
+                    out.append((Span(0, along.end, along.close), numbers(now)))
+        return out, names
+
+
+class _Model:
+    """Frames of a model: links, joints, frames."""
+
+    def __init__(self, document: Document, node: Node):
+        self.document = document
+        self.nodes: dict[str, Node] = {}
+        for child in node.children:
+            if child.tag in ("model", "include"):
+                raise self._refused(child, "a model in a model; valid: one model with the arm")
+            if child.tag in ("link", "joint", "frame"):
+                name = child.attributes.get("name", "")
+                if name in self.nodes:
+                    raise self._refused(child, f"a second '{escaped(name)}'; valid: names of one")
+                self.nodes[name] = child
+        self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
+
+    def _refused(self, node: Node, what: str) -> InputError:
+        return InputError(f"{self.document.name}: line {node.line}: {what}")
+
+    def text(self, node: Node | None) -> str:
+        """Text of an element; empty where it is none."""
+        if node is None:
+            return ""
+        return self.document.text[node.end : node.close].strip()
+
+    def ends(self, joint: Node) -> tuple[str, str]:
+        """Names of the parent and the child link."""
+        return self.text(joint.first("parent")), self.text(joint.first("child"))
+
+    def own(self, name: str) -> Floats:
+        """(4, 4) pose as written."""
+        pose = self.nodes[name].first("pose")
+        if pose is None or not self.text(pose):
+            return np.eye(4)
+        if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
+            raise self._refused(pose, "a <pose> in degrees or quaternions; valid: x y z r p y, rad")
+        v = self.document.numbers(pose, self.text(pose), 6)
+        turns = [se3.rotation(row) for row in np.diag(v[3:])]
+        return se3.matrix(turns[2] @ turns[1] @ turns[0], v[:3])
+
+    def axis(self, joint: Node) -> tuple[Node | None, str]:
+        """`<xyz>` of a joint, and the frame that it is written in where that is not the joint's."""
+        axis = joint.first("axis")
+        xyz = None if axis is None else axis.first("xyz")
+        return xyz, "" if xyz is None else xyz.attributes.get("expressed_in", "")
+
+    def reference(self, name: str) -> str:
+        """Name of the frame that a pose counts from."""
+        node = self.nodes[name]
+        pose = node.first("pose")
+        given = "" if pose is None else pose.attributes.get("relative_to", "")
+        if given:
+            return given
+        if node.tag == "joint":
+            return self.ends(node)[1]
+        return node.attributes.get("attached_to", "") or MODEL
+
+    def place(self, name: str, new: dict[str, Floats] | None = None, depth: int = 0) -> Floats:
+        """(4, 4) of a frame in the model; those in `new` as they are there."""
+        if new is not None and name in new:
+            return new[name]
+        if name in (MODEL, "world"):
+            return np.eye(4)
+        if name not in self.nodes or depth > len(self.nodes):
+            raise InputError(
+                f"{self.document.name}: frame '{escaped(name)}' is not there, or counts from "
+                "itself; valid: links, joints, frames of the model"
+            )
+        return self.place(self.reference(name), new, depth + 1) @ self.own(name)
+
+    def ordered(self) -> list[Node]:
+        """Joints, each behind that which leads to its parent."""
+        out: list[Node] = []
+        left = list(self.joints)
+        while left:
+            children = {self.ends(j)[1] for j in left}
+            ready = [j for j in left if self.ends(j)[0] not in children]
+            if not ready:
+                raise InputError(f"{self.document.name}: joints go round in a circle")
+            out += ready
+            left = [j for j in left if j not in ready]
+        return out
+
+
+def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain:
+    """Return the chain from a base link to a tip link.
+
+    Args:
+        document: the file.
+        base: name of the link; the first one where None.
+        tip: name of the link; the only one behind the turning joints where None.
+
+    Raises:
+        InputError: no such chain, or one that cannot be read.
+    """
+    models = list(document.root.every("model"))
+    if not models:
+        raise InputError(f"{document.name}: no <model>; valid: an SDF with the arm")
+    model = _Model(document, models[0])
+    leads = {model.ends(j)[1]: j for j in model.ordered() if model.ends(j)[0] != "world"}
+    turning = [j for j in leads.values() if j.attributes.get("type") in ("revolute", "continuous")]
+    if not turning:
+        raise InputError(f"{document.name}: no revolute joint; valid: an SDF with the arm")
+
+    def up(link: str) -> list[Node]:
+        out = []
+        while link in leads:
+            out.append(leads[link])
+            link = model.ends(leads[link])[0]
+        return out
+
+    used = {model.ends(j)[0] for j in leads.values()}
+    ends = [c for c in leads if c not in used and any(j in turning for j in up(c))]
+    for name in (base, tip):
+        if name is not None and (name not in model.nodes or model.nodes[name].tag != "link"):
+            valid = ", ".join(escaped(n) for n, node in model.nodes.items() if node.tag == "link")
+            raise InputError(f"{document.name}: no link '{escaped(name)}'; valid: {valid}")
+    if tip is None and len(ends) != 1:
+        raise InputError(
+            f"{document.name}: give --tip-link, the flange; its last links: {', '.join(ends)}"
+        )
+    joints = up(tip or ends[0])
+    if base is not None:
+        names = [model.ends(j)[0] for j in joints]
+        if base not in names:
+            raise InputError(f"{document.name}: no chain from '{base}' to '{tip or ends[0]}'")
+        joints = joints[: names.index(base) + 1]
+    joints.reverse()
+    return SdfChain([_step(model, j) for j in joints], document, joints, model)
+
+
+def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
+    """Edit that gives a link or joint a pose, where it has none a new one."""
+    pose = node.first("pose")
+    if pose is None or pose.close < pose.end:  # <pose/>
+        at = node.end if pose is None else pose.begin
+        return Span(0, at, at if pose is None else pose.end), f"<pose>{text}</pose>"
+    return Span(0, pose.end, pose.close), text
+
+
+def _step(model: _Model, joint: Node) -> Step:
+    """Return the step of a joint; raises as `sdf_chain` does."""
+    kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
+    parent, child = model.ends(joint)
+    place = se3.inverse(model.place(parent)) @ model.place(child)
+    turn = None
+    if kind in ("revolute", "continuous"):
+        xyz, other = model.axis(joint)
+        along = model.document.numbers(xyz or joint, model.text(xyz) or "0 0 1", 3)
+        along, at = model.document.direction(xyz or joint, along), model.place(name)
+        if other:
+            along = at[:3, :3].T @ model.place(other)[:3, :3] @ along
+        turn = se3.inverse(model.place(child)) @ at @ z_to(along)
+    elif kind != "fixed":
+        raise InputError(
+            f"{model.document.name}: line {joint.line}: joint '{escaped(name)}' is {escaped(kind)};"
+            " valid between base and tip: revolute, continuous, fixed"
+        )
+    return Step(name, joint.line, place, turn, lambda _: [])

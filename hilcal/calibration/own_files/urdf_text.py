@@ -1,0 +1,212 @@
+"""A URDF or xacro of the user: `<origin xyz rpy>` of its joints.
+
+Of a xacro, places that are written as numbers change; an expression `${…}` of numbers and `pi` is
+read, and refused by its line where it would have to change.
+"""
+
+import ast
+import math
+import re
+
+import numpy as np
+
+from hilcal.calibration.handover import origin_of
+from hilcal.calibration.own_files.chain_text import Edits, Step, numbers, z_to
+from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.programs.program import Span
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.robot import se3
+from hilcal.types import Floats
+
+_EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
+_TURNING, _FIXED = ("revolute", "continuous"), "fixed"
+
+
+def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Step]:
+    """Return the steps from a base link to a tip link.
+
+    Args:
+        document: the file.
+        base: name of the link, without what a xacro puts before it; the root link where None.
+        tip: the same of the last one; the only leaf behind the last joint where None.
+
+    Raises:
+        InputError: no such chain.
+    """
+    parents: dict[str, tuple[str, Node]] = {}
+    for joint in document.root.every("joint"):
+        ends = [joint.first(tag) for tag in ("parent", "child")]
+        names = [e.attributes.get("link") for e in ends if e is not None]
+        if len(names) != 2 or None in names:
+            continue
+        parent, child = (str(n) for n in names)
+        if child in parents:
+            raise InputError(
+                f"{document.name}: line {joint.line}: a second joint leads to link "
+                f"'{escaped(child)}'; valid: a tree"
+            )
+        parents[child] = (parent, joint)
+    links = {*parents, *(p for p, _ in parents.values())}
+    if not links:
+        raise InputError(f"{document.name}: no joints; valid: a URDF or a xacro with them")
+    end = _link(document, links, tip) if tip is not None else _leaf(document, parents, links)
+    up = _path(end, parents, document)
+    if base is not None:
+        start = _link(document, links, base)
+        down = _path(start, parents, document)
+        common = next((name for name, _ in down if name in {n for n, _ in up}), None)
+        if common is None:
+            raise InputError(f"{document.name}: no chain from '{base}' to '{tip}'")
+        up = up[: [n for n, _ in up].index(common)]
+        back = down[: [n for n, _ in down].index(common)]
+        inverse = [_step(document, j, turned=True) for _, j in back if j is not None]
+        return [*inverse, *(_step(document, j) for _, j in reversed(up) if j is not None)]
+    return [_step(document, j) for _, j in reversed(up) if j is not None]
+
+
+def _path(
+    link: str, parents: dict[str, tuple[str, Node]], document: Document
+) -> list[tuple[str, Node | None]]:
+    """Links from one up to the root, each with the joint that leads to it."""
+    out: list[tuple[str, Node | None]] = []
+    while link in parents:
+        parent, joint = parents[link]
+        out.append((link, joint))
+        link = parent
+        if len(out) > len(parents):
+            raise InputError(f"{document.name}: its joints go round in a circle; valid: a tree")
+    return [*out, (link, None)]
+
+
+def _plain(name: str) -> str:
+    """A name without the expressions of a xacro."""
+    return _EXPRESSION.sub("", name)
+
+
+def _link(document: Document, links: set[str], name: str) -> str:
+    found = [link for link in links if name in (link, _plain(link))]
+    if len(found) != 1:
+        raise InputError(
+            f"{document.name}: link '{escaped(name)}' is there {len(found)} times; valid: "
+            f"{', '.join(sorted(escaped(_plain(link)) for link in links))}"
+        )
+    return found[0]
+
+
+def _leaf(document: Document, parents: dict[str, tuple[str, Node]], links: set[str]) -> str:
+    """Return the only link behind the moving joints that nothing is attached to."""
+    used = {p for p, _ in parents.values()}
+
+    def moves(link: str) -> bool:
+        return any(
+            j is not None and j.attributes.get("type") in _TURNING
+            for _, j in _path(link, parents, document)
+        )
+
+    leaves = sorted(link for link in links if link not in used and moves(link))
+    if len(leaves) != 1:
+        names = ", ".join(escaped(_plain(link)) for link in leaves)
+        raise InputError(f"{document.name}: give --tip-link, the flange; its last links: {names}")
+    return leaves[0]
+
+
+def _step(document: Document, joint: Node, *, turned: bool = False) -> Step:
+    """Return the step of a joint; `turned`: from its child to its parent.
+
+    Raises:
+        InputError: it neither turns nor is fixed, or its place cannot be read.
+    """
+    kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
+    axis = joint.first("axis")
+    if kind not in (*_TURNING, _FIXED) or (turned and kind != _FIXED):
+        raise InputError(
+            f"{document.name}: line {joint.line}: joint '{escaped(name)}' is {kind or 'nothing'}; "
+            "valid between base and tip: revolute, continuous, fixed"
+        )
+    along = "1 0 0" if axis is None else axis.attributes.get("xyz", "1 0 0")
+    origin = joint.first("origin")
+    given = {} if origin is None else origin.attributes
+    xyz, rpy = (_values(document, origin or joint, given.get(k, "0 0 0")) for k in ("xyz", "rpy"))
+    place = se3.matrix(_of_rpy(rpy), xyz)
+    turn = None
+    if kind != _FIXED:
+        node = axis or joint
+        turn = z_to(document.direction(node, _values(document, node, along)))
+
+    def write(new: Floats) -> Edits:
+        if turned:
+            new = se3.inverse(new)
+        values = dict(zip(("xyz", "rpy"), origin_of(new), strict=True))
+        if origin is None:
+            text = " ".join(f'{k}="{numbers(v)}"' for k, v in values.items())
+            return [(Span(0, joint.end, joint.end), f"<origin {text}/>")]
+        out: Edits = []
+        for key, old in (("xyz", xyz), ("rpy", rpy)):
+            same = np.abs(old - values[key]).max() < 1e-12
+            if same:
+                continue
+            if "$" in given.get(key, ""):
+                raise InputError(
+                    f"{document.name}: line {origin.line}: the place of joint '{escaped(name)}' is "
+                    f"'{escaped(given[key][:60])}', and becomes '{numbers(values[key])}'; write "
+                    "numbers there, or correct what xacro makes of it: xacro F.xacro > F.urdf"
+                )
+            out.append(document.put(origin, key, numbers(values[key])))
+        return out
+
+    return Step(name, joint.line, se3.inverse(place) if turned else place, turn, write)
+
+
+def _of_rpy(rpy: Floats) -> Floats:
+    """(3, 3) of fixed-axis roll, pitch, yaw."""
+    turns = [se3.rotation(row) for row in np.diag(rpy)]
+    return np.asarray(turns[2] @ turns[1] @ turns[0])
+
+
+def _values(document: Document, node: Node, text: str) -> Floats:
+    """Return three numbers, of which a xacro may compute some.
+
+    Raises:
+        InputError: an expression of others than numbers.
+    """
+
+    def computed(m: re.Match[str]) -> str:
+        try:
+            return repr(_constant(ast.parse(m[1].strip(), mode="eval").body))
+        except (ValueError, SyntaxError, ZeroDivisionError, OverflowError, RecursionError):
+            raise InputError(
+                f"{document.name}: line {node.line}: '{escaped(m[0][:60])}' is not of numbers; "
+                "correct what xacro makes of the file: xacro F.xacro > F.urdf"
+            ) from None
+
+    return document.numbers(node, _EXPRESSION.sub(computed, text), 3)
+
+
+def _constant(node: ast.expr) -> float:
+    """Value of an expression of numbers, pi and radians().
+
+    Raises:
+        ValueError: it is another one.
+    """
+    match node:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
+            return float(value)
+        case ast.Name("pi"):
+            return math.pi
+        case ast.UnaryOp(op=ast.USub(), operand=inner):
+            return -_constant(inner)
+        case ast.BinOp(left=a, op=op, right=b):
+            x, y = _constant(a), _constant(b)
+            match op:
+                case ast.Add():
+                    return x + y
+                case ast.Sub():
+                    return x - y
+                case ast.Mult():
+                    return x * y
+                case ast.Div():
+                    return x / y
+        case ast.Call(func=ast.Name("radians"), args=[inner], keywords=[]):
+            return math.radians(_constant(inner))
+    raise ValueError

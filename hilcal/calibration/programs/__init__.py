@@ -1,0 +1,1 @@
+"""Programs of robots in their makers' languages: KRL, RAPID, Fanuc LS, INFORM."""

@@ -1,0 +1,507 @@
+"""KUKA KRL: a module of a `.src` and a `.dat` file.
+
+Points are `E6POS`, `POS`, `FRAME` (X, Y, Z in mm; A, B, C about z, y', x'' in degrees; status S and
+turn T) and `E6AXIS`, `AXIS` (degrees), declared with a value, or written into a motion. `S` has bit
+0 for the wrist centre behind axis 1 and bit 1 for axis 3 beyond the stretched arm, `T` a bit for
+each axis at a negative angle; the controller takes both in PTP motions and neither on paths.
+
+Tool and base are `$TOOL` and `$BASE`, as they are set before the motion in the text by an
+assignment, `BAS(#TOOL, n)`, `BAS(#BASE, n)`, by an inline form (`FDAT`), or in the motion (`WITH`).
+What is set within a branch or a loop is forgotten at its end, and everything at a call of a
+subprogram, which may set both.
+
+Source: KUKA, *KUKA System Software 8.3, Operating and Programming Instructions for System
+Integrators*, chapters 10 to 12; *Expert Programming*, status and turn.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from hilcal.calibration.programs.program import (
+    JOINTS,
+    UNSTATED,
+    Frames,
+    Language,
+    Program,
+    ProgramPoint,
+    Span,
+    arguments_of,
+    frames_of_toml,
+    of_euler,
+    read_text,
+    to_euler,
+)
+from hilcal.errors import InputError
+from hilcal.types import Floats, Ints
+
+POSE, AXES, TURN = ("X", "Y", "Z", "A", "B", "C"), tuple(f"A{k}" for k in range(1, 7)), "T"
+OVERHEAD, ELBOW = 1, 2
+"""Bits of S."""
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_FIELD = re.compile(
+    rf"\b([A-Za-z]\w*)\s+({_NUMBER}|'[BbHh][0-9A-Fa-f]+'|#\w+|\"[^\"]*\"|TRUE|FALSE)"
+)
+_TEXT = re.compile(r'"[^"]*"|;.*')
+_DATA = re.compile(
+    r"^\s*(?:GLOBAL\s+)?(?:DECL\s+)?(?:GLOBAL\s+)?(?:(\w+)\s+)?(\$?\w+(?:\[\s*\d+\s*\])?)\s*=\s*(\{.*)$",
+    re.IGNORECASE,
+)
+_MOTION = re.compile(
+    r"^\s*(S?PTP|S?LIN|S?CIRC|SPL|ASYPTP|S?(?:PTP|LIN|CIRC|SPL)_REL)\b(?!\s*=)", re.IGNORECASE
+)
+_NAME = re.compile(r"\$?[A-Za-z_]\w*(?:\s*\[\s*\d+\s*\])?")
+_PLAIN = re.compile(rf"({_NAME.pattern})?\s*(C_\w+\b|WITH\b|\{{|$)", re.IGNORECASE)
+"""A target that is a name or an aggregate, before what else a motion has."""
+_SET = re.compile(r"^\s*\$(TOOL|BASE)\s*=\s*(.+)$", re.IGNORECASE)
+_BAS = re.compile(r"^\s*BAS\s*\(\s*#(\w+)\s*(?:,\s*([^)]*))?\)", re.IGNORECASE)
+_FDAT = re.compile(r"^\s*FDAT_ACT\s*=\s*(\w+)", re.IGNORECASE)
+_INDEX = re.compile(r"^(TOOL|BASE)_DATA\s*\[\s*(\d+)\s*\]$", re.IGNORECASE)
+_OPENS = ("IF", "SWITCH", "FOR", "WHILE", "LOOP", "REPEAT", "SPLINE")
+_LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
+_CLOSES = ("ENDIF", "ENDSWITCH", "ENDFOR", "ENDWHILE", "ENDLOOP", "UNTIL", "ENDSPLINE")
+_ELSE = ("ELSE", "CASE", "DEFAULT")
+_CALL = re.compile(r"^\s*([A-Za-z_]\w*)\s*\(")
+_NO_CALLS = (
+    *("BAS", "IF", "WHILE", "UNTIL", "SWITCH", "FOR", "WAIT", "PULSE", "HALT", "CASE", "RETURN"),
+    *("CWRITE", "CREAD", "SREAD", "SWRITE", "ANOUT", "ANIN", "TRIGGER", "INTERRUPT"),
+    *("EXT", "EXTFCT", "DEF", "DEFFCT", "GLOBAL", "DECL", "SIGNAL"),
+)
+_FORBIDDEN = re.compile(
+    r"\$(ROBROOT|WORLD|NULLFRAME|ERSYSROOT|TOOL|BASE)\b\s*(\.\w+\s*)?=(?!=)"
+    r"|\$IPO_MODE\s*=\s*#TCP|\$(CORRECTION|PRO_IP)\b",
+    re.IGNORECASE,
+)
+_INERT = re.compile(r"^\s*(\$H_POS|\$POS_RET)\s*=\s*\w+\s*$", re.IGNORECASE)
+"""Statements that read a point and move nothing."""
+
+
+def flags(q: Floats, shape: Ints) -> Ints:
+    """(K, 8) bits 0 and 1 of S, and the bits of T, at joint values (K, 6)."""
+    return np.column_stack([shape[:, 0], 1 - shape[:, 1], (q < 0).astype(np.int64)])
+
+
+def _written(new: Ints, texts: Sequence[str]) -> list[str]:
+    """T with the bits of the flags."""
+    (text,) = texts
+    turn = int(_value(text)) & ~0b111111
+    turn |= sum(1 << k for k, bit in enumerate(new[2:]) if bit == 1)
+    return [str(turn)]
+
+
+KRL = Language(
+    name="KRL",
+    pose=of_euler,
+    numbers=to_euler,
+    decimals=(6, 7, 7),
+    axes=((0, 0, -1), (0, 1, 0), (0, 1, 0), (-1, 0, 0), (0, 1, 0), (-1, 0, 0)),
+    flags=flags,
+    of_shape=(True, True, *(False,) * JOINTS),
+    written=_written,
+)
+
+
+def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Program:
+    """Read a `.src` file with the `.dat` file beside it.
+
+    Args:
+        path: of the `.src` file.
+        frames_file: TOML, or the controller's `$config.dat`; None where there is none.
+        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
+
+    Raises:
+        InputError: it cannot be read, or something could change what its points mean.
+    """
+    beside = next(
+        (
+            p
+            for p in sorted(path.parent.glob("*"))
+            if p.stem == path.stem and p.suffix.lower() == ".dat"
+        ),
+        None,
+    )
+    paths = [path, *([] if beside is None else [beside])]
+    texts, encodings = zip(*(read_text(p) for p in paths), strict=True)
+    if encodings.count("latin-1") and len(set(encodings)) > 1:
+        texts = tuple(p.read_bytes().decode("latin-1") for p in paths)
+    data: dict[str, list[_Value]] = {}
+    if frames_file is not None and frames_file.suffix.lower() == ".dat":
+        _collect(read_text(frames_file)[0], -1, data)
+    known = Frames()
+    if frames_file is not None and frames_file.suffix.lower() == ".toml":
+        known = frames_of_toml(frames_file, of_euler, len(POSE))
+    elif frames_file is not None and frames_file.suffix.lower() != ".dat":
+        raise InputError(f"{frames_file}: valid: a .toml file, or the controller's $config.dat")
+    for k, text in enumerate(texts):
+        _collect(text, k, data)
+    names = [p.name for p in paths]
+    points = _Reader(names, data, replace(known, tool=tool)).points(texts[0])
+    return Program(
+        KRL,
+        tuple(p.suffix for p in paths),
+        texts,
+        points,
+        "latin-1" if "latin-1" in encodings else "utf-8",
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Value:
+    """An aggregate {…}: where it stands, its type, and its fields with their places."""
+
+    file: int
+    line: int
+    kind: str
+    fields: Mapping[str, tuple[str, int, int]]
+
+    def numbers(self, keys: Sequence[str]) -> Floats | None:
+        """Values of some fields; None where one is missing."""
+        try:
+            return np.array([_value(self.fields[k][0]) for k in keys])
+        except (KeyError, ValueError):
+            return None
+
+    def span(self, key: str) -> Span:
+        """Where the number of a field stands."""
+        return Span(self.file, *self.fields[key][1:])
+
+
+def _code(text: str) -> Iterator[tuple[int, int, str]]:
+    """Yield number, place and code of each line: comments and texts blanked, of the same length."""
+    at = 0
+    for number, line in enumerate(text.split("\n"), start=1):
+        code = _TEXT.sub(lambda m: " " * len(m[0]), line.rstrip("\r"))
+        if code.strip() and not code.lstrip().startswith("&"):
+            yield number, at, code
+        at += len(line) + 1
+
+
+def _aggregate(code: str, at: int, file: int, line: int, kind: str) -> _Value:
+    """Fields of an aggregate that begins a text; `at` is its place in the file."""
+    body = code[: code.index("}") + 1] if "}" in code else code
+    fields = {m[1].upper(): (m[2], at + m.start(2), at + m.end(2)) for m in _FIELD.finditer(body)}
+    return _Value(file, line, kind.upper(), fields)
+
+
+def _collect(text: str, file: int, into: dict[str, list[_Value]]) -> None:
+    """Add all aggregates that names are given."""
+    for line, at, code in _code(text):
+        if m := _DATA.match(code):
+            value = _aggregate(m[3], at + m.start(3), file, line, m[1] or "")
+            into.setdefault(_key(m[2]), []).append(value)
+
+
+def _key(name: str) -> str:
+    return re.sub(r"\s", "", name).upper()
+
+
+@dataclass(frozen=True, slots=True)
+class _State:
+    """Tool and base that are set: a pose, or why it is not known."""
+
+    tool: Floats | str
+    base: Floats | str
+
+    def same(self, other: "_State") -> bool:
+        """Whether both are known and the same as elsewhere, or unknown there, too."""
+        return all(
+            a is b
+            or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
+            for a, b in ((self.tool, other.tool), (self.base, other.base))
+        )
+
+
+_NOT_SET = "the program does not set {} before it in the same subprogram"
+
+
+@dataclass(slots=True, eq=False)
+class _Block:
+    """A block that is open: the state at its beginning, and at the ends of its branches."""
+
+    begin: _State
+    ends: list[_State] = field(default_factory=list)
+
+
+class _Reader:
+    """Goes through the statements of a `.src` file in the order of its text."""
+
+    def __init__(self, files: Sequence[str], data: Mapping[str, list[_Value]], known: Frames):
+        self.files, self.data, self.known = files, data, known
+        self.found: dict[str, ProgramPoint] = {}
+        self.at_name: dict[str, str] = {}
+        self.state = _State(*(_NOT_SET.format(n) for n in ("$TOOL", "$BASE")))
+        self.form: str | None = None
+
+    def points(self, text: str) -> tuple[ProgramPoint, ...]:
+        """All points; raises as `read_krl` does."""
+        lines = list(_code(text))
+        used = self._used_otherwise(lines)
+        blocks: list[_Block] = []
+        for k, (line, at, code) in enumerate(lines):
+            m = _NAME.match(code.strip())
+            word = m[0].upper() if m else ""
+            if word in ("DEF", "DEFFCT", "GLOBAL") and re.search(r"\bDEF(FCT)?\b", code, re.I):
+                self.state, blocks = _State(*(_NOT_SET.format(n) for n in ("$TOOL", "$BASE"))), []
+            elif word in _ELSE and blocks:
+                blocks[-1].ends.append(self.state)
+                self.state = blocks[-1].begin
+            elif word in _CLOSES and blocks:
+                block = blocks.pop()
+                if not all(s.same(self.state) for s in (*block.ends, block.begin)):
+                    self._forget(f"the block that ends in line {line} sets them on some ways only")
+            elif word in _OPENS:
+                if word in _LOOPS and _sets(lines[k + 1 :]):
+                    self._forget(f"the loop of line {line} sets them later")
+                blocks.append(_Block(self.state))
+            elif word and re.fullmatch(r"\s*\w+\s*:\s*", code):
+                self._forget(f"line {line} is a label, which may be reached from elsewhere")
+            else:
+                self._statement(line, at, code, used)
+        if not self.found:
+            raise InputError(f"{self.files[0]}: no motions; valid: PTP, LIN, CIRC and their S…")
+        return tuple(self.found.values())
+
+    def _forget(self, because: str) -> None:
+        why = f"its tool and base are not known: {because}"
+        self.state = _State(why, why)
+
+    def _statement(self, line: int, at: int, code: str, used: Mapping[str, int]) -> None:
+        """Take note of one statement; raises as `read_krl` does."""
+        if m := _MOTION.match(code):
+            self._motion(line, at, code, m, used)
+        elif m := _SET.match(code):
+            self._set(m[1].upper(), m[2].strip(), line, at + m.start(2))
+        elif m := _FDAT.match(code):
+            self.form = m[1]
+        elif m := _BAS.match(code):
+            what, number = m[1].upper(), (m[2] or "").strip()
+            if what in ("TOOL", "BASE"):
+                self._set(what, f"{what}_DATA[{number}]", line, at)
+            elif what in ("PTP_PARAMS", "CP_PARAMS", "PTP_DAT", "CP_DAT", "FRAMES"):
+                self._of_form(self.form, line)
+            elif what == "INITMOV":
+                self._forget(f"BAS(#INITMOV) of line {line} sets them to what $config.dat has")
+        elif m := _FORBIDDEN.search(code):
+            raise InputError(
+                f"{self.files[0]}: line {line}: '{m[0].strip()}' changes what points mean; valid: "
+                "$TOOL and $BASE as a whole, a tool on the flange"
+            )
+        elif (m := _CALL.match(code)) and m[1].upper() not in _NO_CALLS:
+            self._forget(f"{m[1][:40]} of line {line} may set them")
+
+    def _of_form(self, name: str | None, line: int, only: str = "") -> None:
+        """Set tool and base of an inline form."""
+        values = self.data.get(_key(name or ""), [])
+        if len(values) != 1 or "TOOL_NO" not in values[0].fields:
+            why = f"the FDAT of line {line} is not in the .dat file"
+            self.state = _State(why, why)
+            return
+        fields = values[0].fields
+        if fields.get("IPO_FRAME", ("#BASE",))[0].upper() != "#BASE":
+            raise InputError(
+                f"{self.files[0]}: line {line}: {name} has its tool outside of the arm "
+                "(IPO_FRAME #TCP); valid: a tool on the flange"
+            )
+        for what in ("TOOL", "BASE"):
+            if only in ("", what):
+                number = fields.get(f"{what}_NO", ("0",))[0]
+                self._set(what, f"{what}_DATA[{number}]", line, 0)
+
+    def _set(self, what: str, value: str, line: int, at: int) -> None:
+        """Set `$TOOL` or `$BASE`."""
+        key, out = what.lower(), self._frame(what, value, line, at)
+        self.state = replace(self.state, **{key: out})
+
+    def _frame(self, what: str, value: str, line: int, at: int) -> Floats | str:
+        """Pose of a value, or why it is not known."""
+        if value.upper() == "$NULLFRAME":
+            return np.eye(4)
+        if value.startswith("{"):
+            numbers = _aggregate(value, at, 0, line, "FRAME").numbers(POSE)
+            return f"${what} of line {line} is not whole" if numbers is None else of_euler(numbers)
+        m = _INDEX.match(value)
+        if m is None or m[1].upper() != what:
+            values = self.data.get(_key(value), [])
+            numbers = values[0].numbers(POSE) if len(values) == 1 else None
+            if numbers is None:
+                return f"${what} of line {line} is computed"
+            return of_euler(numbers)
+        number = m[2]
+        table = self.known.tools if what == "TOOL" else self.known.bases
+        if number in table:
+            return table[number]
+        values = self.data.get(f"{what}_DATA[{number}]", [])
+        numbers = values[0].numbers(POSE) if len(values) == 1 else None
+        if numbers is not None:
+            return of_euler(numbers)
+        if number == "0":
+            return np.eye(4)
+        if what == "TOOL" and self.known.tool is not None:
+            return self.known.tool
+        other = " or --tool" if what == "TOOL" else ""
+        return (
+            f"{what}_DATA[{number}] is not in the program; give it by --frames (a copy of "
+            f"$config.dat, or TOML){other}"
+        )
+
+    def _motion(
+        self, line: int, at: int, code: str, m: re.Match[str], used: Mapping[str, int]
+    ) -> None:
+        """Take the targets of a motion."""
+        word = m[1].upper()
+        rest, begin = code[m.end() :], at + m.end()
+        head, _, with_ = re.split(r"(\bWITH\b)", f"{rest} WITH ", maxsplit=1, flags=re.I)
+        with_ = with_.rpartition("WITH")[0] if "WITH" in rest.upper() else ""
+        before = self.state
+        for what in ("TOOL", "BASE"):
+            if given := re.search(rf"\${what}\s*=\s*(.+?)(?=,\s*\$|$)", with_, re.I):
+                text = given[1].strip()
+                form = re.match(r"\w+\s*\(.*?\b(\w+)(?:\.\w+)?\s*\)", text)
+                if form and _key(form[1]) in self.data:
+                    self._of_form(form[1], line, what)
+                else:
+                    self._set(what, text, line, 0)
+        left = ""
+        if word.endswith("_REL") or word == "ASYPTP":
+            left = f"{word} is not corrected"
+        elif "CIRC" in word and re.search(r"\bCA\b", head, re.I):
+            left = "a circle with CA does not end at the point that is stated"
+        targets = [
+            (b, t) for b, t in arguments_of(head) if not re.match(r"\s*(CA|C_\w+)\b", t, re.I)
+        ]
+        for offset, target in targets[: 2 if "CIRC" in word else 1]:
+            self._target(line, begin + offset, target, word in ("PTP", "SPTP"), left, used)
+        self.state = before
+
+    def _target(
+        self, line: int, at: int, text: str, obeyed: bool, left: str, used: Mapping[str, int]
+    ) -> None:
+        """Take one target."""
+        body = re.sub(r"\s+C_(PTP|DIS|VEL|ORI|SPL)\b.*", "", text, flags=re.I).strip()
+        at += len(text) - len(text.lstrip())
+        if body.startswith("{"):
+            value, key = _aggregate(text.strip(), at, 0, line, ""), f"line {line}, {at}"
+            name = f"line {line}"
+        else:
+            values, key = self.data.get(_key(body), []), _key(body)
+            name = f"line {line}"
+            if not _NAME.fullmatch(body):
+                left = left or f"the point '{body[:40]}' is computed while the program runs"
+            elif len(values) != 1 or values[0].file < 0:
+                what = "is not in this program" if not values else "has several values"
+                left = left or f"the point '{body[:40]}' {what}"
+            elif key in used:
+                left = left or f"line {used[key]} uses or changes '{body[:40]}' otherwise"
+            if len(values) == 1 and values[0].file >= 0:
+                value = values[0]
+                name = f"{body} ({self.files[value.file]} line {value.line})"
+            else:
+                value = _Value(0, line, "", {})
+        new = self._point(value, name, line, obeyed, left)
+        old = self.found.get(key)
+        if old is not None and not old.left:
+            if not new.left and not (
+                np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
+            ):
+                new = replace(old, left=f"line {line} has it with another tool or base")
+            elif not new.left:
+                new = replace(old, obeyed=old.obeyed or obeyed)
+        elif old is not None:
+            new = old
+        self.found[key] = new
+
+    def _point(self, value: _Value, name: str, line: int, obeyed: bool, left: str) -> ProgramPoint:
+        """Return a point of an aggregate."""
+        bare = ProgramPoint(value.line if value.fields else line, name)
+        if left:
+            return replace(bare, left=left)
+        moved = [k for k, f in value.fields.items() if re.fullmatch(r"E[1-6]", k) and _moves(f[0])]
+        if moved:
+            return replace(bare, left=f"{moved[0]} moves, and it is not known what that carries")
+        if AXES[0] in value.fields:
+            numbers = value.numbers(AXES)
+            if numbers is None:
+                return replace(bare, left="not all of A1 to A6 are written")
+            spans = tuple(value.span(k) for k in AXES)
+            return replace(
+                bare, numbers=spans, values=numbers, joints=True, tool=self._tool_or_one()
+            )
+        numbers = value.numbers(POSE)
+        if numbers is None:
+            return replace(bare, left="not all of X, Y, Z, A, B, C are written")
+        for state in (self.state.tool, self.state.base):
+            if isinstance(state, str):
+                return replace(bare, left=state)
+        s, t = (value.numbers([k]) for k in ("S", TURN))
+        status = [UNSTATED] * 2 if s is None else [int(s[0]) & OVERHEAD, int(s[0]) // ELBOW & 1]
+        turn = [UNSTATED] * JOINTS if t is None else [int(t[0]) >> k & 1 for k in range(JOINTS)]
+        assert isinstance(self.state.tool, np.ndarray)  # noqa: S101 - no text, see above
+        assert isinstance(self.state.base, np.ndarray)  # noqa: S101 - no text, see above
+        return replace(
+            bare,
+            numbers=tuple(value.span(k) for k in POSE),
+            values=numbers,
+            frame=self.state.base,
+            tool=self.state.tool,
+            flags=(*status, *turn),
+            config=() if t is None else (value.span(TURN),),
+            obeyed=obeyed,
+        )
+
+    def _tool_or_one(self) -> Floats:
+        return self.state.tool if isinstance(self.state.tool, np.ndarray) else np.eye(4)
+
+    def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
+        """Names of points that statements use which are no motions to them, with their lines."""
+        out: dict[str, int] = {}
+        keys: dict[str, list[str]] = {}
+        for key in self.data:
+            for name in {key, key.partition("[")[0]}:
+                keys.setdefault(name, []).append(key)
+        for line, _, code in lines:
+            if m := _MOTION.match(code):
+                targets = [t.strip() for _, t in arguments_of(code[m.end() :])]
+                plain = not m[1].upper().endswith("_REL")
+                texts = [t for t in targets if not (plain and _PLAIN.match(t))]
+            else:
+                texts = [] if _DATA.match(code) or _INERT.match(code) else [code]
+            for name in (_key(n) for text in texts for n in _NAME.findall(text)):
+                for key in keys.get(name, ()):
+                    out.setdefault(key, line)
+        return out
+
+
+def _value(text: str) -> float:
+    """Value of a number: 1.5, 'B010', 'H2A'.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if text.startswith("'"):
+        return int(text[2:-1], 2 if text[1] in "Bb" else 16)
+    return float(text)
+
+
+def _moves(text: str) -> bool:
+    try:
+        return _value(text) != 0
+    except ValueError:
+        return True
+
+
+def _sets(lines: Sequence[tuple[int, int, str]]) -> bool:
+    """Whether a loop, whose statements these begin with, may set tool or base."""
+    depth = 0
+    for _, _, code in lines:
+        m = _NAME.match(code.strip())
+        word = m[0].upper() if m else ""
+        depth += (word in _OPENS) - (word in _CLOSES)
+        if depth < 0:
+            return False
+        call = _CALL.match(code)
+        if _SET.match(code) or _BAS.match(code) or (call and call[1].upper() not in _NO_CALLS):
+            return True
+    return False

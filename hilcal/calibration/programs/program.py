@@ -1,0 +1,393 @@
+"""What a program of any maker holds: its points, where their numbers stand, and what they count in.
+
+A point is joint values, or a pose of a tool in a frame. Its numbers are replaced where they stand;
+all other text stays, byte by byte. A point that did not move keeps its own text, too.
+
+A pose becomes the pose at which the nominal arm, which is the one that the controller computes
+with, has the corrected joint values:
+
+    T_frame_tool = T_base_frame⁻¹ T_base_flange(q) T_flange_tool
+"""
+
+import re
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from pydantic import Field
+
+from hilcal import limits
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.toml import Number, Section, load_section
+from hilcal.types import Floats, Ints
+
+JOINTS = 6
+SAME_M, SAME_RAD = 2e-9, 2e-9
+"""m, rad; a point that moved less keeps its text: above what the inverse leaves, see
+`calibration.compensation.TOLERANCE`, and below what any controller resolves."""
+GIMBAL = 1e-9
+"""cos B below which A and C turn about one axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """A piece of a text."""
+
+    file: int
+    begin: int
+    end: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ProgramPoint:
+    """One point of a program, in the order of its first use.
+
+    Attributes:
+        line: of its numbers, from 1.
+        name: for people, with its line.
+        numbers: where its numbers stand: joint values, or those of a pose.
+        values: (k,) these as written.
+        joints: whether they are joint values.
+        scale: (6,) what the language counts joint values in, per rad.
+        frame: (4, 4) T_base_frame that a pose counts from.
+        tool: (4, 4) T_flange_tool.
+        flags: the configuration as `Language.flags` has it; −99 where it is not stated.
+        config: where what of it may change stands; empty where it cannot.
+        obeyed: whether the controller takes the configuration that is stated; it goes on from the
+            point before otherwise.
+        made: text of the whole span `numbers[0]`, with places for the numbers and the changeable
+            configuration, where the point is computed in the program (`Offs(p, …)`); else "".
+        left: why it is left as it is; empty where it is understood.
+        blend_m: 0, since only URScript states it at the point.
+    """
+
+    line: int
+    name: str
+    numbers: tuple[Span, ...] = ()
+    values: Floats = field(default_factory=lambda: np.empty(0))
+    joints: bool = False
+    scale: Floats = field(default_factory=lambda: np.full(JOINTS, np.degrees(1.0)))
+    frame: Floats = field(default_factory=lambda: np.eye(4))
+    tool: Floats = field(default_factory=lambda: np.eye(4))
+    flags: tuple[int, ...] = ()
+    config: tuple[Span, ...] = ()
+    obeyed: bool = True
+    made: str = ""
+    left: str = ""
+    blend_m: float = 0.0
+
+
+UNSTATED = -99
+
+
+@dataclass(frozen=True, slots=True)
+class Language:
+    """How a maker writes points.
+
+    Attributes:
+        name: of the language.
+        pose: T (4, 4) of the numbers of a pose.
+        numbers: the numbers of T (4, 4), near to those that were there.
+        decimals: of a position in mm, of the orientation, of joint values; at least these.
+        axes: (6, 3) directions of the axes of the maker's arms with spherical wrist, all joint
+            values zero, in axes of the controller's base.
+        flags: (K, F) configuration at joint values (K, 6), by the `branch.shape` (K, 2) there.
+        of_shape: (F,) which of these the shape of the arm tells, and not the joint values alone.
+        written: what stands at `ProgramPoint.config`, from the flags and the texts that are there.
+        padded: whether numbers stand in columns.
+    """
+
+    name: str
+    pose: Callable[[Floats], Floats]
+    numbers: Callable[[Floats, Floats], Floats]
+    decimals: tuple[int, int, int]
+    axes: tuple[tuple[int, int, int], ...]
+    flags: Callable[[Floats, Ints], Ints]
+    of_shape: tuple[bool, ...]
+    written: Callable[[Ints, Sequence[str]], list[str]]
+    padded: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Program:
+    """A program.
+
+    Attributes:
+        language: its language.
+        suffixes: of its files.
+        texts: of its files, as they are.
+        points: in the order of their first use.
+        encoding: of the files.
+    """
+
+    language: Language
+    suffixes: tuple[str, ...]
+    texts: tuple[str, ...]
+    points: tuple[ProgramPoint, ...]
+    encoding: str = "utf-8"
+
+    @property
+    def understood(self) -> list[ProgramPoint]:
+        """Points that are not left."""
+        return [p for p in self.points if not p.left]
+
+    def corrected(
+        self, arm: Arm, found: Sequence[ProgramPoint], given: Floats, q: Floats, flags: Ints
+    ) -> dict[str, bytes]:
+        """Return the files, by suffix, with other points.
+
+        Args:
+            arm: the nominal one.
+            found: N points of it.
+            given: (N, 6) joint values of them as they were, rad.
+            q: (N, 6) joint values that they get.
+            flags: (N, F) configuration that they get.
+
+        Raises:
+            InputError: the configuration changes where it cannot be written; names the line.
+        """
+        edits: list[tuple[Span, str]] = []
+        poses = evaluate(arm, q)
+        for k, p in enumerate(found):
+            flange = se3.matrix(poses.rotation[-1][k], poses.position[-1][k])
+            edits += _edits(self, p, flange, given[k], q[k], flags[k])
+        return {
+            suffix: edited(text, [(s, new) for s, new in edits if s.file == k]).encode(
+                self.encoding
+            )
+            for k, (suffix, text) in enumerate(zip(self.suffixes, self.texts, strict=True))
+        }
+
+
+def _edits(
+    program: Program, p: ProgramPoint, flange: Floats, given: Floats, q: Floats, flags: Ints
+) -> list[tuple[Span, str]]:
+    """Texts that change at one point; raises as `Program.corrected` does."""
+    language = program.language
+    if np.abs(q - given).max() < SAME_RAD:
+        return []
+    if p.joints:
+        degrees = np.allclose(p.scale, np.degrees(1.0))  # others are pulses, which are whole
+        return _numbers(program, p, q * p.scale, [language.decimals[2] if degrees else 0] * JOINTS)
+    goal = se3.inverse(p.frame) @ flange @ p.tool
+    was = language.pose(p.values)
+    turned = se3.rotation_vector(goal[:3, :3] @ was[:3, :3].T)
+    moved = np.linalg.norm(goal[:3, 3] - was[:3, 3])
+    if moved < SAME_M and np.linalg.norm(turned) < SAME_RAD:
+        return []
+    new = language.numbers(goal, p.values)
+    decimals = [language.decimals[0]] * 3 + [language.decimals[1]] * (len(new) - 3)
+    old = [program.texts[s.file][s.begin : s.end] for s in p.config]
+    words = language.written(flags, old) if p.config or p.made else []
+    if not words and np.any(flags != np.array(p.flags)):
+        raise InputError(
+            f"{p.name}: the correction takes a joint into another configuration, which is stated "
+            "for several points at once; valid: joint values in its place"
+        )
+    if p.made:
+        texts = [f"{v:.{d}f}" for v, d in zip(new, decimals, strict=True)]
+        return [(p.numbers[0], p.made.format(*texts, *words))]
+    changed = [(s, w) for s, w, o in zip(p.config, words, old, strict=True) if w != o]
+    return _numbers(program, p, new, decimals) + changed
+
+
+def _numbers(
+    program: Program, p: ProgramPoint, new: Floats, decimals: Sequence[int]
+) -> list[tuple[Span, str]]:
+    """Numbers in the place of those that were there, with as many decimals at least."""
+    out = []
+    for span, value, least in zip(p.numbers, new.tolist(), decimals, strict=True):
+        old = program.texts[span.file][span.begin : span.end]
+        digits = old.lower().partition("e")[0].partition(".")[2]
+        text = f"{value:.{max(least, len(digits.strip())) if least else 0}f}"
+        if text.strip("-0.") == "":
+            text = text.lstrip("-")
+        if program.language.padded:
+            text = text.rjust(len(old))
+            text = text if text.startswith(" ") or not old.startswith(" ") else f" {text}"
+        out.append((span, text))
+    return out
+
+
+def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
+    """Return a text with other pieces in the place of some."""
+    parts, at = [], 0
+    for span, new in sorted(edits, key=lambda e: e[0].begin):
+        parts += [text[at : span.begin], new]
+        at = span.end
+    return "".join([*parts, text[at:]])
+
+
+def read_text(path: Path) -> tuple[str, str]:
+    """Text of a file with its line ends as they are, and its encoding.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        raw = limits.read_bytes(path, limits.SCRIPT)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read as a program: {error}") from None
+    if b"\x00" in raw:
+        raise InputError(f"{path}: a binary file; valid: a program as text")
+    try:
+        return raw.decode("utf-8"), "utf-8"
+    except UnicodeDecodeError:
+        return raw.decode("latin-1"), "latin-1"  # controllers write comments in the local set
+
+
+def arguments_of(text: str) -> list[tuple[int, str]]:
+    """Parts between commas that are in no bracket, with their places."""
+    out, depth, begin = [], 0, 0
+    for k, sign in enumerate(text):
+        depth += (sign in "{[(") - (sign in "}])")
+        if sign == "," and depth == 0:
+            out.append((begin, text[begin:k]))
+            begin = k + 1
+    return [*out, (begin, text[begin:])]
+
+
+def line_of(text: str, at: int) -> int:
+    """Line of a place in a text, from 1."""
+    return bisect_left(_ends(text), at) + 1
+
+
+@lru_cache(maxsize=4)
+def _ends(text: str) -> list[int]:
+    """Where the lines of a text end."""
+    return [m.start() for m in re.finditer("\n", text)]
+
+
+class _FramesFile(Section):
+    """`--frames F.toml`: the controller's tools and frames, as it shows them."""
+
+    tools: dict[str, tuple[Number, ...]] = Field(default_factory=dict, description="numbers")
+    bases: dict[str, tuple[Number, ...]] = Field(default_factory=dict, description="numbers")
+    pulses_per_degree: tuple[Number, ...] | None = Field(None, description="a number per joint")
+    turn_axes: tuple[int, ...] | None = Field(None, description="three numbers of axes")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frames:
+    """What the controller keeps apart from programs.
+
+    Attributes:
+        tools: (4, 4) T_flange_tool by number or name.
+        bases: (4, 4) T_base_frame by number or name.
+        pulses: (6,) pulses per rad; None where they are not given.
+        turn_axes: axes that the three turn numbers of a Fanuc are of, `$SCR_GRP[1].$TURN_AXIS`.
+        tool: (4, 4) of tools that are not in `tools`, from --tool; None without it.
+    """
+
+    tools: Mapping[str, Floats] = field(default_factory=dict)
+    bases: Mapping[str, Floats] = field(default_factory=dict)
+    pulses: Floats | None = None
+    turn_axes: tuple[int, ...] | None = None
+    tool: Floats | None = None
+
+
+def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> Frames:
+    """Read `--frames F.toml`.
+
+    Args:
+        path: the file.
+        pose: of the maker's numbers.
+        count: how many these are.
+
+    Raises:
+        InputError: it cannot be used.
+    """
+    found = load_section(path, _FramesFile)
+    groups = []
+    for key, group in (("tools", found.tools), ("bases", found.bases)):
+        for name, numbers in group.items():
+            if len(numbers) != count:
+                raise InputError(
+                    f"{path.name}: {key}.{escaped(name)} has {len(numbers)} numbers; valid: "
+                    f"{count}, as the controller shows them: mm and degrees"
+                    + (", x y z q1 q2 q3 q4" if count > JOINTS else "")
+                )
+        groups.append({name: pose(np.array(numbers)) for name, numbers in group.items()})
+    pulses = found.pulses_per_degree
+    if pulses is not None and (len(pulses) != JOINTS or not all(pulses)):
+        raise InputError(f"{path.name}: pulses_per_degree; valid: {JOINTS} numbers other than 0")
+    axes = found.turn_axes
+    if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
+        raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
+    per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
+    return Frames(groups[0], groups[1], per_rad, axes)
+
+
+def toml_frames(
+    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
+) -> Frames:
+    """Read `--frames F.toml`, where there is one; raises as `frames_of_toml` does.
+
+    Raises:
+        InputError: it is no TOML file.
+    """
+    if path is None:
+        return Frames(tool=tool)
+    if path.suffix.lower() != ".toml":
+        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
+    return replace(frames_of_toml(path, language.pose, count), tool=tool)
+
+
+def frame_of(known: Frames, what: str, number: str) -> Floats | str:
+    """Pose of a tool ("tool") or frame ("frame") by its number, or why it is not known."""
+    table = known.tools if what == "tool" else known.bases
+    if number in table:
+        return table[number]
+    if number == "0":
+        return np.eye(4)
+    if what == "tool" and known.tool is not None:
+        return known.tool
+    key, other = ("tools", " or --tool") if what == "tool" else ("bases", "")
+    return f"{what} {number} is not in the program; give it by --frames F.toml, [{key}]{other}"
+
+
+def of_euler(values: Floats) -> Floats:
+    """T (4, 4) of x, y, z in mm and turns about z, then y, then x in degrees: Rz(A) Ry(B) Rx(C)."""
+    with np.errstate(invalid="ignore"):  # what is not finite is refused by its line
+        (ca, cb, cc), (sa, sb, sc) = (f(np.radians(values[3:6])) for f in (np.cos, np.sin))
+    r = np.array(
+        [
+            [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],
+            [sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc],
+            [-sb, cb * sc, cb * cc],
+        ]
+    )
+    return se3.matrix(r, 1e-3 * np.asarray(values[:3], dtype=float))
+
+
+def to_euler(t: Floats, near: Floats) -> Floats:
+    """x, y, z in mm and A, B, C in degrees of T (4, 4): of all that are the same, the nearest."""
+    r = t[:3, :3]
+    a = np.radians(near[3])
+    if np.hypot(r[0, 0], r[1, 0]) > GIMBAL:
+        a = np.arctan2(r[1, 0], r[0, 0])
+    ca, sa = np.cos(a), np.sin(a)
+    b = np.arctan2(-r[2, 0], ca * r[0, 0] + sa * r[1, 0])
+    c = np.arctan2(sa * r[0, 2] - ca * r[1, 2], ca * r[1, 1] - sa * r[0, 1])
+    both = np.degrees([[a, b, c], [a + np.pi, np.pi - b, c + np.pi]])
+    both += 360.0 * np.rint((near[3:6] - both) / 360.0)
+    angles = both[int(np.argmin(np.abs(both - near[3:6]).sum(axis=1)))]
+    return np.concatenate([1e3 * t[:3, 3], angles])
+
+
+def of_wpr(values: Floats) -> Floats:
+    """T (4, 4) of x, y, z in mm and W, P, R in degrees: Rz(R) Ry(P) Rx(W)."""
+    return of_euler(np.concatenate([values[:3], values[5:2:-1]]))
+
+
+def to_wpr(t: Floats, near: Floats) -> Floats:
+    """Inverse of `of_wpr`, near to what was there."""
+    out = to_euler(t, np.concatenate([near[:3], near[5:2:-1]]))
+    return np.concatenate([out[:3], out[5:2:-1]])

@@ -1,0 +1,403 @@
+"""Programs of four makers: points are where Pinocchio and SciPy have them, all other text stays.
+
+The examples were written after the makers' published syntax. Their Cartesian numbers are of
+Pinocchio's forward kinematics of `Q`, with SciPy's rotations.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilcal.calibration.programs.branch import flags_of, resolve, unlike
+from hilcal.calibration.programs.fanuc import LS
+from hilcal.calibration.programs.inform import INFORM
+from hilcal.calibration.programs.krl import KRL
+from hilcal.calibration.programs.languages import Understood, understood
+from hilcal.calibration.programs.program import UNSTATED, Language, Program, ProgramPoint
+from hilcal.calibration.programs.rapid import RAPID
+from hilcal.errors import InputError
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+from tests.support.maker_arms import EXAMPLES, maker_arm, urdf_of
+
+DELTA = 1e-3 * np.array([0.7, -0.4, 0.9, -1.1, 0.5, -0.8])
+
+
+def place(kind: str, values: list[float]) -> Floats:
+    """A pose in mm by SciPy: "ZYX" and "xyz" angles in degrees, or a quaternion, w first."""
+    turn = (
+        Rotation.from_quat(np.roll(values[3:], -1))
+        if kind == "wxyz"
+        else Rotation.from_euler(kind, values[3:], degrees=True)
+    )
+    return se3.matrix(turn.as_matrix(), 1e-3 * np.array(values[:3]))
+
+
+@dataclass(frozen=True)
+class Example:
+    """A program, the joint values that it means, and one of its poses for other eyes."""
+
+    file: str
+    frames: str | None
+    language: Language
+    q: tuple[tuple[float, ...], ...]
+    kind: str
+    pose: str
+    at: int
+    frame: Floats
+    tool: Floats
+    atol: float
+
+
+EXAMPLE = {
+    "krl": Example(
+        "weld.src",
+        "config.dat",
+        KRL,
+        (
+            (10, -70, 100, 20, -60, 30),
+            (-20, -80, 110, 15, 50, 160),  # on a straight line T = 35 is not looked at
+            (25, -60, 95, -170, 40, 100),
+            (5, -75, 100, 10, 60, 0),
+            (12, -72, 102, 18, -58, 28),
+            (14, -74, 104, 16, -56, 26),
+            (14, -74, 104, 16, -56, 26),
+        ),
+        "ZYX",
+        r"XP1=\{X (\S+),Y (\S+),Z (\S+),A (\S+),B (\S+),C ([^,]+),",
+        0,
+        place("ZYX", [800, -200, 150, 30, 0, 0]),
+        place("ZYX", [120.5, -3.2, 210, 10, 20, -30]),
+        1e-8,
+    ),
+    "rapid": Example(
+        "weld.mod",
+        None,
+        RAPID,
+        (
+            (0, -10.5, 20, 0, 30, 0),
+            (10, 20, 15, 30, 40, -100),
+            (-15, 25, 5, -20, -50, 170),
+            (4.9999999, 8.043691, 14.6296544, 0.4466837, 52.3264061, 0.3305581),  # Offs
+            (5, 10, 20, 0.5, 45, 0.25),
+            (2.6023405, 11.0143368, 12.9875339, 6.1665176, 52.3497838, -20.5280617),  # RelTool
+            (7, 12, 18, 10, 45, 5),
+        ),
+        "wxyz",
+        r"p10:=\[\[(\S+?),(\S+?),(\S+?)\],\[(\S+?),(\S+?),(\S+?),(\S+?)\]",
+        1,
+        place("wxyz", [300, 50, 100, 0.5**0.5, 0, 0, 0.5**0.5])
+        @ place("xyz", [10, -20, 30, 0, 0, 0]),
+        place("wxyz", [0, 20, 150, 0.9659258262890683, 0, 0.25881904510252074, 0]),
+        1e-8,
+    ),
+    "fanuc": Example(
+        "weld.ls",
+        "fanuc.toml",
+        LS,
+        (
+            (10, 20, -15, 30, -60, 40),
+            (-12, 25, -20, 20, -50, -30),
+            (20, 15, -25, -40, 55, 100),
+            (0, -10.5, 15, 0, -75, 0),
+        ),
+        "xyz",
+        r"P\[1\]\{[^}]*?X =\s*(\S+)\s*mm,\s*Y =\s*(\S+)\s*mm,\s*Z =\s*(\S+)\s*mm,"
+        r"\s*W =\s*(\S+)\s*deg,\s*P =\s*(\S+)\s*deg,\s*R =\s*(\S+)\s*deg",
+        0,
+        place("xyz", [400, 100, -50, 0, 0, 35]),
+        place("xyz", [15, -8, 120, 5, -10, 20]),
+        1e-5,
+    ),
+    "inform": Example(
+        "weld.jbi",
+        "yaskawa.toml",
+        INFORM,
+        (
+            (0, -5, 10, 0, -70, 0),
+            (15, 10, -20, 25, -60, 40),
+            (-10, 15, -15, -30, -55, 60),
+            (20, 12, -18, 120, 60, -40),
+            (22, 14, -20, 118, 62, -42),
+        ),
+        "xyz",
+        r"C00001=(\S+?),(\S+?),(\S+?),(\S+?),(\S+?),(\S+)",
+        1,
+        place("xyz", [350, -100, 20, 0, 0, -20]),
+        place("xyz", [0, 30, 140, 0, 15, 0]),
+        3e-6,
+    ),
+}
+
+
+@pytest.fixture(scope="session")
+def arms(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Arm]:
+    folder = tmp_path_factory.mktemp("arms")
+    return {maker: maker_arm(maker, folder) for maker in EXAMPLE}
+
+
+@cache
+def flange(maker: str, q: tuple[float, ...]) -> Floats:
+    """Pose of the flange by Pinocchio."""
+    model = pin.buildModelFromXML(urdf_of(maker))
+    data = model.createData()
+    pin.framesForwardKinematics(model, data, np.array(q))
+    return np.array(data.oMf[model.getFrameId("tool0")].homogeneous)
+
+
+def read(maker: str, arms: dict[str, Arm], folder: Path = EXAMPLES, **more: object) -> Understood:
+    e = EXAMPLE[maker]
+    frames = None if e.frames is None else EXAMPLES / e.frames
+    return understood(folder / e.file, arms[maker], frames=frames, **more)  # type: ignore[arg-type]
+
+
+def copied(maker: str, folder: Path, change: Callable[[str], str]) -> None:
+    """Write the example, all of its files changed."""
+    stem = EXAMPLE[maker].file.partition(".")[0]
+    suffixes = (".src", ".dat") if maker == "krl" else (Path(EXAMPLE[maker].file).suffix,)
+    for suffix in suffixes:
+        text = (EXAMPLES / f"{stem}{suffix}").read_bytes().decode("latin-1")
+        (folder / f"{stem}{suffix}").write_bytes(change(text).encode("latin-1"))
+
+
+@pytest.mark.parametrize("maker", EXAMPLE)
+def test_points_are_where_pinocchio_has_them(maker: str, arms: dict[str, Arm]) -> None:
+    q = np.degrees(read(maker, arms).q)
+    # numbers of three decimals leave that much near a singular wrist
+    np.testing.assert_allclose(q, EXAMPLE[maker].q, atol=1e-3)
+
+
+@pytest.mark.parametrize("ends", ["\r\n", "\n"])
+@pytest.mark.parametrize("maker", EXAMPLE)
+def test_without_a_correction_every_byte_stays(
+    maker: str, ends: str, arms: dict[str, Arm], tmp_path: Path
+) -> None:
+    copied(maker, tmp_path, lambda text: text.replace("\r\n", ends))
+    found = read(maker, arms, tmp_path)
+    noise = 1e-11 * np.random.default_rng(0).standard_normal(found.q.shape)
+    for suffix, content in found.corrected(found.q + noise).items():
+        assert content == (tmp_path / f"weld{suffix}").read_bytes()
+
+
+@pytest.mark.parametrize("maker", EXAMPLE)
+def test_a_corrected_program_means_the_corrected_joint_values(
+    maker: str, arms: dict[str, Arm], tmp_path: Path
+) -> None:
+    """By its own reading, and one pose by other eyes: a pattern, SciPy and Pinocchio."""
+    e, found = EXAMPLE[maker], read(maker, arms)
+    wanted = found.q + DELTA
+    numbers = re.compile(r"(?<![A-Za-z\d])[-+]?\s*(\d+\.?\d*|\.\d+)(E\+?\d+)?")
+    for suffix, content in found.corrected(wanted).items():
+        (tmp_path / f"weld{suffix}").write_bytes(content)
+        old = (EXAMPLES / f"weld{suffix}").read_bytes().decode("latin-1").split("\r\n")
+        new = content.decode("latin-1").split("\r\n")
+        assert len(old) == len(new)
+        for a, b in zip(old, new, strict=True):
+            if "Offs(" not in a and "RelTool(" not in a:
+                assert re.sub(r"\s", "", numbers.sub("0", a)) == re.sub(
+                    r"\s", "", numbers.sub("0", b)
+                )
+        changed = [a for a, b in zip(old, new, strict=True) if a != b]
+        assert len(changed) == {"src": 3, "dat": 4, "mod": 7, "ls": 8, "jbi": 5}[suffix[1:]]
+        if m := re.search(e.pose, "\n".join(new)):
+            pose = e.frame @ place(e.kind, [float(v) for v in m.groups()]) @ se3.inverse(e.tool)
+            there = flange(maker, tuple((np.radians(e.q[e.at]) + DELTA).tolist()))
+            np.testing.assert_allclose(pose, there, atol=10 * e.atol)
+    again = read(maker, arms, tmp_path)
+    np.testing.assert_allclose(again.q, wanted, atol=3e-5 if maker in ("fanuc", "inform") else 1e-7)
+
+
+def test_offs_and_reltool_move_as_abb_defines_them() -> None:
+    """Offs in the object frame; RelTool in the tool's: about x, the new y, the new z."""
+    e = EXAMPLE["rapid"]
+    offs, p30, relative = (
+        se3.inverse(e.frame) @ flange("rapid", tuple(np.radians(e.q[k]).tolist())) @ e.tool
+        for k in (3, 4, 5)
+    )
+    np.testing.assert_allclose(offs[:3, 3] - p30[:3, 3], [0, 0, 0.04], atol=1e-7)
+    np.testing.assert_allclose(offs[:3, :3], p30[:3, :3], atol=1e-7)
+    step = place("XYZ", [5, 0, -30, 4, 0, -15])
+    np.testing.assert_allclose(relative, p30 @ step, atol=1e-7)
+
+
+@pytest.mark.parametrize("maker", EXAMPLE)
+def test_flags_tell_every_branch_and_turn(maker: str, arms: dict[str, Arm]) -> None:
+    arm, language = arms[maker], EXAMPLE[maker].language
+    assert unlike(arm, language) == ""
+    q = np.random.default_rng(5).uniform(0.9 * arm.q_min, 0.9 * arm.q_max, (12, 6))
+    q[:, 4] = np.where(np.abs(q[:, 4]) < 0.2, 0.5, q[:, 4])
+    chain = evaluate(arm, q)
+    poses = se3.matrix(chain.rotation[-1], chain.position[-1])
+    near = np.array([0, 0, 0, 1, 0, 0, 0]) if maker == "rapid" else np.zeros(6)
+    points = tuple(
+        ProgramPoint(k, f"{k}", values=language.numbers(pose, near), flags=tuple(flags.tolist()))
+        for k, (pose, flags) in enumerate(zip(poses, flags_of(arm, language, q), strict=True))
+    )
+    found, doubts, said = resolve(Program(language, (), (), points), arm, None)
+    assert not any(doubts)
+    assert not said
+    np.testing.assert_allclose(found, q, atol=1e-6)
+
+
+def test_a_joint_that_passes_zero_changes_its_turn(arms: dict[str, Arm], tmp_path: Path) -> None:
+    copied("krl", tmp_path, lambda t: t.replace("gun", "gun"))
+    found = read("krl", arms, tmp_path)
+    q = found.q.copy()
+    q[0, 3], q[2, 0] = -0.01, -0.02  # joint 4 of XP1, joint 1 of XP3
+    dat = found.corrected(q)[".dat"].decode("latin-1")
+    assert re.search(r"XP1=.*,S 2,T 26,E1", dat)  # 18 + 8
+    assert re.search(r"XP3=.*,S 'B010',T 11\}", dat)  # 10 + 1
+    rapid = read("rapid", arms)
+    q = rapid.q.copy()
+    q[1, 5] = np.radians(-89.9)  # from quadrant -2 to -1
+    assert re.search(r"p10:=.*\],\[0,0,-1,0\],\[9E9", rapid.corrected(q)[".mod"].decode())
+    inform = read("inform", arms)
+    q = inform.q.copy()
+    q[3, 3] = np.radians(89.0)  # no flip becomes flip
+    with pytest.raises(InputError, match=r"C00003 \(line 17\): .* another configuration"):
+        inform.corrected(q)
+
+
+@pytest.mark.parametrize(
+    ("maker", "old", "new", "words"),
+    [
+        ("krl", "LIN XP2 C_DIS", "LIN XP2:XP3 C_DIS", "line 28: the point 'XP2:XP3' is computed"),
+        ("krl", "gripper_open( )", "XP1.X=XP1.X+1", "XP1 (weld.dat line 7): line 31 uses or chang"),
+        ("krl", "gripper_open( )", "PTP_REL {A1 5}", "line 31: PTP_REL is not corrected"),
+        ("krl", "PTP home1", "PTP XHOME", "line 37: the point 'XHOME' is not in this program"),
+        ("krl", "PTP home1", "open( )", "not known: open of line 37 may set them"),
+        ("krl", "$OUT[7]=TRUE", "$TOOL.X=5", "line 40: '$TOOL.X=' changes what points mean"),
+        ("krl", "$OUT[7]=TRUE", "$IPO_MODE=#TCP", "line 40: '$IPO_MODE=#TCP' changes"),
+        ("krl", "BAS(#TOOL, 1)", "BAS(#TOOL, 5)", "TOOL_DATA[5] is not in the program; give it"),
+        ("krl", "E1 0.0,E2", "E1 20.0,E2", "E1 moves, and it is not known what that carries"),
+        ("krl", "#BASE", "#TCP", "has its tool outside of the arm"),
+        ("krl", ",S 2,T 18,E1", ",S 0,T 18,E1", "no solution of krl has the configuration"),
+        ("krl", "A1 5,", "", "(weld.dat line 14): not all of X, Y, Z"),
+        ("rapid", "MoveL p30,", "p30.trans.x:=1;MoveL p30,", "'Offs(p30,0,0,40)' is computed"),
+        ("rapid", "MoveL p30,", "MoveL CRobT(),", "line 20: the point 'CRobT()' is computed"),
+        (
+            "rapid",
+            "SetDO doGrip,1",
+            "PDispOn p10,tGun",
+            "line 22: PDispOn changes what points mean",
+        ),
+        ("rapid", "SetDO doGrip,1", "SearchL di1,p,p10,v9,tGun", "uses or changes 'p10'"),
+        ("rapid", "0,0,40)", "0,0,z)", "is computed while the program runs"),
+        ("rapid", "fine,tool0;", "fine,tPen;", "the tool 'tPen' is not in the module; give it by"),
+        ("rapid", "[FALSE,TRUE,", "[FALSE,FALSE,", "the work object 'wTable' is not fixed"),
+        ("rapid", ",[9E+09,", ",[150,", "an external axis moves"),
+        ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", "P[2] (line 25): line 12 uses P[2]"),
+        ("fanuc", "L P[3]", "L PR[3]", "line 15: a position register"),
+        ("fanuc", "L P[3]", "L P[R[1]]", "otherwise than as the target of a plain motion"),
+        ("fanuc", "R[1]=R[1]+1", "UFRAME[1]=PR[2]", "line 14: 'UFRAME[1]=' changes a frame"),
+        ("fanuc", "UF : 1, UT : 2", "UF : 4, UT : 2", "frame 4 is not in the program; give it"),
+        ("fanuc", "T, 0, 0, 0", "T, 0, 0, 1", "turn_axes = [1, 4, 6]"),
+        (
+            "inform",
+            "DOUT OT#(1) ON",
+            "SFTON P001 UF#(1)",
+            "line 28: SFTON changes what points mean",
+        ),
+        ("inform", "DOUT OT#(1) ON", "IMOV P007 V=9", "line 28: IMOV is not corrected; and 1 more"),
+        ("inform", "POSTYPE USER", "POSTYPE MASTER", "POSTYPE MASTER is not corrected"),
+        ("inform", "///USER 3", "///USER 9", "frame 9 is not in the program; give it by --frames"),
+        ("inform", "C00003=", "BC00001=500.0\r\nC00003=", "a base axis moves the arm"),
+        ("inform", "P007 V", "P008 V", "line 30: the point 'P008 V=50.0' is not in this job"),
+    ],
+)
+def test_what_is_not_understood_is_refused_by_line(
+    maker: str, old: str, new: str, words: str, arms: dict[str, Arm], tmp_path: Path
+) -> None:
+    copied(maker, tmp_path, lambda text: text.replace(old, new))
+    with pytest.raises(InputError) as error:
+        read(maker, arms, tmp_path)
+    assert words in str(error.value)
+    assert "weld." in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("maker", "old", "new", "left"),
+    [
+        ("krl", "gripper_open( )", "PTP_REL {A1 5}", ["line 31"]),
+        ("krl", "LIN XP2 C_DIS", "LIN XP2:XP3 C_DIS", ["line 28", "XP3 (weld.dat line 12)"]),
+        ("rapid", "Offs(p30,0,0,40)", "Offs(p30,0,0,z)", ["line 19", "line 20"]),
+        ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", ["P[2] (line 25)"]),
+    ],
+)
+def test_what_is_left_and_all_that_it_counts_from_stay_as_they_are(
+    maker: str, old: str, new: str, left: list[str], arms: dict[str, Arm], tmp_path: Path
+) -> None:
+    copied(maker, tmp_path, lambda text: text.replace(old, new))
+    found = read(maker, arms, tmp_path, leave=True)
+    assert [p.name for p in found.program.points if p.left] == left
+    for suffix, content in found.corrected(found.q + DELTA).items():
+        before = (tmp_path / f"weld{suffix}").read_bytes().split(b"\r\n")
+        for p in found.program.points:
+            if p.left and (p.name.startswith("line") != (suffix == ".dat")):
+                assert content.split(b"\r\n")[p.line - 1] == before[p.line - 1]
+
+
+def test_frames_on_some_ways_only_are_not_known(arms: dict[str, Arm], tmp_path: Path) -> None:
+    """What a branch or a loop sets is not taken for what holds behind it."""
+    copied(
+        "krl",
+        tmp_path,
+        lambda t: t.replace("PTP home1", "IF $IN[1] THEN\r\n$BASE = $NULLFRAME\r\nENDIF"),
+    )
+    with pytest.raises(InputError, match="block that ends in line 39 sets them on some ways only"):
+        read("krl", arms, tmp_path)
+    copied(
+        "krl",
+        tmp_path,
+        lambda t: t.replace("PTP home1", "LOOP").replace("$OUT[7]=TRUE", "BAS(#BASE,0)\r\nENDLOOP"),
+    )
+    with pytest.raises(InputError, match="the loop of line 37 sets them later"):
+        read("krl", arms, tmp_path)
+
+
+def test_an_arm_of_another_form_has_its_branches_from_the_point_before(tmp_path: Path) -> None:
+    """A UR arm: no spherical wrist, so that S and cfx are not read, and that is said."""
+    arm = load_arm("ur10e")
+    q = np.radians([[0, -80, 100, -110, -90, 10], [5, -85, 105, -108, -88, 12]])
+    chain = evaluate(arm, q)
+    poses = se3.matrix(chain.rotation[-1], chain.position[-1])
+    points = tuple(
+        ProgramPoint(k + 1, f"line {k + 1}", values=KRL.numbers(pose, np.zeros(6)), flags=flags)
+        for k, (pose, flags) in enumerate(
+            zip(poses, [(0, 1, *(UNSTATED,) * 6), (1, 0, *(UNSTATED,) * 6)], strict=True)
+        )
+    )
+    program = Program(KRL, (), (), points)
+    found, doubts, said = resolve(program, arm, q[0] + 0.05)
+    assert not any(doubts)
+    np.testing.assert_allclose(found, q, atol=1e-8)
+    assert (
+        "2 points state a shape of the arm that is read for KRL arms of the usual form" in said[0]
+    )
+    assert "give --near" in resolve(program, arm, None)[1][0]
+
+
+@pytest.mark.parametrize("b", [90.0, -90.0, 89.99999, 90.0 - 1e-9, 0.0])
+@pytest.mark.parametrize("language", [KRL, LS])
+def test_angles_are_those_that_were_there_at_every_pitch(language: Language, b: float) -> None:
+    given = np.array([100.0, 200.0, 300.0, 170.0, b, -175.0])
+    pose = language.pose(given)
+    found = language.numbers(pose, given)
+    np.testing.assert_allclose(language.pose(found), pose, atol=1e-12)
+    if b == 0.0:
+        np.testing.assert_allclose(found, given, atol=1e-9)
+    turned = pose @ se3.matrix(se3.rotation(np.array([1e-3, 2e-3, -1e-3])), np.zeros(3))
+    near = language.numbers(turned, given)
+    np.testing.assert_allclose(language.pose(near), turned, atol=1e-12)
+    kind = "ZYX" if language is KRL else "xyz"
+    np.testing.assert_allclose(place(kind, near.tolist()), turned, atol=1e-12)

@@ -1,0 +1,287 @@
+"""Descriptions of the user, corrected where their numbers stand: against Pinocchio and others."""
+
+import difflib
+import re
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilcal.calibration.corrected import Corrected
+from hilcal.calibration.handover import matlab
+from hilcal.calibration.own_files.correct import Correction, correct_file
+from hilcal.errors import InputError
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.catalogue import load_arm
+from hilcal.robot.chain import evaluate
+from hilcal.robot.conventions import with_conventions
+from hilcal.types import Floats
+from tests.support.description_files import MJCF, SDF
+from tests.support.maker_arms import maker_arm, urdf_of
+
+Q = np.random.default_rng(1).uniform(-2, 2, (12, 6))
+NM = 1e-9
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Arm:
+    return maker_arm("krl", tmp_path)
+
+
+def changed(arm: Arm, where: slice = slice(None), seed: int = 0) -> Arm:
+    off = se3.matrix(*se3.exp(3e-4 * np.random.default_rng(seed).standard_normal((7, 6))))
+    links = arm.links.copy()
+    links[where] = links[where] @ off[where]
+    return replace(arm, links=links)
+
+
+def flanges(arm: Arm, q: Floats = Q) -> Floats:
+    chain = evaluate(arm, q)
+    return se3.matrix(chain.rotation[-1], chain.position[-1])
+
+
+def correct(path: Path, nominal: Arm, new: Arm, *ends: str | None) -> Correction:
+    return correct_file(path, nominal, Corrected(new, (), ()), *ends)
+
+
+def by_pinocchio(model: pin.Model, base: str, tip: str) -> Floats:
+    data, out = model.createData(), []
+    for row in Q:
+        pin.framesForwardKinematics(model, data, row)
+        a, b = (data.oMf[model.getFrameId(name)] for name in (base, tip))
+        out.append((a.inverse() * b).homogeneous.copy())
+    return np.stack(out)
+
+
+def lines_changed(before: str, after: str) -> list[str]:
+    found = difflib.unified_diff(before.split("\n"), after.split("\n"), n=0, lineterm="")
+    return [line[1:] for line in found if line.startswith("+") and not line.startswith("+++")]
+
+
+def test_a_urdf_keeps_all_but_the_origins_of_its_joints(arm: Arm, tmp_path: Path) -> None:
+    text = urdf_of("krl").replace("'", '"').replace("\n", "\r\n")
+    text = text.replace(
+        '<link name="link_2"/>',
+        '<link name="link_2"><!-- häßlich --><visual><origin xyz="1 2 3" rpy="0 0 1"/><geometry>'
+        '<mesh filename="package://a/b.stl"/></geometry></visual></link>',
+    )
+    text = text.replace('<origin xyz="0.61 0 0" rpy="0 0 0"/>', "<origin xyz='0.61 0 0'/>")
+    text = text.replace('<origin xyz="0 0 0" rpy="0 0 0"/>', "")  # joint 6
+    path, new = tmp_path / "mine.urdf", changed(arm)
+    path.write_bytes(text.encode())
+    found = correct(path, arm, new)
+    after = found.content.decode()
+    path.write_bytes(found.content)
+    made = by_pinocchio(pin.buildModelFromUrdf(str(path)), "base_link", "tool0")
+    np.testing.assert_allclose(made, flanges(new), atol=NM)
+    assert len(lines_changed(text, after)) == 7
+    joint_origin = re.compile(r"(<joint[^>]*>)(<origin[^>]*/>)?")
+    assert joint_origin.sub(r"\1", after) == joint_origin.sub(r"\1", text)
+    assert "7 places changed (j1, j2, j3, j4, j5, j6, flange)" in found.said
+    assert correct(tmp_path / "krl.urdf", arm, arm).content == (tmp_path / "krl.urdf").read_bytes()
+
+
+def test_a_urdf_with_a_base_beside_and_zeros_of_its_own(tmp_path: Path) -> None:
+    """`base` is a leaf, half a turn from `base_link`; the controller counts from other zeros."""
+    drawn = maker_arm("krl", tmp_path)
+    text = (tmp_path / "krl.urdf").read_text()
+    extra = (
+        "<link name='base'/><joint name='to_base' type='fixed'><origin xyz='0 0 0.1' "
+        "rpy='0 0 3.141592653589793'/><parent link='base_link'/><child link='base'/></joint>"
+    )
+    path = tmp_path / "mine.urdf"
+    path.write_text(text.replace("</robot>", f"{extra}</robot>"))
+    up = se3.matrix(np.diag([-1.0, -1.0, 1.0]), np.array([0, 0, 0.1]))
+    links = drawn.links.copy()
+    links[0] = se3.inverse(up) @ links[0]
+    sign, zero = np.array([1.0, -1, 1, 1, -1, 1]), np.array([0.1, -1.57, 0, 0.3, 0, 0])
+    arm = with_conventions(replace(drawn, links=links), sign, zero, np.zeros((6, 6)))
+    new = changed(arm)
+    path.write_bytes(correct(path, arm, new, "base", "tool0").content)
+    model = pin.buildModelFromUrdf(str(path))
+    data = model.createData()
+    for row, expected in zip(Q, flanges(new), strict=True):
+        pin.framesForwardKinematics(model, data, sign * row + zero)
+        a, b = (data.oMf[model.getFrameId(name)] for name in ("base", "tool0"))
+        np.testing.assert_allclose((a.inverse() * b).homogeneous, expected, atol=NM)
+
+
+def test_a_xacro_is_corrected_where_it_has_numbers(arm: Arm, tmp_path: Path) -> None:
+    text = urdf_of("krl").replace("1.5707963267948966", "${pi/2}")
+    text = re.sub(r"'(base_link|link_\d|tool0|j\d)'", r"'${prefix}\1'", text)
+    text = text.replace("<robot name='krl'>", "<robot xmlns:xacro='x'><xacro:macro name='krl'>")
+    text = text.replace("</robot>", "</xacro:macro></robot>")
+    path = tmp_path / "krl.xacro"
+    path.write_text(text)
+    found = correct(path, arm, changed(arm, slice(1, 5)), "base_link", "tool0")
+    assert "places changed (${prefix}j2, ${prefix}j3, ${prefix}j4, ${prefix}j5)" in found.said
+    assert len(lines_changed(text, found.content.decode())) == 4
+    assert found.content.decode().count("${pi/2}") == 1
+    with pytest.raises(InputError, match=r"krl\.xacro: line 16: the place of joint 'flange' is"):
+        correct(path, arm, changed(arm), "base_link", "tool0")
+    path.write_text(text.replace("0 0 0.45", "0 0 ${h1}"))
+    with pytest.raises(InputError, match=r"line 10: '\$\{h1\}' is not of numbers; .* xacro F"):
+        correct(path, arm, changed(arm), "base_link", "tool0")
+
+
+def test_an_mjcf_is_the_corrected_arm_to_pinocchio(arm: Arm, tmp_path: Path) -> None:
+    path, new = tmp_path / "lab.xml", changed(arm)
+    path.write_text(MJCF)
+    before = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
+    np.testing.assert_allclose(before, flanges(arm), atol=NM)
+    found = correct(path, arm, new, "base", "flange")
+    path.write_bytes(found.content)
+    made = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
+    np.testing.assert_allclose(made, flanges(new), atol=NM)
+    after = found.content.decode()
+    assert len(lines_changed(MJCF, after)) == 7
+    assert "<!-- the arm of bay 3 -->" in after
+    assert "1 places have" not in found.said
+    rounded = MJCF.replace("0.61 0.1 0", "0.612 0.1 0").replace("0 0 0.66", "0 0 0.663")
+    path.write_text(rounded)
+    found = correct(path, arm, new, "base", "flange")
+    assert "its axes lay up to 3.00 mm from those of the nominal krl" in found.said
+    path.write_bytes(found.content)
+    again = by_pinocchio(pin.buildModelFromMJCF(str(path)), "base", "flange")
+    np.testing.assert_allclose(again, flanges(new), atol=NM)
+    lost = correct(path, new, changed(new), "base")
+    assert "no place for the flange's own shift" in lost.said
+
+
+def sdf_flanges(text: str) -> Floats:
+    """Forward kinematics of an SDF by ElementTree and SciPy."""
+    model = ElementTree.fromstring(text.partition("?>")[2]).find("model")
+    assert model is not None
+    named = {e.get("name"): e for e in model if e.tag in ("link", "joint")}
+
+    def at(name: str | None) -> Floats:
+        if name in (None, "__model__"):
+            return np.eye(4)
+        e = named[name]
+        pose, out = e.find("pose"), np.eye(4)
+        if pose is not None:
+            v = [float(x) for x in str(pose.text).split()]
+            out = se3.matrix(Rotation.from_euler("xyz", v[3:]).as_matrix(), np.array(v[:3]))
+        over = None if pose is None else pose.get("relative_to")
+        return at(over or (e.findtext("child") if e.tag == "joint" else None)) @ out
+
+    result = []
+    for row in Q:
+        place = at("base")
+        for k, angle in enumerate(row):
+            joint = named[f"a{k + 1}"]
+            xyz = joint.find("axis/xyz")
+            assert xyz is not None
+            axis = np.array([float(v) for v in str(xyz.text).split()])
+            axis = at(xyz.get("expressed_in") or f"a{k + 1}")[:3, :3] @ axis
+            axis = at(f"a{k + 1}")[:3, :3].T @ axis
+            parent, child = (str(joint.findtext(tag)) for tag in ("parent", "child"))
+            turn = se3.matrix(Rotation.from_rotvec(angle * axis).as_matrix(), np.zeros(3))
+            to_joint = se3.inverse(at(parent)) @ at(f"a{k + 1}")
+            place = place @ to_joint @ turn @ se3.inverse(at(f"a{k + 1}")) @ at(child)
+        result.append(place @ se3.inverse(at("l6")) @ at("tool0"))
+    return np.stack(result)
+
+
+def test_an_sdf_is_the_corrected_arm_and_carries_what_hangs_on_it(arm: Arm, tmp_path: Path) -> None:
+    path, new = tmp_path / "lab.sdf", changed(arm)
+    path.write_text(SDF)
+    np.testing.assert_allclose(sdf_flanges(SDF), flanges(arm), atol=NM)
+    found = correct(path, arm, new, "base", "tool0")
+    after = found.content.decode()
+    np.testing.assert_allclose(sdf_flanges(after), flanges(new), atol=1e-8)
+    assert "<!-- by hand -->" in after
+    poses = re.compile(r"(<pose[^>]*>|<xyz[^>]*>)[^<]*")
+    assert poses.sub(r"\1", after) == poses.sub(r"\1", SDF)
+    assert '<pose relative_to="a2">0 0 0 -0.3 0 0</pose>' in after  # follows its joint
+    (grip,) = re.findall(r'gripper"><pose>([^<]*)', after)
+    assert grip != "1.6 0 0.47 0 0 0"
+    (tool,) = re.findall(r'tool0"><pose relative_to="l6">([^<]*)', after)
+    assert tool != "0.08 0 0 0 1.5707963267948966 0"
+
+
+def test_ur_s_calibration_conf_makes_the_controller_s_rows_the_arm(tmp_path: Path) -> None:
+    """Its classic rows with the deltas added, multiplied out."""
+    nominal = load_arm("ur10e")
+    new = changed(nominal, slice(1, 6))  # the rows have no place for base and flange
+    text = (
+        "[mounting]\r\ndelta_theta = [ 9.1e-08, 0, 0, 0, 0, 0]\r\ndelta_a = [ 0, 0, 0, 0, 0, 0]\r\n"
+        "delta_d = [0, 0, 0, 0, 0, 0]\r\ndelta_alpha = [ 0, 0, 0, 0, 0, 0] # rad\r\n"
+        "joint_checksum = [ 0xb3241580, 0xb10112f1]\r\ncalibration_status = 2 # 2 == Linearised\r\n"
+    )
+    path = tmp_path / "calibration.conf"
+    path.write_bytes(text.encode())
+    after = correct(path, nominal, new).content.decode()
+    assert len(lines_changed(text, after)) == 4
+    deltas = {
+        key: np.array([float(v) for v in values.split(",")])
+        for key, values in re.findall(r"delta_(\w+) = \[([^\]]*)\]", after)
+    }
+    a = np.array([0, -0.6127, -0.57155, 0, 0, 0]) + deltas["a"]
+    d = np.array([0.1807, 0, 0, 0.17415, 0.11985, 0.11655]) + deltas["d"]
+    alpha = np.array([np.pi / 2, 0, 0, np.pi / 2, -np.pi / 2, 0]) + deltas["alpha"]
+    for row, expected in zip(Q, flanges(new), strict=True):
+        place = np.eye(4)
+        for k in range(6):
+            turn = Rotation.from_euler("z", row[k] + deltas["theta"][k]).as_matrix()
+            bend = Rotation.from_euler("x", alpha[k]).as_matrix()
+            place = place @ se3.matrix(turn, np.array([0, 0, d[k]]))
+            place = place @ se3.matrix(bend, np.array([a[k], 0, 0]))
+        np.testing.assert_allclose(place, expected, atol=1e-8)  # d of hundreds of metres cancel
+    other = replace(nominal, name="kr10")
+    with pytest.raises(InputError, match="is for UR arms, the campaign has kr10"):
+        correct(path, other, new)
+
+
+def test_a_matlab_function_builds_the_arm(arm: Arm) -> None:
+    """Its transforms, multiplied out as rigidBodyTree does."""
+    text = matlab(changed(arm), "lab_arm", "made")
+    assert text.startswith("function robot = lab_arm()\n% made\n")
+    fixed = [
+        np.array([[float(v) for v in row.split()] for row in rows.split(";")])
+        for rows in re.findall(r"setFixedTransform\(joint, \[([^\]]*)\]\)", text)
+    ]
+    parents = re.findall(r"addBody\(robot, body, '(\w+)'\)", text)
+    assert parents == ["base", *(f"link_{k}" for k in range(1, 7))]
+    for row, expected in zip(Q, flanges(changed(arm)), strict=True):
+        place = np.eye(4)
+        for k, t in enumerate(fixed):
+            angle = row[k] if k < 6 else 0.0
+            turn = Rotation.from_euler("z", angle).as_matrix()
+            place = place @ t @ se3.matrix(turn, np.zeros(3))
+        np.testing.assert_allclose(place, expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (urdf_of("rapid"), "line 10: the axis of j1 lies 0 µm and 180°"),
+        (
+            urdf_of("krl").replace("0.61 0 0", "0.68 0 0"),
+            "line 12: the axis of j3 lies 70.0 mm and 0° from that of joint 3",
+        ),
+        (urdf_of("krl").replace("'revolute'", "'prismatic'", 1), "joint 'j1' is prismatic"),
+        (urdf_of("krl").replace("0.61 0 0", "0.61 0"), "has '0.61 0'; valid: 3 numbers"),
+        (urdf_of("krl").replace("'flange' type='fixed'", "'f' type='floating'"), "is floating"),
+        ("<robot>", "no XML"),
+        ("<html/>", "an XML file of <html>; valid: a URDF"),
+        ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "entities of its own"),
+        (MJCF.replace("a6", "a6' type='slide", 1).replace("'", '"'), "is no hinge"),
+        (SDF.replace('a6" type="revolute"', 'a6" type="screw"'), "joint 'a6' is screw"),
+        (SDF.replace('relative_to="l6"', 'relative_to="nowhere"'), "frame 'nowhere' is not there"),
+    ],
+)
+def test_other_files_are_refused_by_line(text: str, words: str, arm: Arm, tmp_path: Path) -> None:
+    path = tmp_path / "mine.xml"
+    path.write_text(text)
+    tip = "flange" if "mujoco" in text else "tool0"
+    base = "base" if "<mujoco" in text or "<sdf" in text else "base_link"
+    with pytest.raises(InputError) as error:
+        correct(path, arm, changed(arm), base, tip)
+    assert words in str(error.value)
+    assert "mine.xml" in str(error.value)
