@@ -229,6 +229,10 @@ def test_another_arm_is_calibrated_by_itself(
 HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_steps.py::test_"
 PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
 DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
+KINEMATICS = (
+    "tests/wire/test_polyscope_x_cell.py"
+    "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
+)
 TAKEN: dict[str, dict[str, str]] = {
     "calibration/corrected": {
         "hilcal identify RUN --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm"
@@ -283,6 +287,10 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until",
     },
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
+    "config/cell": {
+        "check CELL.toml --save-calibration": KINEMATICS,
+        "`hilcal plan` plans": "tests/cli/test_import_observers.py",
+    },
     "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "design/checked_plan": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
@@ -291,6 +299,7 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "identification/learnt": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
     "identification/weight": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
+    "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
     "measuring/run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {
         "hilcal accept RUN N": f"{HERE}what_a_report_names",
