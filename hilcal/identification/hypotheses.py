@@ -278,8 +278,8 @@ def hypotheses(d: Described) -> Iterator[Hypothesis]:
     for joint, follows in may_follow(n):
         for factor in (1.0, -1.0) if slides[joint - 1] == slides[follows - 1] else ():
             yield Hypothesis("coupling", joint, follows=follows, factor=factor)
-    simple = ("millimetres", "metres", "joint_degrees", "joint_radians", "mirrored")
-    simple += ("travel_millimetres",) * bool(slides.any())
+    travels = ("travel_millimetres",) * bool(slides.any())
+    simple = ("millimetres", "metres", "joint_degrees", "joint_radians", "mirrored", *travels)
     yield from map(Hypothesis, simple if d.turn is None else simple + OF_ATTITUDES)
     for name in robot_names():
         if name != d.arm.name and load_arm(name).n == n:
