@@ -215,11 +215,10 @@ class Arm:
         Raises:
             InputError: says what would be valid.
         """
-        travel = (self.q_max - self.q_min)[self.slides]
-        if not np.all(np.isfinite(travel) & (travel > 0.0)):
-            raise InputError(
-                f"{self.name}: a prismatic joint needs a lower and an upper limit, in m"
-            )
+        if self.prismatic is not None:
+            travel = (self.q_max - self.q_min)[self.prismatic]
+            if not np.all(np.isfinite(travel) & (travel > 0.0)):
+                raise InputError(f"{self.name}: a prismatic joint needs two limits, in m")
         if self.n > limits.JOINTS:
             raise InputError(f"{self.name}: {self.n} joints; valid: at most {limits.JOINTS}")
 

@@ -17,7 +17,7 @@ from hilcal.types import Bools, Floats
 _SAMPLES = 256  # states that tell which pairs touch by their crude shape alone
 _SHORT = 1e-12  # m, of a segment without a direction
 _ALWAYS = 0.3  # share of those states from which on a pair is not checked
-_NEAR = 0.03  # m; where shapes are guessed, neighbours that are always so near are none, a choice
+_NEAR = 0.03  # m; guessed shapes that are so near in every state are neighbours, a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,9 +149,11 @@ class Scene:
         arm = self._arm
         drawn = _spread(_SAMPLES, arm.n)
         low, high = arm.usual_range
-        near = 0.0 if is_known(arm) else _NEAR
-        often = self._pairs(pairs).how_often(low + drawn * (high - low), near)
-        return [pair for pair, share in zip(pairs, often, strict=True) if share < _ALWAYS]
+        q, of = low + drawn * (high - low), self._pairs(pairs)
+        often = of.how_often(q)
+        near = np.zeros(len(pairs)) if is_known(arm) else of.how_often(q, _NEAR)
+        kept = (often < _ALWAYS) & (near < 1.0)
+        return [pair for pair, keep in zip(pairs, kept, strict=True) if keep]
 
 
 class Pairs:

@@ -265,7 +265,7 @@ def test_what_cannot_be_simulated_is_refused_before_anything_starts(tmp_path):
     odd = World(
         replace(world.cell, arm=arm), Truth.rigid(arm), *(np.eye(4),) * 2, world.noise, np.zeros(7)
     )
-    refused("the arm odd has 7 joints", world=odd)
+    refused("differ in arm.links", world=odd)
     (tmp_path / "force").mkdir()
     refused("cannot be used")
     assert not list(tmp_path.glob("*.log"))

@@ -174,7 +174,7 @@ def test_csv(name: str) -> None:
     assert plan_csv(plan).endswith(",-0.5\n")
     errors = SimpleNamespace(error_m=np.ones(1), std_m=np.ones(1), band_m=np.ones(1))
     found = SimpleNamespace(q=np.zeros((1, 6)), before=errors, after=errors)
-    the_same_cells(_csv((name,), found), [[None] * 10, [name, *[None] * 9]])
+    the_same_cells(_csv((name,), found, ("rad",) * 6), [[None] * 10, [name, *[None] * 9]])
     arm = replace(ARM, joint_names=(name,) * 6)
     rows = to_csv(dh_rows(ARM, "standard"), arm)
     the_same_cells(rows, [[None] * 5, *[[name, *[None] * 4]] * 6])
