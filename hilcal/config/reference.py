@@ -1,7 +1,7 @@
 """Every key of CELL.toml with unit, default and example, read off the sections themselves."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import tomli_w
@@ -35,6 +35,7 @@ _UNITS = (
     ("clock", "times real time"),
     ("singularity", "1"),
     ("factor", "1"),
+    ("direction", "1"),
 )
 """Units by the end of a key's name."""
 REQUIRED = "required"
@@ -90,6 +91,8 @@ def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[Table, .
             found.append(_by_name(name, field))
             continue
         found += _tables(name, inner, _is_list(field))
+        if getattr(field.annotation, "__origin__", None) is dict:
+            found[-1] = replace(found[-1], header=f"[{name}.NAME]")
         for place, section in (options or {}).items():
             if place.split(".")[0] == name:
                 found.append(_table(place, section, False))
