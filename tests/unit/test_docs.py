@@ -170,7 +170,8 @@ def in_a_cell(text: str) -> CellConfig:
 
 
 def test_the_cells_of_the_guides_are_accepted() -> None:
-    urdf, _, _, signs = blocks(HOW_TO / "add-a-robot.md", "toml")
+    urdf, _, _, signs, factory = blocks(HOW_TO / "add-a-robot.md", "toml")
+    assert in_a_cell(factory).robot.kinematics == "factory"
     assert in_a_cell(urdf).robot.tip_link == "tool0"
     assert in_a_cell(signs).robot.joint_sign == (1, 1, 1, -1, 1, 1)
     _, driver = blocks(HOW_TO / "add-a-device.md", "toml")
