@@ -11,6 +11,7 @@ controller's and port 30003 its primary one. Prints that address, and ends with 
 import contextlib
 import os
 import secrets
+import select
 import socket
 import subprocess
 import sys
@@ -42,10 +43,9 @@ def start(host: str) -> tuple[subprocess.Popen[str], str]:
         text=True,
     )
     assert process.stdout is not None  # noqa: S101 - for the type checker
-    timer = threading.Timer(_READY_S, process.kill)
-    timer.start()
-    address = process.stdout.readline().strip()
-    timer.cancel()
+    # No thread: one that is left would take the signal that the worker puts off, see `outliving`.
+    ready = select.select([process.stdout], [], [], _READY_S)[0]
+    address = process.stdout.readline().strip() if ready else ""
     if not address:
         process.kill()
         raise LinkError("no address of this computer is free for the primary port's programs")
