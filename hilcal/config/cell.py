@@ -228,7 +228,7 @@ class Tracker(Section):
     observes: Literal["position", "distance", "height"] = Field(
         "position",
         description='"position", "distance" (from all [points.NAME]) or "height" (of all '
-        "[gauges.NAME]): what `hilcal plan` plans readings of; devices read positions",
+        "[gauges.NAME]): what readings are planned; devices read positions",
     )
     base_xyz_m: Vector3 | None = Field(
         None,

@@ -27,7 +27,11 @@ from hilcal.refinement import add
 from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
 
 MODES = ("absolute", "deflection")
-NAMES = tuple(e.name for e in BUILT_IN if e.name not in ("joint_compliance", "guide_error"))
+NAMES = tuple(
+    e.name
+    for e in BUILT_IN
+    if e.name not in ("joint_compliance", "guide_error") and e.role != "observer"
+)
 HIDDEN = [
     *((n, "deflection" if n in DEFLECTION_EFFECTS else "absolute") for n in NAMES),
     *(
