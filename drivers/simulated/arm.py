@@ -1,4 +1,4 @@
-"""Driver `simulated` of the group `hilcal.arms`: an arm of any make and number of joints.
+"""The simulated arm of any make and number of joints, driver `drivers.simulated.arm:open_arm`.
 
 For rehearsals: the controller is `drivers.simulated.arm_server`, which moves the commanded arm of a
 simulated cell in real time. Arms of Universal Robots have a simulated controller of their own,

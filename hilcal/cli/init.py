@@ -92,7 +92,8 @@ class Draft:
         """Set the address of the arm's controller, and its driver."""
         if not re.fullmatch(r"[\w.:-]+", words):
             raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
-        self.set("robot", driver=drivers(devices.ARMS)[0], host=words)
+        names = drivers(devices.ARMS)
+        self.set("robot", driver="ur" if "ur" in names else names[0], host=words)
 
     def tracker(self, words: str) -> None:
         """Set the tracker's driver."""

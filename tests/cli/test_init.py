@@ -151,7 +151,7 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path, capsys: Capsys) -> None:
 
 
 WRONG = {
-    "no robot": ((), "--robot is missing, and nobody can be asked; valid: ur10, "),
+    "no robot": ((), "--robot is missing, and nobody can be asked; valid: fr3, "),
     "robot": (("--robot", "ur10f"), '--robot "ur10f": unknown robot "ur10f" (did you mean'),
     "driver": (("--robot", "ur3", "--tracker", "geocam"), 'is unknown (did you mean "geocom"?)'),
     "port alone": (("--robot", "ur3", "--force-port", "x"), "--force-port without --force-sensor"),
