@@ -183,7 +183,7 @@ def test_the_cells_of_the_guides_are_accepted() -> None:
 
 def test_the_arm_of_the_guide_is_an_arm(tmp_path: Path) -> None:
     path = tmp_path / "my_arm.toml"
-    _, arm, track, _ = blocks(HOW_TO / "add-a-robot.md", "toml")
+    _, arm, track, *_ = blocks(HOW_TO / "add-a-robot.md", "toml")
     path.write_text(arm, encoding="utf-8")
     assert load_arm(str(path)).n == 1
     path.write_text(f"{arm}\n{track}", encoding="utf-8")
