@@ -314,7 +314,7 @@ PATIENCE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredStop:
     """What was measured at one stop.
 
     Attributes:
@@ -359,7 +359,7 @@ class Measurer:
         name: str,
         find: Callable[[], None] | None = None,
         force: WrenchSample | None = None,
-    ) -> Measured:
+    ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
         Args:
@@ -419,7 +419,7 @@ class Measurer:
 
     def _averaged(
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
-    ) -> tuple[Measured | None, str]:
+    ) -> tuple[MeasuredStop | None, str]:
         """Average over the window; None and the reason where that cannot be a reading."""
         differed, before = self._mover.differed, self._mover.look()
         tracker: list[TrackerSample] = []
@@ -451,7 +451,7 @@ class Measurer:
             return None, "the tracker gives what is not a number"
         q = np.mean([*angles, after.q], axis=0)
         said = (*remarks, *mean.warnings)
-        return Measured(mean, q, before, after, tuple(tracker), force, settling, said), ""
+        return MeasuredStop(mean, q, before, after, tuple(tracker), force, settling, said), ""
 
     def _wrong(self, force: WrenchSample | None, at: ArmSample) -> bool:
         """Whether the mean wrench is not that of what hangs either: such a reading is kept."""

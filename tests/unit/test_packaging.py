@@ -1,5 +1,6 @@
 """What is installed is what is in the tree."""
 
+import ast
 import subprocess
 import sys
 import tomllib
@@ -16,6 +17,17 @@ def test_every_directory_with_code_is_a_package() -> None:
     modules = [path for top in ("hilcal", "drivers") for path in (ROOT / top).rglob("*.py")]
     missing = {path.parent for path in modules if not (path.parent / "__init__.py").is_file()}
     assert not missing  # setup.py would leave them out
+
+
+def test_a_class_has_a_name_of_its_own() -> None:
+    """In the whole tree, so that a reader finds it by its name alone."""
+    places: dict[str, list[str]] = {}
+    for top in ("hilcal", "drivers"):
+        for path in (ROOT / top).rglob("*.py"):
+            for node in ast.parse(path.read_text(encoding="utf-8")).body:
+                if isinstance(node, ast.ClassDef):
+                    places.setdefault(node.name, []).append(str(path.relative_to(ROOT)))
+    assert {name: at for name, at in places.items() if len(at) > 1} == {}
 
 
 def test_the_lock_pins_every_dependency_with_hashes_and_names_no_host() -> None:
