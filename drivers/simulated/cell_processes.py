@@ -16,7 +16,6 @@ import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur_server import API, POLYSCOPE_X
 from drivers.simulated.world import World
 from drivers.simulated.world_server import open_board, write_world
 from hilcal.config import CellConfig
@@ -135,7 +134,7 @@ ARM_DRIVER = "drivers.simulated.arm:open_arm"
 """Of every other arm, by its place: it is of use in a simulated cell alone."""
 EMSCON_PORT = 7000
 """Of the simulated tracker: the real one, 700, is for the administrator alone."""
-RDT_PORT, WEB_PORT = 49152, 8080
+RDT_PORT, WEB_PORT = 49152, 8081
 PORTS = (*UR_PORTS, EMSCON_PORT, WEB_PORT)
 NATNET_PORT = 1510
 TRACKERS = ("geocom", "emscon", "natnet")
@@ -439,6 +438,8 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
 
     What it gives stays, but for the driver of an arm whose own protocol is not simulated.
     """
+    from drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
+
     options: dict[str, Any] = {**config.robot.options}
     if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:
         options["robot_api_port"] = API

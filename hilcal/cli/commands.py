@@ -64,7 +64,8 @@ COMMANDS = {
         "looking_up:config", "Explain the sections and keys of CELL.toml: unit, default, example."
     ),
     "check": Command(
-        "planning:check", "Connect to every device and report its state; nothing moves."
+        "planning:check",
+        "Connect to every device and report its state; nothing moves without --factory.",
     ),
     "plan": Command(
         "planning:plan",

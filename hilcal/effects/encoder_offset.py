@@ -12,6 +12,7 @@ class EncoderOffset(PerJoint):
 
     name = "encoder_offset"
     summary = "dq_j = o_j: the zero of each joint is off"
+    kinematic = True
     change = Changeable(
         "joint",
         words="zero",

@@ -193,6 +193,8 @@ class Effect(ABC):
             first three take the options `prior_m` and `prior_rad`.
         for_missing_weight: whether a starting model has the effect where the arm is described
             without masses and the readings tell what its weight does.
+        kinematic: whether it is an error of the unloaded arm's lengths and zeros, which a
+            factory's calibration measures.
         plausible: standard deviation of the parameters over arms and cells as they are, in their
             ordinary magnitudes: the range that a suspect of this name must stay in. An effect
             that states none is plausible at any size. See `most`.
@@ -218,6 +220,7 @@ class Effect(ABC):
     option_help: ClassVar[Mapping[str, str]] = {}
     role: ClassVar[Role] = "effect"
     for_missing_weight: ClassVar[bool] = False
+    kinematic: ClassVar[bool] = False
     plausible: ClassVar[float] = np.inf
     of_setup: ClassVar[bool] = False
     drift: ClassVar[float] = 0.1

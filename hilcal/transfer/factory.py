@@ -29,8 +29,6 @@ from hilcal.robot.factory import FactoryKinematics, with_factory
 from hilcal.shown import Shown
 from hilcal.types import Bools
 
-GEOMETRY = ("encoder_offset", "link_geometry")
-"""Effects of which nothing should be left beside the factory's kinematics."""
 LEVEL = 1e-3
 """p-value below which the geometry is called changed; a choice."""
 LEAST = 8
@@ -89,7 +87,8 @@ def check_factory(
     theirs = replace(cell, arm=as_counted(nominal, robot))
     fit = mixed_fit(baseline(ours, readings, "absolute", catalogue), readings, "absolute")
     problem = fit.problem
-    numbers = [k for k, f in enumerate(problem.families.random) if f.effect in GEOMETRY]
+    known = fit.model.catalogue
+    numbers = [k for k, f in enumerate(problem.families.random) if known[f.effect].kinematic]
     without = estimate_variances(
         problem.without(numbers), np.delete(fit.variances.log_std, numbers), search=True
     )

@@ -127,6 +127,7 @@ def test_the_file_is_planned_without_an_edit(
     assert (tmp_path / "plan.json").is_file()
 
 
+@pytest.mark.slow
 def test_the_steps_that_it_names(tmp_path: Path, capsys: Capsys) -> None:
     path, plan, out = (tmp_path / n for n in ("CELL.toml", "plan.json", "rehearsal.hilcal"))
     said = " ".join(ok(capsys, "init", path, "--robot", "ur3").out.split())

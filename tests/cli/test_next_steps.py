@@ -289,8 +289,6 @@ TAKEN: dict[str, dict[str, str]] = {
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
     "config/cell": {
         "check CELL.toml --save-calibration": KINEMATICS,
-        "`hilcal plan` plans": "tests/unit/design/test_plan_observers.py"
-        "::test_devices_read_positions",
     },
     "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "design/checked_plan": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},

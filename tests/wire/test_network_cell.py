@@ -56,10 +56,12 @@ def test_a_tracker_that_cannot_be_simulated_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_lab_with_an_at401_calibrates_by_one_command(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_lab_of_today_calibrates_by_one_command(tmp_path: Path, capsys: Capsys) -> None:
+    """A UR15 on PolyScope X, an AT401 and a Net F/T."""
     toml, out = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     sensor = '[force_sensor]\ndriver = "netft"\nhost = "192.168.1.1"\n'
-    toml.write_text(f'{CELL}{sensor}[tracker]\ndriver = "emscon"\n', encoding="utf-8")
+    cell = CELL.replace("ur10e", "ur15") + 'controller_version = "10.12.0.1"\n'
+    toml.write_text(f'{cell}{sensor}[tracker]\ndriver = "emscon"\n', encoding="utf-8")
     size = ("--poses", "4", "--validation", "3")
     told = ok(capsys, "calibrate", toml, "-o", out, "--rehearse", "--yes", "--json", *size)
     error = told.document["improvement"]["error"]
@@ -67,6 +69,7 @@ def test_a_lab_with_an_at401_calibrates_by_one_command(tmp_path: Path, capsys: C
     about = ok(capsys, "info", out).out
     assert "SIM AT401, serial 391234" in about
     assert "SIM NET F/T" in about
+    assert "UR15" in about
 
 
 @pytest.mark.slow
