@@ -178,7 +178,7 @@ def import_mapped(
     covariance, rounding, told, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
     if mapping.position is not None:
         position = table.matrix(columns.POSITION)
-        whole = ~np.isnan(position).any(axis=1)
+        whole = np.asarray(np.isfinite(position).all(axis=1))
         covariance, told = mapped_covariance(
             table.taken(whole),
             grid.rows_with(whole),
