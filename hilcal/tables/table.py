@@ -329,6 +329,10 @@ def _states(table: Table, arm: Arm) -> States:
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if torque is not None:
+        lost = np.isnan(torque)
+        some = lost & ~lost.all(axis=1, keepdims=True)
+        names = columns.torque_columns(arm.units)
+        table.refuse(some, names, lambda _: "no value; give all torques of a row, or none")
         _in_range(table, columns.torque_columns(arm.units), -LARGEST_NM, LARGEST_NM, "N·m or N")
     if "air_degC" in number:
         _in_range(table, ("air_degC",), -50, 80, "°C")
