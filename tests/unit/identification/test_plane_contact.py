@@ -144,7 +144,7 @@ def test_commands_name_what_the_plate_does_not_see(tmp_path: Path, capsys: Capsy
     _, world, readings = touched(["granite"], 20, 3)
     write_table(readings, tmp_path / "t.csv")
     (tmp_path / "cell.toml").write_text(CELL.read_text())
-    run = tmp_path / "r.hilcal"
+    run, other = tmp_path / "r.hilcal", tmp_path / "other.hilcal"
     ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", run)
     document = json.loads(ok(capsys, "identify", run, "--json").out)
     told = {p["name"]: p for p in document["parameters"]}
@@ -154,7 +154,17 @@ def test_commands_name_what_the_plate_does_not_see(tmp_path: Path, capsys: Capsy
         assert p["identifiable"] == (k > 1)
         if k > 1:
             assert abs(p["value"] - truth[k - 1]) < 4 * p["std"]
-    assert (
-        "Not determined by these readings: joint_compliance j1" in ok(capsys, "identify", run).out
-    )
+    told_by = {c: ok(capsys, c, run).out for c in ("identify", "compare", "info")}
+    assert "Not determined by these readings: joint_compliance j1" in told_by["identify"]
     assert ok(capsys, "diagnose", run, "--json").document["verdict"] == "adequate"
+    ok(capsys, "import", tmp_path / "t.csv", "--config", tmp_path / "cell.toml", "-o", other)
+    told_by["validate"] = ok(capsys, "validate", run, other).out
+    told_by["refine"] = ok(capsys, "refine", run, "--readings", "absolute").out
+    page = tmp_path / "page.html"
+    ok(capsys, "report", run, "-o", page)
+    told_by["report"] = page.read_text()
+    for command, told_words in told_by.items():
+        words = " ".join(told_words.split())
+        assert "error of the readings" in words, command
+        for wrong in ("3-D position error", "3-D error", "predicted positions", "60 positions"):
+            assert wrong not in words, (command, wrong)
