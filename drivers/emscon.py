@@ -48,7 +48,7 @@ _ORDERS = ("xyz", "XYZ")
 _STEP, _SAME = 1e-6, 1e-4
 
 
-class Options(Section):
+class EmsconOptions(Section):
     """[tracker.options]: keys of the driver "emscon"."""
 
     target: Literal["position", "pose"] = Field(
@@ -70,7 +70,7 @@ class Options(Section):
     )
 
 
-class Connection:
+class EmsconConnection:
     """One connection to an emScon server: commands, results, and what it sends by itself.
 
     Attributes:
@@ -216,9 +216,9 @@ class EmsconTracker:
 
     def __init__(
         self,
-        connect: Callable[[], Connection],
+        connect: Callable[[], EmsconConnection],
         config: TrackerConfig,
-        options: Options,
+        options: EmsconOptions,
         clock: Clock,
     ) -> None:
         """Connect and set units, axes and mode; nothing turns.
@@ -541,6 +541,6 @@ def open_tracker(config: CellConfig) -> EmsconTracker:
             f'[tracker] frame = "{tracker.frame}": a laser tracker gives positions in its own axes;'
             ' it must be "tracker"'
         )
-    options = check_section(tracker.options, Options, "[tracker] options")
+    options = check_section(tracker.options, EmsconOptions, "[tracker] options")
     clock = Clock(config.simulation.clock)
-    return EmsconTracker(lambda: Connection(host, port), tracker, options, clock)
+    return EmsconTracker(lambda: EmsconConnection(host, port), tracker, options, clock)

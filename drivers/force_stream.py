@@ -79,7 +79,7 @@ class Port(Protocol):
         """Give it back."""
 
 
-class Frames(Protocol):
+class FrameSource(Protocol):
     """What takes frames out of bytes, and counts; see `frames.Deframer`."""
 
     frames: int
@@ -98,7 +98,7 @@ class ForceStream:
         self,
         port: Port,
         sensor: SensorFormat,
-        deframer: Frames | None = None,
+        deframer: FrameSource | None = None,
         failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
     ) -> None:
         """Start to read.
@@ -111,7 +111,7 @@ class ForceStream:
         """
         self._port, self._sensor, self._failures = port, sensor, failures
         self._path = str(port.port)
-        self._deframer: Frames = Deframer(sensor.frame) if deframer is None else deframer
+        self._deframer: FrameSource = Deframer(sensor.frame) if deframer is None else deframer
         self._counter = sensor.losses()
         self._lock = threading.Lock()
         self._failure = ""

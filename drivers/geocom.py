@@ -67,7 +67,7 @@ class PolarReading:
     warning: str = ""
 
 
-class Options(Section):
+class GeoComOptions(Section):
     """[tracker.options]: keys of the driver "geocom"."""
 
     search_rad: Positive = Field(
@@ -85,7 +85,9 @@ class Options(Section):
 class GeoComTracker:
     """A GeoCOM instrument as a `hilcal.measuring.devices.TrackerDevice` of positions (m = 3)."""
 
-    def __init__(self, link: Link, config: TrackerConfig, options: Options, clock: Clock) -> None:
+    def __init__(
+        self, link: Link, config: TrackerConfig, options: GeoComOptions, clock: Clock
+    ) -> None:
         """Take over an open link; sends nothing yet."""
         self._link, self._config, self._options, self._clock = link, config, options, clock
         self._full_known = True
@@ -342,7 +344,7 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
             f'[tracker] frame = "{tracker.frame}": a GeoCOM instrument gives positions in its '
             'own axes; it must be "tracker"'
         )
-    options = check_section(tracker.options, Options, "[tracker] options")
+    options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
     return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))
 

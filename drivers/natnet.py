@@ -37,7 +37,7 @@ FLOOR = 1e-7
 """Least standard deviation of a frame, m and rad: frames are in single precision."""
 
 
-class Options(Section):
+class NatNetOptions(Section):
     """[tracker.options]: keys of the driver "natnet"."""
 
     rigid_body: str | None = Field(
@@ -61,7 +61,7 @@ class Options(Section):
 class NatNetTracker:
     """A rigid body as a `hilcal.measuring.devices.TrackerDevice`; m = 6, or 3."""
 
-    def __init__(self, host: str, port: int, options: Options) -> None:
+    def __init__(self, host: str, port: int, options: NatNetOptions) -> None:
         """Connect, agree on a version, find the rigid body.
 
         Raises:
@@ -204,7 +204,7 @@ class NatNetTracker:
             return None
         return bodies
 
-    def _greet(self) -> nn.Server:
+    def _greet(self) -> nn.NatNetServer:
         content = self._ask(nn.connect(nn.NEWEST), nn.SERVER_INFO)
         try:
             server = nn.server(content)
@@ -219,18 +219,20 @@ class NatNetTracker:
             if server.group or answer[:4] not in (bytes(4), words[:4]):
                 self._refuse(server)
             version = nn.NEWEST
-            server = nn.Server(server.name, server.program, version, server.data_port, server.group)
+            server = nn.NatNetServer(
+                server.name, server.program, version, server.data_port, server.group
+            )
         if server.version < nn.OLDEST:
             self._refuse(server)
         return server
 
-    def _refuse(self, server: nn.Server) -> None:
+    def _refuse(self, server: nn.NatNetServer) -> None:
         raise DeviceError(
             f"{DEVICE} at {self.where}: it sends frames of NatNet {server.version[0]}."
             f"{server.version[1]}; valid: 3.0 to {nn.NEWEST[0]}.{nn.NEWEST[1]} (set it in Motive)"
         )
 
-    def _joined(self, server: nn.Server) -> socket.socket:
+    def _joined(self, server: nn.NatNetServer) -> socket.socket:
         """Return a socket to which the frames of a multicast group come."""
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
@@ -312,7 +314,7 @@ def open_tracker(config: CellConfig) -> NatNetTracker:
             f'[tracker] frame = "{tracker.frame}": cameras give poses in their own axes; it must '
             'be "tracker"'
         )
-    options = check_section(tracker.options, Options, "[tracker] options")
+    options = check_section(tracker.options, NatNetOptions, "[tracker] options")
     if options.frames < 2:
         raise InputError("[tracker] options: frames = 1; valid: 2 or more, which show the scatter")
     return NatNetTracker(host, port, options)

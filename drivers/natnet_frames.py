@@ -56,7 +56,7 @@ def connect(version: Version) -> bytes:
 
 
 @dataclass(frozen=True, slots=True)
-class Server:
+class NatNetServer:
     """Who answered, and how it sends frames.
 
     Attributes:
@@ -74,7 +74,7 @@ class Server:
     group: str = ""
 
 
-def server(content: bytes) -> Server:
+def server(content: bytes) -> NatNetServer:
     """Return what the answer to a connection says.
 
     Raises:
@@ -82,12 +82,12 @@ def server(content: bytes) -> Server:
     """
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
-    known = Server(_text(name), ".".join(map(str, numbers[:4])), version)
+    known = NatNetServer(_text(name), ".".join(map(str, numbers[:4])), version)
     if len(content) < _SERVER.size + _CONNECTION.size:
         return known
     _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
     where = ".".join(map(str, group)) if multicast else ""
-    return Server(known.name, known.program, version, port, where)
+    return NatNetServer(known.name, known.program, version, port, where)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,7 +55,7 @@ _MOMENT = {
 """N and N·m per unit, by its name without hyphen, or its number on the page."""
 
 
-class Options(Section):
+class NetFtOptions(Section):
     """[force_sensor.options]: keys of the driver "netft"."""
 
     web_port: Whole = Field(80, description="the port of the sensor's page, 1 to 65535")
@@ -195,7 +195,7 @@ def _number(words: str, *names: str) -> float:
     return number if np.isfinite(number) and number > 0.0 else 0.0
 
 
-def sensor_format(words: str, options: Options, where: str) -> SensorFormat:
+def sensor_format(words: str, options: NetFtOptions, where: str) -> SensorFormat:
     """Return what the sensor sends, by its page.
 
     Raises:
@@ -237,8 +237,8 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         DeviceError: nobody answers, it is no Net F/T, or no record comes.
         InputError: no [force_sensor], no host, or an unknown option.
     """
-    section = checked_config(config, tuple(Options.model_fields))
-    options = check_section(section.options, Options, "[force_sensor] options")
+    section = checked_config(config, tuple(NetFtOptions.model_fields))
+    options = check_section(section.options, NetFtOptions, "[force_sensor] options")
     host, port = address("[force_sensor]", "netft", section.host, PORT)
     words = page(host, options.web_port)
     sensor = sensor_format(words, options, f"{host}:{options.web_port}")

@@ -7,7 +7,7 @@ import termios
 
 from rich.console import Console
 
-from hilcal.config import CellConfig, Load
+from hilcal.config import CellConfig, CellLoad
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report
 from hilcal.names import escaped
@@ -45,7 +45,7 @@ class TerminalOperator:
             () if there else (_NO_TERMINAL,),
         )
 
-    def hang(self, load: Load | None, why: str) -> None:
+    def hang(self, load: CellLoad | None, why: str) -> None:
         """Ask for a load and wait for Enter; what was typed before the question is dropped.
 
         Raises:
@@ -108,7 +108,7 @@ class TerminalOperator:
     def close(self) -> None:
         """Nothing to give back."""
 
-    def _request(self, load: Load | None) -> list[str]:
+    def _request(self, load: CellLoad | None) -> list[str]:
         """Return what is asked for, line by line."""
         if load is None:
             return ["Take every load off the tool, and do not touch the arm."]

@@ -30,7 +30,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.shown import Shown
 
-__all__ = ["Refinement", "Step", "add", "predicts_better", "refine", "remove"]
+__all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "remove"]
 
 MOST_REVISIONS = 15
 MOST_SCATTERS = 2
@@ -45,7 +45,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class RefinementStep:
     """One revision: a fit, its diagnosis, and what was changed to get there.
 
     Attributes:
@@ -65,7 +65,7 @@ class Step:
 class Refinement(Shown):
     """The steps of a refinement, from the starting model to the last one."""
 
-    steps: tuple[Step, ...]
+    steps: tuple[RefinementStep, ...]
 
     @property
     def fit(self) -> Fit:
@@ -100,7 +100,7 @@ def refine(
     say: Say = lambda text: None,
     history: History = NOTHING,
     laws: LawSearch | None = None,
-    seen: Callable[[Step], None] = lambda step: None,
+    seen: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
 ) -> Refinement:
     """Fit, diagnose, add the first suspect, and repeat.
@@ -159,7 +159,7 @@ def refine_from(
     say: Say = lambda text: None,
     history: History = NOTHING,
     laws: LawSearch | None = None,
-    seen: Callable[[Step], None] = lambda step: None,
+    seen: Callable[[RefinementStep], None] = lambda step: None,
     background: bool = True,
 ) -> Refinement:
     """Refine a fit with its noise correlated as it is in its covariance; see `refine`."""
@@ -181,7 +181,7 @@ class Path:
         say: Say = lambda text: None,
         before: History = NOTHING,
         laws: LawSearch | None = None,
-        seen: Callable[[Step], None] = lambda step: None,
+        seen: Callable[[RefinementStep], None] = lambda step: None,
     ) -> None:
         """Begin with a fit, the effects of which stay.
 
@@ -192,7 +192,7 @@ class Path:
             laws: searches laws.
             seen: takes each step.
         """
-        self.steps: list[Step] = []
+        self.steps: list[RefinementStep] = []
         self._given, self._before, self._say = first.model.named, before, say
         self._laws, self._seen = laws, seen
         self._rejected, self._removed = [*before.rejected], [*before.removed]
@@ -219,7 +219,7 @@ class Path:
         """Judge a fit and append it."""
         self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
         diagnosis = judge(self._evidence, self._history(found))
-        self.steps.append(Step(found, diagnosis, added, removed))
+        self.steps.append(RefinementStep(found, diagnosis, added, removed))
         self._seen(self.steps[-1])
 
     def extend(self) -> None:
@@ -348,7 +348,7 @@ class Path:
             lambda left: Evidence(fits[-1], self._refits.add, self._say, self._regressions, left),
         )
         for one, d, name in zip(fits, judged, (BACKGROUND, *names), strict=True):
-            self.steps.append(Step(one, d, name))
+            self.steps.append(RefinementStep(one, d, name))
             self._seen(self.steps[-1])
 
     def take_scatter(self) -> bool:
@@ -376,7 +376,7 @@ class Path:
         self.append(fit(fitted.model, readings, fitted.mode, start=fitted.theta), None)
         return True
 
-    def _better(self, last: Step, other: Alternative) -> bool:
+    def _better(self, last: RefinementStep, other: Alternative) -> bool:
         """Whether others are worth a trial.
 
         While the residual is not noise they must be far better. When it is, several in the place of
@@ -388,7 +388,7 @@ class Path:
         worth = LEAST_SHARE * last.fit.dof if len(other.others) > 1 else 0.0
         return other.better and other.log_evidence > other.own + worth
 
-    def _exchange(self, last: Step, other: Alternative) -> bool:
+    def _exchange(self, last: RefinementStep, other: Alternative) -> bool:
         """Put another in the place of an effect, unless the error on poses left out rises.
 
         The error must fall beyond chance where several take the place of one, since a model that is

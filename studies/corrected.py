@@ -29,11 +29,11 @@ from rich.console import Console
 from drivers.simulated.rehearsal import as_told
 from hilcal.calibration.improvement import Improvement
 from hilcal.cell import cell_from_config
-from hilcal.cli.calibrating import Operator
+from hilcal.cli.calibrating import CalibrationOperator
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.config.loads import Load
+from hilcal.config.loads import CellLoad
 from hilcal.effects.catalogue import installed
 from hilcal.engine.engine import open_engine
 from hilcal.errors import DeviceError
@@ -175,7 +175,7 @@ def _calibrated(t: Terminal, run: Path, config: CellConfig, settings: Settings) 
             p = Procedure(run, cell, config, run.parent, catalogue, settings)
         with ExitStack() as stack:
             try:
-                Operator(t, p, stack, rehearse=True, yes=True).to_the_end()
+                CalibrationOperator(t, p, stack, rehearse=True, yes=True).to_the_end()
             except DeviceError as error:
                 if not left:
                     raise
@@ -204,8 +204,8 @@ def cell_of(arm: str, seed: int) -> CellConfig:
     mass = SHARE * load_arm(arm).payload
     pull = mass * 9.80665
     loads = (
-        Load(name="weight", mass_kg=mass),
-        Load(name="pull", force_N=(pull, 0.0, 0.0), moment_Nm=(0.0, 0.05 * pull, 0.05 * pull)),
+        CellLoad(name="weight", mass_kg=mass),
+        CellLoad(name="pull", force_N=(pull, 0.0, 0.0), moment_Nm=(0.0, 0.05 * pull, 0.05 * pull)),
     )
     planning = {"candidates": CANDIDATES, "against": (), "readings": "absolute"}
     return config.model_copy(

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.information import Problem, readings_of
+from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.nominal_model import nominal_states, planned_effects
 from hilcal.design.predicted import rms
 from hilcal.effects.catalogue import installed
@@ -198,7 +198,7 @@ def run_campaign(
 
 def readings_asked(chosen: Chosen) -> Asked:
     """Return the readings that a plan takes; a unit that is taken again is a cycle of its own."""
-    source: Problem = chosen.problem
+    source: DesignProblem = chosen.problem
     mode: Mode = "deflection" if source.mode == "deflection" else "absolute"
     names = source.candidates.loads
     pose: list[int] = []

@@ -12,9 +12,9 @@ from hilcal.design.choice import choose
 from hilcal.design.compound_criteria import compound_objective
 from hilcal.design.draw import draw
 from hilcal.design.feasible import Space
-from hilcal.design.information import Problem, problem
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import NominalModel, nominal_model
-from hilcal.design.predicted import Predicted, predicted, rms
+from hilcal.design.predicted import PredictedUncertainty, predicted, rms
 from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
@@ -47,8 +47,8 @@ class Scene:
     config: CellConfig
     space: Space
     nominal: NominalModel
-    exact: Problem
-    robust: Problem | None
+    exact: DesignProblem
+    robust: DesignProblem | None
     work: PredictionPoses
 
     def with_others(self, chosen: "Chosen") -> float | None:
@@ -71,9 +71,9 @@ class Chosen:
         efficiency: certified by the planner; None for a plan of another make.
     """
 
-    problem: Problem
+    problem: DesignProblem
     counts: Floats
-    predicted: Predicted
+    predicted: PredictedUncertainty
     efficiency: float | None = None
 
     @property
@@ -212,7 +212,9 @@ def matching(
     return high
 
 
-def _of_poses(of: Problem, order: Iterable[int], budget: int, work: PredictionPoses) -> Chosen:
+def _of_poses(
+    of: DesignProblem, order: Iterable[int], budget: int, work: PredictionPoses
+) -> Chosen:
     """Take poses in order, each with as many loads as it bears, until the readings are used."""
     counts, left = np.zeros(len(of.units)), float(budget)
     pose = np.array([p for p, _ in of.what])

@@ -12,7 +12,7 @@ import numpy as np
 from hilcal.cell import STANDARD_GRAVITY, Cell
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.hypotheses import Described, Hypothesis
-from hilcal.identification.misdescription import Finding, examine
+from hilcal.identification.misdescription import DescriptionFinding, examine
 from hilcal.identification.registration import register
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
@@ -313,7 +313,7 @@ class Outcome:
     exact: bool
 
 
-def judge(case: Case) -> tuple[Outcome, Finding | None]:
+def judge(case: Case) -> tuple[Outcome, DescriptionFinding | None]:
     """Run the program on a case."""
     found = examine(register(case.cell, case.readings), case.readings)
     refused = found is not None and found.refused

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.config import CellConfig
-from hilcal.config.loads import Load
+from hilcal.config.loads import CellLoad
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
 from hilcal.diagnosis.diagnosis import Diagnosis
@@ -56,7 +56,7 @@ def measure_more(
     rng = np.random.default_rng([seed, len(case.readings)])
     own, pulls = with_study_loads(config, robot)
     loads = tuple(
-        Load(name=name, force_N=tuple(map(float, w[:3])), moment_Nm=tuple(map(float, w[3:])))
+        CellLoad(name=name, force_N=tuple(map(float, w[:3])), moment_Nm=tuple(map(float, w[3:])))
         for name, w in pulls
     )
     planning = own.planning.model_copy(update={"candidates": CANDIDATES})

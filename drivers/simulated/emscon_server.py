@@ -61,7 +61,7 @@ SETS = {
 
 
 @dataclass(slots=True, eq=False)
-class Tracker:
+class SimulatedTracker:
     """What the tracker is set to and what it answers.
 
     Attributes:
@@ -178,7 +178,7 @@ def _rates(angles: Floats) -> Floats:
     return np.array([[cc * cb, -sc, 0.0], [sc * cb, cc, 0.0], [-sb, 0.0, 1.0]])
 
 
-def _measure(t: Tracker, body: bytes) -> None:
+def _measure(t: SimulatedTracker, body: bytes) -> None:
     if not t.initialized:
         t.answer(es.START_MEASUREMENT, es.NOT_INITIALIZED)
         return
@@ -192,14 +192,14 @@ def _measure(t: Tracker, body: bytes) -> None:
     t.send(kind, struct.pack("<I", es.OK) + packed)
 
 
-def _initialize(t: Tracker, body: bytes) -> None:
+def _initialize(t: SimulatedTracker, body: bytes) -> None:
     t.station.wait(5.0)
     t.initialized = True
     t.answer(es.INITIALIZE, es.OK)
     t.tell(es.INITIALIZATION_CHANGED)
 
 
-def _acquire(t: Tracker, command: int) -> None:
+def _acquire(t: SimulatedTracker, command: int) -> None:
     if not t.initialized:
         t.answer(command, es.NOT_INITIALIZED)
         return
@@ -209,18 +209,18 @@ def _acquire(t: Tracker, command: int) -> None:
     t.answer(command, es.OK if found else es.NO_RESULT)
 
 
-def _find(t: Tracker, body: bytes) -> None:
+def _find(t: SimulatedTracker, body: bytes) -> None:
     _acquire(t, es.FIND_REFLECTOR)
 
 
-def _go(t: Tracker, body: bytes) -> None:
+def _go(t: SimulatedTracker, body: bytes) -> None:
     at = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
     t.station.turn(at.hz, at.v)
     t.station.pointing = at
     _acquire(t, es.GO_POSITION)
 
 
-def _reflectors(t: Tracker, body: bytes) -> None:
+def _reflectors(t: SimulatedTracker, body: bytes) -> None:
     for number, name in REFLECTORS.items():
         words = name.encode("utf-16-le").ljust(64, b"\0")
         t.answer(
@@ -228,27 +228,27 @@ def _reflectors(t: Tracker, body: bytes) -> None:
         )
 
 
-def _info(t: Tracker, body: bytes) -> None:
+def _info(t: SimulatedTracker, body: bytes) -> None:
     words = NAME.encode("utf-16-le").ljust(64, b"\0")
     rest = struct.pack("<iiiidddiiddIii", 1, 1, 1, 1, 0.0, 160.0, 0.8, 10, 2, 3.14, 3.14, 1, 1, 0)
     t.answer(es.GET_TRACKER_INFO, es.OK, struct.pack("<I64si", 70, words, SERIAL) + rest)
 
 
-def _environment(t: Tracker, body: bytes) -> None:
+def _environment(t: SimulatedTracker, body: bytes) -> None:
     t.answer(es.GET_ENVIRONMENT, es.OK, struct.pack("<3d", *t.environment()))
 
 
-def _system(t: Tracker, body: bytes) -> None:
+def _system(t: SimulatedTracker, body: bytes) -> None:
     state = es.INITIALIZED if t.initialized else es.BOOTED
     packed = struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)
     t.answer(es.GET_SYSTEM_STATUS, es.OK, packed)
 
 
-def _status(t: Tracker, body: bytes) -> None:
+def _status(t: SimulatedTracker, body: bytes) -> None:
     t.answer(es.GET_STATUS_INFO, es.OK, struct.pack("<Ii", es.OK, t.status()))
 
 
-_DO: dict[int, Callable[[Tracker, bytes], None]] = {
+_DO: dict[int, Callable[[SimulatedTracker, bytes], None]] = {
     es.GET_SYSTEM_STATUS: _system,
     es.INITIALIZE: _initialize,
     es.START_MEASUREMENT: _measure,
@@ -261,7 +261,7 @@ _DO: dict[int, Callable[[Tracker, bytes], None]] = {
 }
 
 
-def operations(t: Tracker) -> admin.Operations:
+def operations(t: SimulatedTracker) -> admin.Operations:
     """Return what can be asked of the tracker."""
     station = t.station
 
@@ -315,7 +315,7 @@ def operations(t: Tracker) -> admin.Operations:
     return admin.Operations(own, state)
 
 
-def serve(t: Tracker, door: socket.socket) -> None:
+def serve(t: SimulatedTracker, door: socket.socket) -> None:
     """Answer for ever, one client after another."""
     while True:
         t.client, _ = door.accept()
@@ -358,7 +358,7 @@ def main() -> None:
     measuring, turning = np.random.default_rng(options.seed).spawn(2)
     along, across = tuple(options.range_std), tuple(options.transverse_std)
     board = Blackboard.attach(options.directory / "world.bin")
-    tracker = Tracker(
+    tracker = SimulatedTracker(
         Station(board, Beam(along, across), measuring),
         SimulatedNoise(along, across, options.orientation_std),
         turning,

@@ -38,7 +38,7 @@ ROOM = 22.0
 
 
 @dataclass(slots=True, eq=False)
-class Gauge:
+class StrainGauge:
     """The sensor's measuring bridge: what strain gauges make of the true wrench.
 
         wrench = true + bias + drift (T - T_start) + overload + noise
@@ -66,10 +66,10 @@ class Gauge:
     @staticmethod
     def draw(
         board: Blackboard, noise: tuple[float, float], rng: np.random.Generator, on: float
-    ) -> "Gauge":
+    ) -> "StrainGauge":
         """Return a sensor with a drawn zero; `noise` is of a force (N) and a moment (N·m)."""
         bias, drift = (std * rng.standard_normal(6) for std in (BIAS_STD, DRIFT_STD))
-        return Gauge(board, rng, bias, drift, np.repeat(noise, 3), np.zeros(6), on)
+        return StrainGauge(board, rng, bias, drift, np.repeat(noise, 3), np.zeros(6), on)
 
     def temperature(self) -> float:
         """Return the sensor's temperature, °C: it warms up above the air."""
@@ -101,7 +101,7 @@ class Gauge:
         return float(WARM_K * (1.0 - np.exp(-(time + self.on) / WARM_S)))
 
 
-class ForceSensor:
+class SensorProtocol:
     """A sensor's wire protocol; this one streams from power-on and takes no commands.
 
     Attributes:
@@ -148,7 +148,7 @@ def crc16_x25(data: bytes) -> int:
     return (_MIRRORED[mirrored & 0xFF] << 8 | _MIRRORED[mirrored >> 8]) ^ 0xFFFF
 
 
-class Bota(ForceSensor):
+class Bota(SensorProtocol):
     """Bota Systems Rokubi and SensONE.
 
     Frame (Bota Systems' public Arduino and ROS drivers): `AA`, `<H6fIf` of status, wrench, device
@@ -170,7 +170,7 @@ class Bota(ForceSensor):
         self._start_us = 0
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame, see `ForceSensor.frame`."""
+        """Return one frame, see `SensorProtocol.frame`."""
         inside = np.clip(wrench, -self.full, self.full)
         over = self.saturated or bool(np.any(inside != wrench))
         time_us = (self._start_us + round(number * 1e6 / self.rate)) & 0xFFFFFFFF
@@ -185,7 +185,7 @@ class Bota(ForceSensor):
         }
 
 
-class Hex(ForceSensor):
+class Hex(SensorProtocol):
     """OptoForce (OnRobot) HEX, 10 to 1000 Hz.
 
     Frame (OptoForce, "OptoForce General DAQ", 6-axis): `AA 07 08 10`, `>HH6h` of counter, status,
@@ -199,7 +199,7 @@ class Hex(ForceSensor):
     most, overload = 32767, 1 << 8
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame, see `ForceSensor.frame`."""
+        """Return one frame, see `SensorProtocol.frame`."""
         counts = np.rint(wrench * self.scale)
         inside = np.clip(counts, -self.most, self.most)
         status = self.overload if np.any(inside != counts) else 0
@@ -215,7 +215,7 @@ _WRENCH_REGISTER, _STREAM_REGISTER, _STREAM = 180, 410, 0x0200
 _STOP_BYTES = 50
 
 
-class Ft300(ForceSensor):
+class Ft300(SensorProtocol):
     """Robotiq FT 300: Modbus RTU slave 9, and a stream of its own; it tells no time.
 
     Robotiq, "FT 300 Instruction Manual", chapters "Modbus RTU" and "Data stream": 19200 Bd 8N1,
@@ -246,7 +246,7 @@ class Ft300(ForceSensor):
         }
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame, see `ForceSensor.frame`."""
+        """Return one frame, see `SensorProtocol.frame`."""
         return _checked(b"\x20\x4e" + struct.pack("<6h", *self._counts(wrench)))
 
     def receive(self, data: bytes, wrench: Floats) -> bytes:
@@ -324,7 +324,7 @@ def _refusal(function: int, code: int) -> bytes:
     return _checked(bytes([_SLAVE, function | 0x80, code]))
 
 
-KINDS: dict[str, type[ForceSensor]] = {"bota": Bota, "ft300": Ft300, "hex": Hex}
+KINDS: dict[str, type[SensorProtocol]] = {"bota": Bota, "ft300": Ft300, "hex": Hex}
 
 
 @dataclass(slots=True, eq=False)
@@ -341,8 +341,8 @@ class Stream:
         lost: frames that came too late to be sent.
     """
 
-    sensor: ForceSensor
-    gauge: Gauge
+    sensor: SensorProtocol
+    gauge: StrainGauge
     port: PtyPort
     stalled: bool = False
     number: int = 0
@@ -417,7 +417,7 @@ def main() -> None:
     sensor = KINDS[options.kind](options.rate)
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
     board = Blackboard.attach(options.directory / "world.bin")
-    gauge = Gauge.draw(board, sensor.noise, measuring, options.on)
+    gauge = StrainGauge.draw(board, sensor.noise, measuring, options.on)
     port = PtyPort(options.directory / "force", sensor.baud, faults)
     stream = Stream(sensor, gauge, port, due=time.monotonic())
     admin.serve(options.directory / "force.sock", stream.operations())

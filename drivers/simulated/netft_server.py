@@ -27,7 +27,7 @@ import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.force_server import LATE_S, TICK_S, Gauge
+from drivers.simulated.force_server import LATE_S, TICK_S, StrainGauge
 
 COUNTS = np.repeat((1_000_000.0, 1_000_000.0), 3)
 NOISE = (0.02, 0.0005)
@@ -60,7 +60,7 @@ class NetFt:
         elements: of its page, by name.
     """
 
-    gauge: Gauge
+    gauge: StrainGauge
     rng: np.random.Generator
     rate: float
     line: socket.socket
@@ -220,7 +220,7 @@ def main() -> None:
     board = Blackboard.attach(options.directory / "world.bin")
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     line.bind((options.host, options.port))
-    gauge = Gauge.draw(board, NOISE, measuring, options.on)
+    gauge = StrainGauge.draw(board, NOISE, measuring, options.on)
     sensor = NetFt(gauge, faults, options.rate, line)
     serve_page(sensor, options.host, options.web_port)
     admin.serve(options.directory / "force.sock", operations(sensor))

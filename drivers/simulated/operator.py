@@ -5,7 +5,7 @@ from pathlib import Path
 
 from drivers.simulated import admin
 from drivers.terminal_operator import TerminalOperator
-from hilcal.config import CellConfig, Load
+from hilcal.config import CellConfig, CellLoad
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report
 
@@ -51,7 +51,7 @@ class SimulatedOperator:
         fields = (("hand_s", self.hand), ("person", self.person is not None))
         return Report("operator", name, facts, problems, fields)
 
-    def hang(self, load: Load | None, why: str) -> None:
+    def hang(self, load: CellLoad | None, why: str) -> None:
         """Hang a load in the simulated world, or take it off; a person is asked first.
 
         Raises:

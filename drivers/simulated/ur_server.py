@@ -30,10 +30,10 @@ import numpy as np
 
 from drivers.simulated import admin
 from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur.controller import Controller, Dashboard
+from drivers.simulated.ur.controller import Controller, DashboardServer
 from drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
 from drivers.simulated.ur.programs import ScriptStream
-from drivers.simulated.ur.robot_api import RobotApi
+from drivers.simulated.ur.robot_api import RobotApiServer
 from drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
 from drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
@@ -70,7 +70,7 @@ def switched_on(
     return state
 
 
-class Server:
+class UrServer:
     """Everything that answers on one address."""
 
     def __init__(
@@ -91,7 +91,7 @@ class Server:
         self.controller.hears = self.rtde.hears
         model = state.kinematics.arm.name
         self.is_x = state.version[0] >= POLYSCOPE_X
-        supervision = RobotApi if self.is_x else Dashboard
+        supervision = RobotApiServer if self.is_x else DashboardServer
         self.dashboard = supervision(self.controller, self.faults, model)
         status = NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
@@ -192,7 +192,7 @@ def read_version(text: str) -> Version:
 class AdminOperations:
     """What may be asked and switched; answers with the state, or the log."""
 
-    def __init__(self, server: Server, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, server: UrServer, loop: asyncio.AbstractEventLoop) -> None:
         """Serve from other threads than that of the loop."""
         self._server, self._loop = server, loop
         arm, controller, links = server.arm, server.controller, server.rtde.links
@@ -333,7 +333,7 @@ async def serve(options: argparse.Namespace) -> None:
         raise DeviceError(f"simulated arm: no shared world at {world} ({error})") from None
     rng = np.random.default_rng(options.seed)
     state = switched_on(arm, board, read_version(options.version), rng)
-    server = Server(state, board, options.host, rng, options.api_port, factory)
+    server = UrServer(state, board, options.host, rng, options.api_port, factory)
     await server.open()
     loop = asyncio.get_running_loop()
     admin.serve(options.directory / "arm.sock", AdminOperations(server, loop))

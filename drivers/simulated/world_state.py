@@ -20,7 +20,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorMount:
+class SimulatedMount:
     """Where the force sensor sits: everything beyond it weighs on it.
 
     Attributes:
@@ -32,7 +32,7 @@ class SensorMount:
     axes: Floats
 
     @classmethod
-    def of(cls, config: CellConfig) -> "SensorMount":
+    def of(cls, config: CellConfig) -> "SimulatedMount":
         """Return the mount of a configuration; at the flange where it has no sensor."""
         sensor = config.force_sensor
         if sensor is None:
@@ -122,7 +122,7 @@ class WorldState:
             )
         self._world, self._board, self._seed = world, board, seed
         self._loads = config.loads
-        self._mount = SensorMount.of(config)
+        self._mount = SimulatedMount.of(config)
         self._ages = world.ages
         self._rng = np.random.default_rng([seed, 0])
         self._lock = threading.RLock()

@@ -32,7 +32,7 @@ from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
-from hilcal.calibration.tool import Tool, in_chain, tool_of, tool_poses
+from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
@@ -93,7 +93,7 @@ class Calibration:
     sensor: SensorMount | None = None
     learnt: Learnt | None = None
     conditions: Mapping[str, Condition] = field(default_factory=dict)
-    _tracked: Tool = field(init=False, repr=False)
+    _tracked: ToolPose = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Keep the tracked target as the usual tool."""
@@ -261,7 +261,7 @@ class Calibration:
         found = self._compiled if of is self._tracked else compiled(of, self.mode)
         return () if isinstance(found, Compiled) else found
 
-    def _invert(self, of: Tool, states: States, goal: tuple[Floats, Floats]) -> Inverse:
+    def _invert(self, of: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:
         def poses(at: Floats, points: Ints) -> Pose:
             prediction = of.model.predict(replace(states[points], q=at), of.theta)
             return (*in_chain(of, *tool_poses(of, prediction)), prediction.situation.chain)
@@ -309,7 +309,7 @@ class Calibration:
         """(4, 4) T_sensor_base, see `identification.robot_frames`."""
         return self.frames.base
 
-    def _tool(self, pose: Floats | None) -> Tool:
+    def _tool(self, pose: Floats | None) -> ToolPose:
         """Return the tool with a pose on the flange; raises as `predict` does."""
         if pose is None:
             return self._tracked
@@ -353,7 +353,7 @@ class Calibration:
                 )
         return states, untold
 
-    def nominal(self, of: Tool, states: States) -> tuple[Floats, Floats]:
+    def nominal(self, of: ToolPose, states: States) -> tuple[Floats, Floats]:
         """Orientation and position of the tool that errors are counted from."""
         if self.mode == "deflection":
             return tool_poses(of, of.model.predict(_unloaded(states), of.theta))
@@ -363,7 +363,7 @@ class Calibration:
 
     def poses(
         self,
-        of: Tool,
+        of: ToolPose,
         states: States,
         nominal: tuple[Floats, Floats],
         std: bool,
@@ -400,7 +400,7 @@ class Calibration:
         assert self.learnt is not None  # noqa: S101  (one of both is there)
         return self.learnt.root(self.model, self.theta, self.mode)
 
-    def _by_parameters(self, of: Tool, states: States, prediction: Prediction) -> Floats:
+    def _by_parameters(self, of: ToolPose, states: States, prediction: Prediction) -> Floats:
         """(N, 3, 3) κ J C Jᵀ of the position, axes of the chain, m²."""
         spread = self._spread(of, prediction)
         if self.mode == "deflection":
@@ -417,7 +417,7 @@ class Calibration:
             position, spread = position - free[0], spread - free[1]
         return position, spread
 
-    def _spread(self, of: Tool, prediction: Prediction) -> Floats:
+    def _spread(self, of: ToolPose, prediction: Prediction) -> Floats:
         """(N, 3, K) J R of the position, axes of the chain."""
         jacobian = of.model.jacobian(prediction, of.theta, 3)
         jacobian = np.swapaxes(prediction.observation.axes, 1, 2) @ jacobian

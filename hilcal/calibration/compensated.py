@@ -13,7 +13,7 @@ import numpy as np
 from hilcal.calibration.compensation import Inverse, singular
 from hilcal.calibration.measured import Outside
 from hilcal.calibration.poses import BAND, ToolPoses
-from hilcal.calibration.tool import Tool
+from hilcal.calibration.tool import ToolPose
 from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
@@ -34,7 +34,7 @@ class Compensation:
 
     inverse: Inverse
     _calibration: "Calibration"
-    _tool: Tool
+    _tool: ToolPose
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool

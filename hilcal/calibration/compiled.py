@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
-from hilcal.calibration.form import TRIALS, Form, given_the_columns, packed, repeated
-from hilcal.calibration.tool import Tool, in_chain
+from hilcal.calibration.form import TRIALS, CompiledForm, given_the_columns, packed, repeated
+from hilcal.calibration.tool import ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
@@ -46,7 +46,7 @@ class Compiled:
     load: tuple[Any, ...]
     laws: tuple[Floats, ...]
     tables: tuple[Any, ...]
-    tool: Tool
+    tool: ToolPose
     nominal: tuple[tuple[Floats, ...], tuple[Any, ...]]
     reach: float
     mode: Mode
@@ -104,7 +104,7 @@ class Compiled:
         return packed(dq), packed(twist), packed(soft)
 
 
-def compiled(tool: Tool, mode: Mode) -> Compiled | tuple[str, ...]:
+def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
     """Return a model for the kernel; the names of what it has no form for where there is such."""
     try:
         import numba  # noqa: F401
@@ -116,7 +116,7 @@ def compiled(tool: Tool, mode: Mode) -> Compiled | tuple[str, ...]:
         return (f"{arm.name}'s joints (not six, coupled, or sliding)",)
     if tool.moving:
         return tuple(e.name for e, _ in tool.moving)
-    s, form = _situation(tool), Form.empty(arm.n)
+    s, form = _situation(tool), CompiledForm.empty(arm.n)
     first_moment, point = np.zeros((arm.n, 3)), cell.load_point
     by_point: list[tuple[Effect, Floats]] = []
     for e, mine in zip(model.effects, model.slices(), strict=True):
@@ -137,7 +137,7 @@ def compiled(tool: Tool, mode: Mode) -> Compiled | tuple[str, ...]:
         packed(arm.masses), first_moment, form.gain, form.bias,
     )  # fmt: skip
     links = (packed(arm.links[:, :3, :3]), packed(arm.links[:, :3, 3]), packed(arm.coms))
-    bare = Form.empty(arm.n)
+    bare = CompiledForm.empty(arm.n)
     nominal = bare.laws(), bare.tables()
     unit = np.zeros_like(s.wrench[:1])
     unit[..., 5] = 1.0
@@ -153,7 +153,7 @@ def _nothing(n: int) -> tuple[Floats, Floats, Floats]:
     return np.zeros((1, n)), np.zeros((1, n + 1, 6)), np.zeros((1, n))
 
 
-def _situation(tool: Tool) -> Situation:
+def _situation(tool: ToolPose) -> Situation:
     """Return random states with every column, and random wrenches through their slots."""
     arm, rng = tool.model.cell.arm, np.random.default_rng(20250307)
     states = States(

@@ -26,7 +26,7 @@ EXACT = 1e-12
 
 
 @dataclass(slots=True, eq=False)
-class Form:
+class CompiledForm:
     """The sum of the effects so far."""
 
     a: Floats
@@ -43,7 +43,7 @@ class Form:
     bias: Floats
 
     @classmethod
-    def empty(cls, n: int) -> "Form":
+    def empty(cls, n: int) -> "CompiledForm":
         """Return the form of an arm of n joints without any effect."""
         return cls(
             np.zeros(n), np.zeros((n, n)), np.zeros((n, 6)), np.zeros((n + 1, 6)),

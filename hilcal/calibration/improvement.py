@@ -33,7 +33,7 @@ from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Size:
+class ErrorSize:
     """Sizes of 3-D position errors, m."""
 
     mean_m: float
@@ -41,7 +41,7 @@ class Size:
     max_m: float
 
     @classmethod
-    def of(cls, errors: Floats) -> "Size":
+    def of(cls, errors: Floats) -> "ErrorSize":
         """Return the sizes of (N,) distances."""
         rms = float(np.sqrt(np.mean(errors**2)))
         return cls(float(errors.mean()), rms, float(errors.max()))
@@ -66,8 +66,8 @@ class Improved:
 
     name: str
     count: int
-    before: Size
-    after: Size
+    before: ErrorSize
+    after: ErrorSize
     noise_m: float
     band_m: float
     inside: int
@@ -114,7 +114,7 @@ class Improvement:
         return int(np.sum(self.after_m > limit_m))
 
     def _part(self, name: str, mine: Bools) -> Improved:
-        before, after = Size.of(self.before_m[mine]), Size.of(self.after_m[mine])
+        before, after = ErrorSize.of(self.before_m[mine]), ErrorSize.of(self.after_m[mine])
         noise = float(np.sqrt(np.mean(self.noise_m[mine] ** 2)))
         first, last = (np.sqrt(max(s.rms_m**2 - noise**2, 0.0)) for s in (before, after))
         return Improved(

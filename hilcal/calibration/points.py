@@ -43,7 +43,7 @@ from hilcal.tables.columns import (
     with_following,
 )
 from hilcal.tables.files import open_grid
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 from hilcal.tables.guessing.proposal import GUESSED
 from hilcal.tables.guessing.propose import Proposed, propose
 from hilcal.tables.guessing.sniff import sniff
@@ -143,7 +143,7 @@ def read_points(
     return Points(names, q, wanted, wrench, sensed, recorded, taken)
 
 
-def _plain(path: Path, arm: Arm) -> tuple[Table | None, str]:
+def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
     """Return a table whose columns are called as above; None where none of them is."""
     groups = _groups(arm)
     chosen: list[Sequence[str]] = []
@@ -152,7 +152,7 @@ def _plain(path: Path, arm: Arm) -> tuple[Table | None, str]:
         chosen.extend(_checked(path, given, groups, arm))
 
     try:
-        return Table.of(open_grid(path, _form(path), check), *chosen), ""
+        return ColumnTable.of(open_grid(path, _form(path), check), *chosen), ""
     except _OtherNamesError:
         return None, ""
 
@@ -329,7 +329,7 @@ def _certain_unit(of: Proposed, arm: Arm) -> bool:
     return LEAST_REACH * arm.reach < far < arm.reach + LONGEST_TOOL
 
 
-def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> Table:
+def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
     """Return a table by its mapping, with the columns of above."""
     of = mapped_table(path, mapping, arm)
     table = with_following(of.table, arm)
@@ -400,7 +400,7 @@ def _checked(
     return text, [name for name in header if name in known]
 
 
-def _load(table: Table, row: int, loads: Mapping[str, Floats]) -> Floats:
+def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
     """(6,) wrench of a named load.
 
     Raises:

@@ -20,7 +20,7 @@ from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Tool:
+class ToolPose:
     """What is to be put somewhere.
 
     Attributes:
@@ -46,7 +46,7 @@ class Tool:
     moving: tuple[tuple[Effect, slice], ...]
 
 
-def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
+def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
     """Return the tracked target as fitted, or a tool with another pose.
 
     Args:
@@ -65,7 +65,7 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
         cell = replace(cell, target=at.flange @ pose, target_known=True)
         own = replace(model, cell=cell, effects=tuple(named))
-    return Tool(
+    return ToolPose(
         model=own,
         theta=theta[kept],
         kept=kept,
@@ -78,7 +78,7 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> Tool:
     )
 
 
-def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
+def tool_poses(tool: ToolPose, prediction: Prediction) -> tuple[Floats, Floats]:
     """Orientation (N, 3, 3) and position (N, 3) of the tool in base axes, m."""
     chain, s = prediction.situation.chain, prediction.situation
     moved = [e.deviation(tool.theta[mine], s) for e, mine in tool.moving]
@@ -98,7 +98,7 @@ def tool_poses(tool: Tool, prediction: Prediction) -> tuple[Floats, Floats]:
     return se3.product(r, rotation), p + se3.apply(r, position)
 
 
-def in_chain(tool: Tool, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
+def in_chain(tool: ToolPose, rotation: Floats, position: Floats) -> tuple[Floats, Floats]:
     """Poses (N, 3, 3) and (N, 3) in the axes of the fitted chain, from those in base axes."""
     turn = tool.base[:3, :3].T
     return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])

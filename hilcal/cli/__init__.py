@@ -20,7 +20,7 @@ from hilcal.cli.commands import (
     EXIT_CODES,
     EXIT_CODES_OF_RUN,
     Command,
-    Group,
+    CommandGroup,
     InOrderOfWork,
     load,
 )
@@ -43,7 +43,7 @@ def application(
     help_text: str,
     *,
     alone: bool = False,
-    group: type[Group] = Group,
+    group: type[CommandGroup] = CommandGroup,
     completion: bool = False,
 ) -> typer.Typer:
     """Return an empty application.

@@ -55,7 +55,7 @@ from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
 from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure, continued
-from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, Settings, Step
+from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile
@@ -157,11 +157,11 @@ def calibrate(
         )
     with told.how_to_go_on(p), ExitStack() as stack:
         live = stack.enter_context(followed(t, view, output))
-        Operator(t, p, stack, rehearse, yes, live).to_the_end()
+        CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()
         with working(t.progress) as say:
             found = p.compare(say)
     limit_m = p.settings.limit_m
-    t.show(step_heading(Step("compare", output)))
+    t.show(step_heading(ProcedureStep("compare", output)))
     t.show(improvement_report(found, limit_m))
     files = p.files
     t.show(
@@ -322,7 +322,7 @@ def _document(p: Procedure) -> dict[str, object]:
     }
 
 
-class Operator:
+class CalibrationOperator:
     """Does one step after the other, and asks before the arm moves."""
 
     def __init__(
@@ -355,7 +355,7 @@ class Operator:
             else:
                 self._computing(step)
 
-    def _moving(self, step: Step) -> None:
+    def _moving(self, step: ProcedureStep) -> None:
         """Ask, and measure what is missing of a plan."""
         self._check()
         if not self._yes and somebody_there(self._t):
@@ -396,7 +396,7 @@ class Operator:
         refuse_unready(answers)
         self._ready = True
 
-    def _computing(self, step: Step) -> None:
+    def _computing(self, step: ProcedureStep) -> None:
         """Do a step in which nothing moves, and say what came of it."""
         p, t = self._p, self._t
         if step.kind == "plan":

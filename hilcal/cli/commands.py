@@ -163,7 +163,7 @@ EXIT_CODES_OF_RUN = (
 )
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """A group whose help gives the whole summary of each command, wrapped between words."""
 
     sections: dict[str, tuple[str, ...]] = {}  # noqa: RUF012  (replaced, never changed)
@@ -187,7 +187,7 @@ class Group(TyperGroup):
         return str(getattr(command, "help", None) or "").strip().split("\n\n")[0]
 
 
-class InOrderOfWork(Group):
+class InOrderOfWork(CommandGroup):
     """The group of all commands of hilcal."""
 
     sections = SECTIONS

@@ -14,7 +14,7 @@ from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
-from hilcal.calibration.programs.languages import READERS, Understood, understood
+from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
 from hilcal.calibration.urscript import (
     JOINTS,
     Waypoint,
@@ -73,7 +73,7 @@ class _Task:
     tool: Floats | None
     program: str | None = None
     waypoints: tuple[Waypoint, ...] = ()
-    other: Understood | None = None
+    other: UnderstoodProgram | None = None
 
 
 def compensate(

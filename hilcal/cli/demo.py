@@ -30,8 +30,8 @@ from hilcal.cli.options import EffectsFrom, Json, Record, catalogue_with, check_
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import chapter_of, revisions_json, rows_of
 from hilcal.cli.rehearsing import (
-    Measured,
     RehearsalSettings,
+    RehearsedCampaign,
     first_plan,
     in_process,
     on_devices,
@@ -353,7 +353,7 @@ def demo(
 @contextmanager
 def _campaign(
     t: Terminal, told: RehearsalSettings, poses: int, without_devices: bool, ambiguous: bool
-) -> Iterator[tuple[Measured, Rehearsal, Doubted | None]]:
+) -> Iterator[tuple[RehearsedCampaign, Rehearsal, Doubted | None]]:
     """Measure a campaign; the cell is there as long as the block lasts.
 
     With `ambiguous`, arms are measured until one leaves a doubt, and then what settles it.

@@ -9,10 +9,10 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.emscon import Options as EmsconOptions
-from drivers.geocom import Options as GeoComOptions
-from drivers.natnet import Options as NatNetOptions
-from drivers.netft import Options as NetFtOptions
+from drivers.emscon import EmsconOptions as EmsconOptions
+from drivers.geocom import GeoComOptions as GeoComOptions
+from drivers.natnet import NatNetOptions as NatNetOptions
+from drivers.netft import NetFtOptions as NetFtOptions
 from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import (
     EffectsFrom,

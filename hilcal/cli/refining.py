@@ -72,14 +72,14 @@ from hilcal.present.registration import covariance_words, fitted_lines, other_ar
 from hilcal.present.story import Chapter
 from hilcal.present.torques import torque_lines
 from hilcal.present.verdict import message
-from hilcal.refinement import Step as RefinementStep
+from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import change
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Row:
+class RevisionRow:
     """A revision as it is listed: what it changed, its fit and the verdict on it."""
 
     number: int
@@ -95,10 +95,10 @@ class Row:
         return self.number, change(self.added, self.removed, scatter), self.fit, self.verdict
 
 
-def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[Row]:
+def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[RevisionRow]:
     """Return the steps of a refinement as they are listed, by the numbers of their revisions."""
     return [
-        Row(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
+        RevisionRow(number, s.fit, s.diagnosis.verdict, s.added, s.removed)
         for number, s in zip(numbers, steps, strict=True)
     ]
 
@@ -185,9 +185,9 @@ def _change(
                 live.revised(Chapter(c.number, c.added, c.fit, c.diagnosis, c.removed))
         stored, d = o.file.revision(number), c.diagnosis
         verdict = str(stored.result_json.get("diagnose", {}).get("verdict", ""))
-        rows: list[Row] = [
-            Row(number, before, verdict, stored.added, stored.removed),
-            Row(c.number, c.fit, d.verdict, c.added, c.removed),
+        rows: list[RevisionRow] = [
+            RevisionRow(number, before, verdict, stored.added, stored.removed),
+            RevisionRow(c.number, c.fit, d.verdict, c.added, c.removed),
         ]
         t.show([revisions_table([r.shown for r in rows]), key(c.fit.readings)])
         named = write_effect(effect, options or {})
@@ -350,7 +350,7 @@ def chapter_of(number: int, step: RefinementStep) -> Chapter:
     return Chapter(number, step.added, step.fit, step.diagnosis, step.removed)
 
 
-def revisions_json(rows: Sequence[Row]) -> list[dict[str, object]]:
+def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
     """Return what the contract says of each revision."""
     return [
         {

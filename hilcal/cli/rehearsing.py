@@ -93,7 +93,7 @@ class RehearsalSettings:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class RehearsedCampaign:
     """A first campaign, in a simulated cell that is still there.
 
     Attributes:
@@ -124,7 +124,7 @@ def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say
 
 
 @contextmanager
-def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Measured]:
+def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
     """Run a plan on simulated devices; they stay for further plans as long as the block lasts.
 
     The drivers are the real ones; what they talk to are the simulated devices of one world, each
@@ -161,11 +161,11 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
             log.append(log.with_new_names(more))
             return measured()
 
-        yield Measured(measured(), further, missing)
+        yield RehearsedCampaign(measured(), further, missing)
 
 
 @contextmanager
-def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Measured]:
+def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[RehearsedCampaign]:
     """Draw the readings of a plan from the simulated world without any device.
 
     They are written bit by bit, as a real campaign grows.
@@ -195,7 +195,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Mea
             for k, step in enumerate(log.plan.steps):
                 log.record(drawn[slice(k, k + 1)], step, {"drawn": True})
 
-        yield Measured(measured(plan, 1, 0.0), further, missing)
+        yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
 def last_time(readings: Readings) -> float:

@@ -223,7 +223,7 @@ def workbench(
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     from hilcal.workbench.guard import UNUSED_S
     from hilcal.workbench.server import require_nicegui, serve
-    from hilcal.workbench.session import Session
+    from hilcal.workbench.session import WorkbenchSession
 
     require_nicegui()
     if config is not None:
@@ -243,7 +243,7 @@ def workbench(
         sys.stdout.flush()
         t.notice(f"It lets one browser in, within {UNUSED_S / 60:g} minutes. Serving until Ctrl-C.")
 
-    if not serve(Session(run, catalogue), port, told, browser=not no_browser):
+    if not serve(WorkbenchSession(run, catalogue), port, told, browser=not no_browser):
         t.notice("Nobody opened it: its address is no longer valid. Start it again.")
     _end_of_process().start()  # a fit in a thread may delay it; what is stored is durable
 

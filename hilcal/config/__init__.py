@@ -11,7 +11,7 @@ from hilcal.config.cell import (
     Tracker,
     load_config,
 )
-from hilcal.config.loads import Limits, Load
+from hilcal.config.loads import CellLoad, Limits
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import Acquire, ForceSensor, Motion, Operator
 
@@ -19,9 +19,9 @@ __all__ = [
     "STANDARD_GRAVITY_M_S2",
     "Acquire",
     "CellConfig",
+    "CellLoad",
     "ForceSensor",
     "Limits",
-    "Load",
     "Motion",
     "Obstacle",
     "Operator",

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import Field, Strict, model_validator
 
 from hilcal.config.joints import Conventions
-from hilcal.config.loads import Limits, Load
+from hilcal.config.loads import CellLoad, Limits
 from hilcal.config.observers import Gauge, Point
 from hilcal.config.planning import Obstacle, Planning, Sight
 from hilcal.config.rig import (
@@ -355,7 +355,7 @@ class CellConfig(Section):
     repeatability: Repeatability = Field(
         default_factory=Repeatability, description="a section [repeatability]"
     )
-    loads: tuple[Load, ...] = Field((), description="sections [[loads]], one per load")
+    loads: tuple[CellLoad, ...] = Field((), description="sections [[loads]], one per load")
     force_sensor: ForceSensor | None = Field(
         None, description='a section [force_sensor] with driver = "ft300" and port or the like'
     )

@@ -13,7 +13,7 @@ HANG_M = 0.3
 """Length of what hangs from the load point where a load with a mass does not say, m."""
 
 
-class Load(Section):
+class CellLoad(Section):
     """[[loads]]: a load at hand: a dead weight, a pull in base axes, or both."""
 
     name: str = Field(min_length=1, description='a name other than "none"', examples=["5kg"])
@@ -44,7 +44,7 @@ class Load(Section):
     )
 
     @model_validator(mode="after")
-    def _some_load(self) -> "Load":
+    def _some_load(self) -> "CellLoad":
         if self.name == "none":
             raise ValueError('the name "none" is kept for the unloaded state; choose another')
         if self.mass_kg == 0.0 and not any((*self.force_N, *self.moment_Nm)):

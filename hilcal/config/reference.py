@@ -62,7 +62,7 @@ class Key:
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class KeyTable:
     """One section of CELL.toml.
 
     Attributes:
@@ -78,13 +78,13 @@ class Table:
     keys: tuple[Key, ...]
 
 
-def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[Table, ...]:
+def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[KeyTable, ...]:
     """Return all sections, in the order of the configuration.
 
     Args:
         options: sections of drivers' own keys, by name, e.g. "tracker.options (emscon)".
     """
-    found: list[Table] = []
+    found: list[KeyTable] = []
     for name, field in CellConfig.model_fields.items():
         inner = section_of(field)
         if inner is None:
@@ -99,7 +99,7 @@ def tables(options: Mapping[str, type[Section]] | None = None) -> tuple[Table, .
     return tuple(found)
 
 
-def table(name: str, known: tuple[Table, ...]) -> Table:
+def table(name: str, known: tuple[KeyTable, ...]) -> KeyTable:
     """Return a section by name, with or without its brackets.
 
     Raises:
@@ -114,7 +114,7 @@ def table(name: str, known: tuple[Table, ...]) -> Table:
     )
 
 
-def _tables(name: str, section: type[Section], several: bool) -> Iterator[Table]:
+def _tables(name: str, section: type[Section], several: bool) -> Iterator[KeyTable]:
     """Yield a section and those inside of it."""
     yield _table(name, section, several)
     for key, field in section.model_fields.items():
@@ -123,20 +123,20 @@ def _tables(name: str, section: type[Section], several: bool) -> Iterator[Table]
             yield from _tables(f"{name}.{key}", inner, _is_list(field))
 
 
-def _table(name: str, section: type[Section], several: bool) -> Table:
+def _table(name: str, section: type[Section], several: bool) -> KeyTable:
     about = (section.__doc__ or "").split("\n")[0].split(": ", 1)[-1]
     keys = tuple(_key(key, field) for key, field in section.model_fields.items())
     header = f"[[{name}]]" if several else f"[{name.split()[0]}]"
-    return Table(name, header, about[:1].upper() + about[1:], keys)
+    return KeyTable(name, header, about[:1].upper() + about[1:], keys)
 
 
-def _by_name(name: str, field: FieldInfo) -> Table:
+def _by_name(name: str, field: FieldInfo) -> KeyTable:
     """Return a section whose keys are names of the user's."""
     ((key, value),) = example(field).items()
     valid = f"a number over 0; the key is a name, as {key}"
     one = Key("NAME", "1", "1.0", valid, f"{key} = {inline(value)}")
     about = (field.description or "").split(": ", 1)[-1]
-    return Table(name, f"[{name}]", f"{about[:1].upper()}{about[1:]}.", (one,))
+    return KeyTable(name, f"[{name}]", f"{about[:1].upper()}{about[1:]}.", (one,))
 
 
 def _key(name: str, field: FieldInfo) -> Key:

@@ -4,7 +4,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from hilcal.config.reference import Key, Table, inline, table, tables
+from hilcal.config.reference import Key, KeyTable, inline, table, tables
 from hilcal.names import escaped
 
 SHOWN: dict[str, tuple[str, ...]] = {
@@ -44,7 +44,7 @@ def cell_text(data: Mapping[str, Any], title: str) -> str:
     return "\n".join(lines)
 
 
-def _section(t: Table, keys: Sequence[str], given: Any) -> Iterator[str]:
+def _section(t: KeyTable, keys: Sequence[str], given: Any) -> Iterator[str]:
     yield from _comment(t.about)
     several = t.header.startswith("[[")
     required = any(k.default == "required" for k in t.keys)

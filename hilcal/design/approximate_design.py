@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.design import barrier as interior
-from hilcal.design.barrier import Optimum, Program
+from hilcal.design.barrier import BarrierProgram, Optimum
 from hilcal.design.bound import best_first, prices, total_information, upper_bound
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.criterion import Criterion, Smooth, square
@@ -181,7 +181,7 @@ class _Scan:
             cost = np.append(cost, self.budget)
             left = min(max(1.0 - float(weight @ cost[:-1]) / self.budget, 0.01), 0.99)
             start = np.append((1.0 - left) * start, left)
-        program = Program(self.criterion, rows, cost, self.budget, self.cap, self.prior)
+        program = BarrierProgram(self.criterion, rows, cost, self.budget, self.cap, self.prior)
         found = interior.solve(program, start, goal, order)
         return replace(found, weight=found.weight[: len(active)])
 
@@ -216,7 +216,7 @@ def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
         even = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
         some = np.union1d(best_first(rate, count - len(even)), even)
     rows, cost = units.rows[some], units.cost[some]
-    program = Program(scan.criterion, rows, cost, budget, scan.cap, scan.prior)
+    program = BarrierProgram(scan.criterion, rows, cost, budget, scan.cap, scan.prior)
     w = np.full(len(some), budget / float(cost.sum()))
     for _ in range(_WARM):
         m = program.information(w)

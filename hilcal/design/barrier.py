@@ -20,7 +20,7 @@ _CLAMP = 1e4  # how far a dual may be from μ / w
 
 
 @dataclass(frozen=True, eq=False)
-class Program:
+class BarrierProgram:
     """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
     Attributes:
@@ -151,7 +151,7 @@ class Optimum:
         return self.bound / self.value - 1.0 if self.value > 0.0 else np.inf
 
 
-def solve(program: Program, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
+def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
     """Return the optimum to a relative gap.
 
     Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the
@@ -224,7 +224,7 @@ def solve(program: Program, start: Floats, tolerance: float, order: float = 1.0)
     return best
 
 
-def _newton(program: Program, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
+def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) -> Floats | None:
     """Return the step that spends the budget: K dw + λ c = lean, c·dw = B − c·w."""
     diagonal = np.diag(matrix).copy()
     for ridge in (1e-14, 1e-10, 1e-6):
@@ -253,7 +253,7 @@ def _dual(z: Floats, move: Floats) -> Floats:
 
 
 def _search(
-    program: Program,
+    program: BarrierProgram,
     surrogate: Callable[[Floats], Smooth | None],
     here: Smooth,
     at: tuple[Floats, Floats],

@@ -11,7 +11,7 @@ from hilcal.design.criteria import A, D, MeanVariance
 from hilcal.design.criterion import Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.eigenvalue_criteria import E, K
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import mixed_design
 from hilcal.design.optimum import Design, best
 from hilcal.design.prediction_poses import PredictionPoses
@@ -59,7 +59,7 @@ def canonical(name: str) -> str:
 
 
 def objective_of(
-    problem: Problem, config: CellConfig, name: str, work: PredictionPoses | None
+    problem: DesignProblem, config: CellConfig, name: str, work: PredictionPoses | None
 ) -> Objective:
     """Return a design problem with a criterion.
 
@@ -99,7 +99,7 @@ def objective_of(
     raise InputError(f"criterion {name!r}; valid: {', '.join(CRITERIA)}")
 
 
-def unknown(problem: Problem) -> Ints:
+def unknown(problem: DesignProblem) -> Ints:
     """Return the indices of the model's parameters that have no prior."""
     live = problem.nominal.live
     return np.flatnonzero(np.isinf(problem.nominal.prior_std[live]))
@@ -121,7 +121,7 @@ def choose(
 
 def choose_poses(
     asked: Objective,
-    problem: Problem,
+    problem: DesignProblem,
     usable: Bools,
     poses: int,
     rng: np.random.Generator,
@@ -184,7 +184,7 @@ def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]
 
 
 def costly_loads(
-    asked: Objective, problem: Problem, budget: float, change: float, rng: np.random.Generator
+    asked: Objective, problem: DesignProblem, budget: float, change: float, rng: np.random.Generator
 ) -> tuple[tuple[str, float], ...]:
     """Return loads without which the same time buys more, with the gain as a share of φ.
 
@@ -227,7 +227,7 @@ def only(asked: Objective, wanted: Bools) -> Objective:
 
 
 def _value(
-    asked: Objective, problem: Problem, sample: Bools, loads: tuple[str, ...], budget: float
+    asked: Objective, problem: DesignProblem, sample: Bools, loads: tuple[str, ...], budget: float
 ) -> float:
     """φ of the continuous optimum; 0 where these loads do not determine everything."""
     allowed = {*loads, problem.candidates.loads[0]}

@@ -20,7 +20,7 @@ from hilcal.design.approximate_design import relax
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.choice import LOOSE, SAMPLE, Objective, canonical, objective_of, only
 from hilcal.design.criteria import Determinant, InverseVariance, MeanVariance
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.prediction_poses import PredictionPoses
 from hilcal.types import Floats, Ints
 
@@ -65,7 +65,7 @@ class CompoundVariance(InverseVariance):
 
 
 def compound_objective(
-    problem: Problem,
+    problem: DesignProblem,
     config: CellConfig,
     name: str,
     work: PredictionPoses | None,

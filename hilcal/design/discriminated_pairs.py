@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.design.approximate_design import relax
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.t_optimality import Pair, Separate
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
@@ -64,7 +64,7 @@ class DiscriminatedPairs:
 
 
 def discriminated_pairs(
-    problem: Problem,
+    problem: DesignProblem,
     suspects: Sequence[str] | None = None,
     fitted: Mapping[str, Floats] | None = None,
 ) -> DiscriminatedPairs:
@@ -109,14 +109,14 @@ def discriminated_pairs(
     return _separable(problem, DiscriminatedPairs(tuple(pairs), tuple(both), prior))
 
 
-def pair_of(problem: Problem, names: tuple[str, str], beta: Floats) -> Pair:
+def pair_of(problem: DesignProblem, names: tuple[str, str], beta: Floats) -> Pair:
     """Return a pair of an effect with the parameters β, in the problem's units, and a rival."""
     effect, rival = names
     nuisance = np.concatenate([np.arange(problem.model_size), problem.of_effect(rival)])
     return Pair(problem.of_effect(effect), beta, nuisance, f"{effect} from {rival}")
 
 
-def supported_parameters(problem: Problem, count: int) -> dict[str, Floats]:
+def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats]:
     """Return (count, E) parameters of the families that the readings so far support, SI.
 
     Draws from their posterior, its mean first; see `effect_estimate`.
@@ -132,7 +132,7 @@ def supported_parameters(problem: Problem, count: int) -> dict[str, Floats]:
     return out
 
 
-def _separable(problem: Problem, of: DiscriminatedPairs) -> DiscriminatedPairs:
+def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedPairs:
     """Leave out the pairs that no measurement separates."""
     spread = of.prior + problem.units.information(
         np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
@@ -171,7 +171,7 @@ def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     )
 
 
-def _best_power(problem: Problem, of: DiscriminatedPairs, pair: Pair) -> float:
+def _best_power(problem: DesignProblem, of: DiscriminatedPairs, pair: Pair) -> float:
     """Power of the best plan of `MANY` readings for one pair."""
     try:
         found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
@@ -191,7 +191,7 @@ def power(pair: Pair, information: Floats) -> float:
     return family_power(s, pair.beta, LEVEL)
 
 
-def _directions(problem: Problem, effect: str) -> list[Floats]:
+def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
     """Directions (E,) of an effect whose RMS over all measured elements is 1 σ."""
     where = problem.of_effect(effect)
     rows = problem.units.rows[:, :, where]

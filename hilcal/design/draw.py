@@ -32,7 +32,7 @@ _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class DrawnPoses:
     """K poses that are allowed unloaded, and the loads that each may bear.
 
     Attributes:
@@ -60,7 +60,7 @@ def draw(
     least: int = 1,
     also: Floats | None = None,
     most: int | None = None,
-) -> Drawn:
+) -> DrawnPoses:
     """Return poses from a Sobol sequence over the joint space, turned by a random shift.
 
     Args:
@@ -109,7 +109,7 @@ def draw(
             remarks.append(_unusable(space, q, load))
     if len(space.loads) > 1 and not allowed[:, 1:].any():
         raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
-    return Drawn(q, space.loads, allowed, drawn, left, tuple(remarks))
+    return DrawnPoses(q, space.loads, allowed, drawn, left, tuple(remarks))
 
 
 def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:

@@ -65,7 +65,7 @@ class Potential:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class DesignTerm:
     """A parameter of the problem.
 
     Attributes:
@@ -87,7 +87,7 @@ class Term:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem:
+class DesignProblem:
     """Everything that a plan is chosen by.
 
     Attributes:
@@ -109,7 +109,7 @@ class Problem:
     candidates: Candidates
     units: CandidateSet
     what: tuple[tuple[int, tuple[str, ...]], ...]
-    terms: tuple[Term, ...]
+    terms: tuple[DesignTerm, ...]
     families: tuple[Effect, ...]
     prior: Floats
     measured: Floats
@@ -138,7 +138,7 @@ class Problem:
 
 def problem(
     nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
-) -> Problem:
+) -> DesignProblem:
     """Return the design problem of candidate poses under the loads of a cell.
 
     A unit of absolute positions is one reading. A unit of deflections is a pose with its
@@ -173,7 +173,7 @@ def problem(
     count = len(nominal.live)
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
-    return Problem(
+    return DesignProblem(
         nominal=nominal,
         mode=mode,
         candidates=of,
@@ -187,16 +187,16 @@ def problem(
     )
 
 
-def _terms(nominal: NominalModel, against: Potential) -> tuple[Term, ...]:
+def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
     model = [(e.name, p) for e in nominal.model.effects for p in e.parameters]
     known = [
-        Term(effect, f"{effect}.{p.name}", p.unit, p.scale, float(nominal.theta[k]), False)
+        DesignTerm(effect, f"{effect}.{p.name}", p.unit, p.scale, float(nominal.theta[k]), False)
         for k, (effect, p) in enumerate(model)
         if k in set(nominal.live.tolist())
     ]
     extra = [(e.name, p) for e in against.effects for p in e.parameters]
     return tuple(known) + tuple(
-        Term(effect, f"{effect}.{p.name}", p.unit, float(tau), 0.0, True)
+        DesignTerm(effect, f"{effect}.{p.name}", p.unit, float(tau), 0.0, True)
         for (effect, p), tau in zip(extra, against.scale, strict=True)
     )
 

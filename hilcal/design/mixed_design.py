@@ -32,7 +32,7 @@ from hilcal.design.candidates import (
     deflection_rows,
     reading_derivatives,
 )
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
 from hilcal.design.prior_information import information_of
@@ -68,7 +68,7 @@ class MixedDesign:
     names: tuple[str, ...]
 
 
-def mixed_design(of: Problem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
+def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
     """Return the design problem of predictions with all effects.
 
     Args:
@@ -140,7 +140,7 @@ def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
 class _AllColumns:
     """The units of a problem with the columns of all effects."""
 
-    of: Problem
+    of: DesignProblem
     config: CellConfig
     more: tuple[Effect, ...]
     scale: Floats

@@ -17,7 +17,7 @@ from hilcal.design.discriminated_pairs import (
     supported_parameters,
 )
 from hilcal.design.feasible import Space
-from hilcal.design.information import Problem, readings_of
+from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.planner import Planned, Request, Say, make
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Chosen, Ordering, order_plan
@@ -146,7 +146,7 @@ def measure_next(
 
 
 def expected(
-    problem: Problem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
+    problem: DesignProblem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
 ) -> float:
     """Return the power of a pair, the mean over parameters that its effect may have.
 
@@ -164,7 +164,7 @@ def expected(
 
 
 def _pair_powers(
-    problem: Problem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
+    problem: DesignProblem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
 ) -> Iterator[PairPower]:
     """Yield all pairs of the suspects."""
     seen = {e.name for e in problem.families}

@@ -20,17 +20,17 @@ from hilcal.design.choice import (
     promising,
 )
 from hilcal.design.compound_criteria import compound_objective
-from hilcal.design.draw import Drawn, draw
+from hilcal.design.draw import DrawnPoses, draw
 from hilcal.design.feasible import Space
-from hilcal.design.information import Problem, problem, readings_of
+from hilcal.design.information import DesignProblem, problem, readings_of
 from hilcal.design.noise_model import reading_covariance
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.optimum import Design
-from hilcal.design.predicted import Predicted, predicted
+from hilcal.design.predicted import PredictedUncertainty, predicted
 from hilcal.design.prediction_poses import PredictionPoses, prediction_poses
 from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
 from hilcal.design.timing import pace
-from hilcal.design.undetermined import Undetermined, without_undetermined
+from hilcal.design.undetermined import UndeterminedParameter, without_undetermined
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.carried import CarriedPrior
@@ -95,15 +95,15 @@ class Planned:
     ordered: Ordered
     design: Design
     costly: tuple[tuple[str, float], ...]
-    problem: Problem
+    problem: DesignProblem
     asked: Objective
     usable: Bools
     work: PredictionPoses
-    drawn: Drawn
+    drawn: DrawnPoses
     budget: float
     criterion: str
-    predicted: Predicted
-    undetermined: tuple[Undetermined, ...]
+    predicted: PredictedUncertainty
+    undetermined: tuple[UndeterminedParameter, ...]
     asked_poses: int | None
 
     @property
@@ -211,7 +211,7 @@ def make(
     )  # fmt: skip
 
 
-def _budget(request: Request, of: Problem) -> float:
+def _budget(request: Request, of: DesignProblem) -> float:
     """Readings that are to be taken."""
     if request.readings is not None:
         if request.readings < 1:
@@ -222,7 +222,7 @@ def _budget(request: Request, of: Problem) -> float:
     return float(request.poses * len(of.candidates.loads))
 
 
-def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Floats, Ints]:
+def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:
     """Return the reference (n,), where every load can hang, and which other poses are left.
 
     It is central, and of some such poses the one from which most others are reached.
@@ -249,7 +249,7 @@ def _reference(space: Space, drawn: Drawn, rng: np.random.Generator) -> tuple[Fl
     return drawn.q[home], np.delete(np.arange(len(drawn.q)), home)
 
 
-def _unreachable(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+def _unreachable(space: Space, of: DesignProblem, home: Floats, units: Ints) -> Ints:
     """Return the poses among the chosen units that the arm cannot go to straight from home."""
     wanted: dict[str, set[int]] = {}
     for k in units:
@@ -266,7 +266,7 @@ def _unreachable(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
 
 def _ordered(
     space: Space,
-    of: Problem,
+    of: DesignProblem,
     home: Floats,
     counts: Ints,
     rng: np.random.Generator,
@@ -287,7 +287,7 @@ def _ordered(
     )
 
 
-def _reading_std(space: Space, of: Problem) -> float:
+def _reading_std(space: Space, of: DesignProblem) -> float:
     """Typical standard uncertainty of a reading in one coordinate, m."""
     model, theta = of.nominal.model, of.nominal.theta
     some = of.candidates[slice(0, SAMPLE)].states()

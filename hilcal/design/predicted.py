@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.prediction_poses import PredictionPoses
 from hilcal.identification.uncertainty import LEARNT, MEANINGLESS
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE, ROUNDING
@@ -13,7 +13,7 @@ from hilcal.types import Bools, Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Predicted:
+class PredictedUncertainty:
     """Standard uncertainties that a fit to the planned readings will have.
 
     Twice: with the model complete, as identification will state them, and with the potential
@@ -45,12 +45,12 @@ class Predicted:
 
 
 def predicted(
-    problem: Problem,
+    problem: DesignProblem,
     counts: Floats | None = None,
     *,
     information: Floats | None = None,
     work: PredictionPoses | None = None,
-) -> Predicted:
+) -> PredictedUncertainty:
     """Predict the standard uncertainties that a plan reaches.
 
     Args:
@@ -72,7 +72,7 @@ def predicted(
     prior = problem.nominal.prior_std[problem.nominal.live] / scale[:size]
     terms = problem.terms[:size]
     positions = np.zeros(0) if work is None else positions_of(work, closed, null)
-    return Predicted(
+    return PredictedUncertainty(
         names=tuple(t.name for t in terms),
         units=tuple(t.unit for t in terms),
         values=np.array([t.value for t in terms]),

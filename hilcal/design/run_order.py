@@ -34,7 +34,7 @@ _ALL = 6  # loads up to which every order is tried
 
 
 @dataclass(frozen=True, slots=True)
-class Stop:
+class PlannedStop:
     """A reading at a pose under the load of its block.
 
     Attributes:
@@ -47,7 +47,7 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
+class LoadBlock:
     """What is measured while one load hangs.
 
     Attributes:
@@ -57,7 +57,7 @@ class Block:
     """
 
     load: str
-    loops: tuple[tuple[Stop, ...], ...]
+    loops: tuple[tuple[PlannedStop, ...], ...]
     seconds: float
 
     @property
@@ -258,7 +258,7 @@ def _check(
 
 def stops_of(
     used: Sequence[str], chosen: Sequence[Chosen], repeats: int, rng: np.random.Generator
-) -> dict[str, list[Stop]]:
+) -> dict[str, list[PlannedStop]]:
     """Return the stops by load; each taking gets the first cycle that has none of its loads."""
     taken: dict[tuple[int, str], set[int]] = {}
     for c in chosen:
@@ -274,9 +274,9 @@ def stops_of(
     for pose in rng.choice(once, more, replace=False) if more else ():
         mine = [cycles for (p, _), cycles in taken.items() if p == pose]
         taken[int(pose), UNLOADED].add(max(max(cycles) for cycles in mine) + 1)
-    out: dict[str, list[Stop]] = {}
+    out: dict[str, list[PlannedStop]] = {}
     for (pose, load), cycles in taken.items():
-        out.setdefault(load, []).extend(Stop(pose, cycle) for cycle in sorted(cycles))
+        out.setdefault(load, []).extend(PlannedStop(pose, cycle) for cycle in sorted(cycles))
     return out
 
 
@@ -302,7 +302,7 @@ class OrderDraws:
     q: Floats
     how: Ordering
     rng: np.random.Generator
-    stops: dict[str, list[Stop]] = field(default_factory=dict)
+    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)
     ways: dict[str, Ways] = field(default_factory=dict)
     short: dict[str, list[int]] = field(default_factory=dict)
 
@@ -316,7 +316,7 @@ class OrderDraws:
         """(6,) wrench at the load point by load, base axes, N and N·m."""
         return {load.name: load.wrench(self.cell.gravity) for load in self.config.loads}
 
-    def prepare(self, stops: dict[str, list[Stop]], passable: Passable) -> None:
+    def prepare(self, stops: dict[str, list[PlannedStop]], passable: Passable) -> None:
         """Find the ways and the shortest tour under each load."""
         self.stops = stops
         for load, here in stops.items():
@@ -395,10 +395,10 @@ class OrderDraws:
         walked = tour.shaken(grid, range(1, len(at)), budget, self.rng, moves)
         return [at[k] for k in walked]
 
-    def _block(self, load: str, order: Sequence[int], mixed: bool) -> Block:
+    def _block(self, load: str, order: Sequence[int], mixed: bool) -> LoadBlock:
         """Cut an order into loops; mixed ones come in random order and direction."""
         if not order:
-            return Block(load, (), 0.0)
+            return LoadBlock(load, (), 0.0)
         direct, pace = self.ways[load].direct, self.pace
         parts = tour.loops(direct, order, pace.reading_s, self.how.reference_every_s)
         if parts is None:  # a pose that is reached by another one only, and takes too long
@@ -414,7 +414,7 @@ class OrderDraws:
         seconds = sum(tour.length(direct, p) + pace.reading_s * (len(p) + 1) for p in parts)
         here = self.stops.get(load, [])
         stops = tuple(tuple(here[k - 1] for k in part) for part in parts)
-        return Block(load, stops, seconds)
+        return LoadBlock(load, stops, seconds)
 
     def figures(self, plan: Plan) -> tuple[Duration, Confounding]:
         """Return duration and confounding of a plan."""
@@ -453,7 +453,11 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR)
 
 
 def load_order(
-    before: Block, loaded: Sequence[Block], after: Block, wrenches: Mapping[str, Floats], at: Pace
+    before: LoadBlock,
+    loaded: Sequence[LoadBlock],
+    after: LoadBlock,
+    wrenches: Mapping[str, Floats],
+    at: Pace,
 ) -> list[int]:
     """Return the order of the loads whose wrenches are least correlated with their lags.
 
@@ -486,7 +490,7 @@ def load_order(
 
 
 def assembled(
-    names: Sequence[str], before: Block, loaded: Sequence[Block], after: Block
+    names: Sequence[str], before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock
 ) -> tuple[Step, ...]:
     """Return the steps of the blocks; the reference is read before and after every loop.
 

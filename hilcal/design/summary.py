@@ -14,9 +14,9 @@ from hilcal.design.candidates import reading_derivatives
 from hilcal.design.choice import choose, choose_poses, only, unknown
 from hilcal.design.compound_criteria import compound_objective
 from hilcal.design.confounding import Confounding
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.planner import Planned, Say
-from hilcal.design.predicted import Predicted, predicted
+from hilcal.design.predicted import PredictedUncertainty, predicted
 from hilcal.design.timing import Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
@@ -361,12 +361,12 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     )
 
 
-def _prefixes(of: Problem, *roles: Role) -> tuple[str, ...]:
+def _prefixes(of: DesignProblem, *roles: Role) -> tuple[str, ...]:
     """Return what the names of the parameters of some roles begin with."""
     return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
 
 
-def _joint_share(knows: Predicted, joints: tuple[str, ...]) -> float | None:
+def _joint_share(knows: PredictedUncertainty, joints: tuple[str, ...]) -> float | None:
     """Largest relative standard uncertainty of a joint compliance."""
     shares = [
         std / abs(value)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.effects.per_joint import PerJoint
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.normal_equations import INFORMATION
@@ -23,7 +23,7 @@ SHARE = 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Undetermined:
+class UndeterminedParameter:
     """A parameter that is left out of a plan.
 
     Attributes:
@@ -68,7 +68,9 @@ class Undetermined:
         )
 
 
-def without_undetermined(of: Problem) -> tuple[Problem, tuple[Undetermined, ...]]:
+def without_undetermined(
+    of: DesignProblem,
+) -> tuple[DesignProblem, tuple[UndeterminedParameter, ...]]:
     """Return the problem of those parameters that the candidates determine, and the others.
 
     A parameter without a prior is left out where all candidates together change by less than
@@ -125,7 +127,7 @@ def _lost(m: Floats, flat: Bools) -> Iterator[tuple[int, Ints]]:
         keep = np.delete(keep, worst)
 
 
-def _named(of: Problem, k: int, others: Ints) -> Undetermined:
+def _named(of: DesignProblem, k: int, others: Ints) -> UndeterminedParameter:
     term = of.terms[k]
     confounded = tuple(of.terms[int(j)].name for j in others)
     joint = ""
@@ -133,4 +135,4 @@ def _named(of: Problem, k: int, others: Ints) -> Undetermined:
         if isinstance(e, PerJoint) and e.role == "baseline" and e.name == term.effect:
             names = [f"{e.name}.{p.name}" for p in e.parameters]
             joint = e.shared.words[names.index(term.name)]
-    return Undetermined(term.name, term.unit, term.value, confounded, joint)
+    return UndeterminedParameter(term.name, term.unit, term.value, confounded, joint)

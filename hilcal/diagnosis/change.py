@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import f as f_distribution
 
 from hilcal.diagnosis.change_candidates import Candidate, candidates
-from hilcal.diagnosis.change_found import Change, Changes, Limit, Size
+from hilcal.diagnosis.change_found import Change, Changes, ChangeSize, Limit
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.earlier import Earlier
@@ -51,7 +51,7 @@ its motion, the readings cannot show it. A choice."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Scored:
+class _ScoredChange:
     """A candidate beside the changes found so far."""
 
     candidate: Candidate
@@ -132,17 +132,17 @@ def _least_noise(now: Remeasured) -> float:
     return max(rss / dof, 1.0)
 
 
-def _score(now: Remeasured, candidate: Candidate) -> _Scored:
+def _score(now: Remeasured, candidate: Candidate) -> _ScoredChange:
     x, motion = now.columns(candidate.moving)
     s = now.projection.information(x)
     g = x.T @ now.projection.project_out(now.target)
     score = score_family(s, g, *_pooled(now))
     left = float(np.trace(s)) > ABSORBED * float(np.sum(x**2))
-    return _Scored(candidate, score, s, motion, score.rank > 0 and left)
+    return _ScoredChange(candidate, score, s, motion, score.rank > 0 and left)
 
 
 def _best(
-    now: Remeasured, taken: Sequence[Candidate], seen: Sequence[_Scored], tested: int
+    now: Remeasured, taken: Sequence[Candidate], seen: Sequence[_ScoredChange], tested: int
 ) -> tuple[Remeasured, list[_Step]] | None:
     """Return the minimum with one more change, and the change; None where none is sure."""
     order = sorted(seen, key=lambda s: -s.score.log_evidence)
@@ -247,7 +247,7 @@ def _sized(after: Remeasured, steps: Sequence[_Step], earlier: Earlier) -> tuple
             Change(
                 candidate=candidate,
                 sizes=tuple(
-                    Size(p, u, float(v), float(e), _before(earlier, candidate.effect, p))
+                    ChangeSize(p, u, float(v), float(e), _before(earlier, candidate.effect, p))
                     for p, u, v, e in sizes
                 ),
                 p_value=p_value,

@@ -12,7 +12,7 @@ UNEXPLAINED = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Size:
+class ChangeSize:
     """One parameter of a change.
 
     Attributes:
@@ -49,7 +49,7 @@ class Change:
     """
 
     candidate: Candidate
-    sizes: tuple[Size, ...]
+    sizes: tuple[ChangeSize, ...]
     p_value: float
     log_evidence: float
     moved_m: float

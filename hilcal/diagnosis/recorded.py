@@ -21,14 +21,14 @@ PER_MOTION = 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Variable:
+class RecordedVariable:
     """Values (N,) and functions (N, F) of a recorded variable; products with those of another."""
 
     name: str
     unit: str
     values: Floats
     functions: Floats
-    other: "Variable | None" = None
+    other: "RecordedVariable | None" = None
     labels: tuple[str, ...] = ()
 
     @property
@@ -43,17 +43,17 @@ class Variable:
         both = self.functions[:, :, None] * self.other.functions[:, None, :]
         return both.reshape(len(both), -1)
 
-    def exchanged(self, name: str, order: Ints) -> "Variable":
+    def exchanged(self, name: str, order: Ints) -> "RecordedVariable":
         """Return the law with the values of one variable taken from other readings."""
         out = self if self.other is None else replace(self, other=self.other.exchanged(name, order))
         return replace(out, functions=out.functions[order]) if name == self.name else out
 
 
-def recorded(p: Linearisation) -> list[Variable]:
+def recorded(p: Linearisation) -> list[RecordedVariable]:
     """Everything recorded of the state that varies."""
     readings = p.fit.readings[~p.fit.outlier]
     s, situation = readings.states, p.fit.solution.prediction.situation
-    out: list[Variable] = []
+    out: list[RecordedVariable] = []
 
     def smooth(name: str, unit: str, values: Floats | None, centre: float | None = None) -> None:
         if values is None or np.ptp(values) <= 1e-9 * max(float(np.abs(values).max()), 1.0):
@@ -63,12 +63,12 @@ def recorded(p: Linearisation) -> list[Variable]:
         # Higher powers are the less likely ones.
         powers = np.stack([away**k / max(k, 1) for k in range(POWERS + 1)], axis=1)
         # The straight line by itself, too: it is simpler than a curve of another variable.
-        out.extend(Variable(name, unit, values, f) for f in (powers, powers[:, :2]))
+        out.extend(RecordedVariable(name, unit, values, f) for f in (powers, powers[:, :2]))
 
     force = np.linalg.norm(s.wrench, axis=1)
     pull = force / max(float(force.max()), 1e-300)
-    hung = Variable("load", "", pull, pull[:, None])
-    turns: list[Variable] = []
+    hung = RecordedVariable("load", "", pull, pull[:, None])
+    turns: list[RecordedVariable] = []
     for j in range(situation.angle.shape[1]):
         angle = situation.angle[:, j]
         k = np.arange(1, HARMONICS + 1)
@@ -78,11 +78,11 @@ def recorded(p: Linearisation) -> list[Variable]:
         slides = bool(situation.cell.arm.slides[j])
         name, unit = (travel_name(j), "m") if slides else (angle_name(j), "rad")
         shown = situation.values[:, j] if slides else angle
-        out.append(Variable(name, unit, shown, waves))
+        out.append(RecordedVariable(name, unit, shown, waves))
         if np.ptp(pull) > 0.01:
             out.append(replace(out[-1], other=hung))
         first = np.stack([np.ones(len(angle)), np.cos(angle), np.sin(angle)], axis=1)
-        turns.append(Variable(name, unit, shown, first))
+        turns.append(RecordedVariable(name, unit, shown, first))
         if slides:
             smooth(name, unit, shown, float(situation.cell.arm.usual_range[0][j]))
         load = (f"joint {j + 1} force", "N") if slides else (f"joint {j + 1} torque", "N·m")
@@ -90,7 +90,7 @@ def recorded(p: Linearisation) -> list[Variable]:
         if s.approach is not None and np.ptp(s.approach[:, j]) > 0:
             side = s.approach[:, j]
             sides = np.stack([np.ones(len(side)), side], axis=1)
-            out.append(Variable(f"joint {j + 1} approach", "side", side, sides))
+            out.append(RecordedVariable(f"joint {j + 1} approach", "side", side, sides))
         if s.joint_temperature is not None:
             smooth(f"joint {j + 1} temperature", "°C", s.joint_temperature[:, j])
     if s.time is None:
@@ -104,7 +104,7 @@ def recorded(p: Linearisation) -> list[Variable]:
         member = (readings.load[:, None] == loads[:WIDTH]).astype(float)
         names = tuple(readings.load_names[k] for k in loads)
         index = np.searchsorted(loads, readings.load).astype(float)
-        out.append(Variable("load", "", index, member, None, names))
+        out.append(RecordedVariable("load", "", index, member, None, names))
     return out + [replace(a, other=b) for a, b in combinations(turns, 2)]
 
 
@@ -124,7 +124,7 @@ def motions(p: Linearisation) -> list[Floats]:
     return [PER_MOTION * moves[:, :, [j]] for j in range(moves.shape[2])] + [PER_MOTION * axes]
 
 
-def law_columns(p: Linearisation, v: Variable, way: Floats) -> Floats:
+def law_columns(p: Linearisation, v: RecordedVariable, way: Floats) -> Floats:
     """(R, WIDTH) whitened columns of one law, zeros where it has fewer."""
     w = p.fit.whitening
     functions = v.product()[:, : WIDTH // way.shape[2]]
@@ -134,7 +134,7 @@ def law_columns(p: Linearisation, v: Variable, way: Floats) -> Floats:
     return out
 
 
-def bins_of(v: Variable) -> tuple[Floats, Floats]:
+def bins_of(v: RecordedVariable) -> tuple[Floats, Floats]:
     """Bin of each reading and the mean of each bin; equal numbers of readings in each."""
     distinct = np.unique(v.values)
     if v.labels or len(distinct) <= BINS:

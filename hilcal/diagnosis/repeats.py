@@ -30,7 +30,7 @@ ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class RepeatGroup:
     """Repeats that share something.
 
     Attributes:
@@ -59,7 +59,7 @@ class Contrasts:
 
     readings: Readings
     whitening: Whitening
-    blocks: tuple[Block, ...]
+    blocks: tuple[RepeatGroup, ...]
     y: Floats
     nuisance: Floats
     bias: float
@@ -158,7 +158,7 @@ def _pooled(readings: Readings, kind: Ints) -> tuple[Readings, float]:
     return replace(readings, covariance=mean[kind]), 1.0 / (1.0 - off)
 
 
-def _blocks(w: Whitening, kind: Ints) -> tuple[Block, ...]:
+def _blocks(w: Whitening, kind: Ints) -> tuple[RepeatGroup, ...]:
     """Contrasts by groups of measurements that have classes in common."""
     m = w.m
     # Class of a measurement: of its loaded reading, and of the unloaded ones it is taken from.
@@ -199,7 +199,7 @@ Group = tuple[Ints, Bucket, int]
 """Rows of the measurements, and their bucket and place in it."""
 
 
-def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
+def _block(groups: list[Group], number: Ints, m: int) -> RepeatGroup | None:
     measured = np.concatenate([rows for rows, _, _ in groups])
     column = np.unique(number[measured], return_inverse=True)[1].reshape(-1)
     if column.max() + 1 == len(measured):
@@ -216,10 +216,10 @@ def _block(groups: list[Group], number: Ints, m: int) -> Block | None:
     seen = np.concatenate([np.any(b.factor[g] != 0, axis=1) for _, b, g in groups])
     u, s, _ = np.linalg.svd(member.reshape(len(member), -1)[seen], full_matrices=False)
     rank = int(np.sum(s > ROUNDING * s.max(initial=0.0)))
-    return None if rank == len(u) else Block(rows[seen], u[:, :rank])
+    return None if rank == len(u) else RepeatGroup(rows[seen], u[:, :rank])
 
 
-def _unexplained(blocks: tuple[Block, ...], x: Floats) -> Floats:
+def _unexplained(blocks: tuple[RepeatGroup, ...], x: Floats) -> Floats:
     """Return rows (r, ...) of all blocks less what the classes explain."""
     out, at = x.copy(), 0
     for b in blocks:

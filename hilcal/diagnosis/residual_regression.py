@@ -23,7 +23,7 @@ import numpy as np
 from hilcal.diagnosis.recorded import (
     PER_MOTION,
     WIDTH,
-    Variable,
+    RecordedVariable,
     bins_of,
     law_columns,
     motions,
@@ -297,7 +297,9 @@ def _best(p: Linearisation, laws: _Laws, mine: list[int]) -> int:
     return mine[int(np.argmax(found))]
 
 
-def _curve(p: Linearisation, v: Variable, number: int, way: Floats, share: float) -> Dependence:
+def _curve(
+    p: Linearisation, v: RecordedVariable, number: int, way: Floats, share: float
+) -> Dependence:
     """Mean error by bins of the variable, along what errs most."""
     bins, x = bins_of(v)
     member = (bins[:, None] == np.arange(len(x))).astype(float)

@@ -151,7 +151,7 @@ def serial_noise(found: Fit) -> SerialNoise | None:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Point:
+class _SerialPoint:
     """φ, τ, v_f and the restricted log likelihood there."""
 
     share: float
@@ -161,7 +161,7 @@ class _Point:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem:
+class _SerialProblem:
     """What the likelihood is of, R rows of N readings.
 
     Attributes:
@@ -244,9 +244,9 @@ class _Problem:
         rivals: Floats,
         *,
         serial: bool,
-        start: _Point | None = None,
+        start: _SerialPoint | None = None,
         stated: bool = False,
-    ) -> _Point:
+    ) -> _SerialPoint:
         """Maximise the restricted likelihood, with or without serial noise.
 
         Args:
@@ -279,7 +279,9 @@ class _Problem:
         ]
         found = minimize(climb, x, jac=True, bounds=bounds, method="L-BFGS-B")
         share, length = found.x[:2]
-        return _Point(float(share), float(np.exp(length)), np.exp(found.x[2:]), -float(found.fun))
+        return _SerialPoint(
+            float(share), float(np.exp(length)), np.exp(found.x[2:]), -float(found.fun)
+        )
 
     def _likelihood(
         self, rivals: Floats, share: float, length: float, v: Floats, stated: bool = False
@@ -366,7 +368,7 @@ class _Problem:
         log_det += float(np.linalg.slogdet(h)[1])
         return -0.5 * (free * float(np.log(square / free)) + free + log_det)
 
-    def noise(self, free: _Point, rivals: Floats, gain: float) -> SerialNoise:
+    def noise(self, free: _SerialPoint, rivals: Floats, gain: float) -> SerialNoise:
         """Return the estimate; its uncertainties are by the curvature of ℓ."""
         at = self.climbed(rivals, serial=True, start=free, stated=True)
         stated = free.value - at.value < AGAINST
@@ -396,7 +398,7 @@ class _Problem:
         )
 
 
-def _problem(found: Fit, clock: Clock) -> _Problem | None:
+def _problem(found: Fit, clock: Clock) -> _SerialProblem | None:
     """Form the likelihood's rows along a clock; None where it stands still, or V has no inverse."""
     every = found.readings
     t = every.states.time if clock == "time" else np.arange(len(every), dtype=float)
@@ -441,7 +443,9 @@ def _problem(found: Fit, clock: Clock) -> _Problem | None:
     ridge = s.equations.basis.prior_precision
     if len(y) < 2 * np.sum(ridge == 0):
         return None
-    return _Problem(found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T)
+    return _SerialProblem(
+        found, clock, rows, y, columns, ridge, factor, whitened, t[rows], flat @ flat.T
+    )
 
 
 def _inverse(lower: Floats) -> Floats:

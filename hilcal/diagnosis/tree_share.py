@@ -67,7 +67,7 @@ def tree_share(p: Linearisation, beyond: float = 0.0) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class Predicted:
+class TreePrediction:
     """What trees predict of rows left out.
 
     Attributes:
@@ -83,7 +83,7 @@ class Predicted:
 
 def predicted(
     features: Floats, target: Floats, fold: Ints, scale: float = 1.0, beyond: float = 0.0
-) -> Predicted:
+) -> TreePrediction:
     """Return the share of ‖target‖² that trees predict of rows left out.
 
     Args:
@@ -95,13 +95,13 @@ def predicted(
     """
     total = float(np.sum(target**2))
     if total <= 0 or fold.min(initial=0) == fold.max(initial=0):
-        return Predicted(0.0, 0.0, 0)
+        return TreePrediction(0.0, 0.0, 0)
     forest = _Forest(features, target, fold)
     errors = np.zeros((0, target.size))
     while True:
         errors = np.concatenate([errors, [forest.errors(len(errors) + k) for k in range(TREES)]])
         error, std = _of_pairs(errors @ errors.T)
-        found = Predicted(scale * (1.0 - error / total), scale * std / total, len(errors))
+        found = TreePrediction(scale * (1.0 - error / total), scale * std / total, len(errors))
         no_more = found.share + found.std * float(stdtrit(found.trees - 1, SURELY)) < beyond
         if found.std <= PRECISE or no_more or found.trees >= MOST_TREES:
             return found

@@ -30,7 +30,7 @@ from hilcal.types import Floats
 
 if TYPE_CHECKING:
     from hilcal.discovery.problem import Beside
-    from hilcal.discovery.terms import Term
+    from hilcal.discovery.terms import LawTerm
 
 BEST, EXTENDED = 10, 3
 """Bends that are extended, and further products that are tried of each; a choice, by time."""
@@ -128,7 +128,7 @@ def _better(
     return np.maximum(alone, np.where(both, evidence(gain, 2) - LOG2, -np.inf))
 
 
-def composed_terms(beside: Beside) -> list[Term]:
+def composed_terms(beside: Beside) -> list[LawTerm]:
     """Return terms of functions of composed quantities.
 
     Args:
@@ -142,7 +142,7 @@ def composed_terms(beside: Beside) -> list[Term]:
         frontier = [e for b in frontier[:BEST] for e in _extended(beside, at[b.s], b)]
         frontier.sort(key=lambda b: -b.odds)
         sums += frontier
-    out: list[Term] = []
+    out: list[LawTerm] = []
     for b in (*_apart(found)[:REFINED], *_apart(sums)[:REFINED]):
         out += _terms(beside, at[b.s], b)
     return out
@@ -288,7 +288,7 @@ def _leveled(
     )
 
 
-def _terms(beside: Beside, site: _Site, b: _Bent) -> list[Term]:
+def _terms(beside: Beside, site: _Site, b: _Bent) -> list[LawTerm]:
     """Return a function with its numbers refined, and with an exponent, each with a constant."""
     screen = beside.problem.screen
     each = 0.5 * float(np.log(beside.dof))

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.discovery.functions import HARMONICS
-from hilcal.discovery.law import Form, Part
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import ORDINARY, Site, site_motions
 from hilcal.effects.protocol import Situation
 from hilcal.identification.fit import Fit
@@ -71,7 +71,7 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]
     sure = sorted(form.parts, key=lambda p: -abs(theta[p.coefficient]) / std[p.coefficient])
-    groups: dict[tuple[Site, str, frozenset[tuple[object, ...]]], list[Part]] = {}
+    groups: dict[tuple[Site, str, frozenset[tuple[object, ...]]], list[LawPart]] = {}
     for p in sure:
         for f in p.amplitude.factors:
             others = frozenset(_key(p, f.variable.symbol))
@@ -87,7 +87,7 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     return tuple(out)
 
 
-def _key(p: Part, symbol: str) -> list[tuple[object, ...]]:
+def _key(p: LawPart, symbol: str) -> list[tuple[object, ...]]:
     """Return the other factors of a part."""
     return [
         (f.variable.symbol, f.shape.name, f.numbers)
@@ -97,7 +97,7 @@ def _key(p: Part, symbol: str) -> list[tuple[object, ...]]:
 
 
 def _curve(
-    after: Fit, s: Situation, motion: Floats, parts: list[Part], symbol: str, theta: Floats
+    after: Fit, s: Situation, motion: Floats, parts: list[LawPart], symbol: str, theta: Floats
 ) -> Curve:
     site, first = parts[0].site, parts[0]
     own = [(p, f) for p in parts for f in p.amplitude.factors if f.variable.symbol == symbol]

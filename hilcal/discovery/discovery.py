@@ -25,7 +25,7 @@ from hilcal.discovery.curve import Curve, curves
 from hilcal.discovery.folds import FoldSearch, found_again, search_by_folds, stability
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
 from hilcal.discovery.law import Coefficient, Form, Law, form_of
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import at_linearisation, exact, refine
 from hilcal.discovery.screen import Screen, screen
 from hilcal.discovery.search import MOST_TERMS, Selection, alternatives, search
@@ -120,7 +120,7 @@ def discover(
     say("forming all candidates")
     found = screen(linear)
     say(f"searching among {found.candidates} candidates")
-    problem = Problem(found)
+    problem = SearchProblem(found)
     selections = search(problem)
     if not selections:
         return _silent(fit, found, say, 0.0)
@@ -166,7 +166,7 @@ def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float
     )
 
 
-def curve(problem: Problem, s: Selection) -> Floats:
+def curve(problem: SearchProblem, s: Selection) -> Floats:
     """(R,) what a law explains of the residual, the model projected out."""
     x = np.hstack([problem.columns(t) for t in s.terms])
     free = problem.model.project_out(x)
@@ -176,7 +176,7 @@ def curve(problem: Problem, s: Selection) -> Floats:
 
 def _laws(
     fit: Fit,
-    problem: Problem,
+    problem: SearchProblem,
     selections: list[Selection],
     folds: FoldSearch,
     known: KnownEffects,
@@ -240,7 +240,7 @@ def _as_good(left: Floats, best: Floats) -> bool:
 
 
 def _law(
-    problem: Problem,
+    problem: SearchProblem,
     s: Selection,
     form: Form,
     name: str,

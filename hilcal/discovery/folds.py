@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.discovery.law import Again
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.search import SAME, Selection, search
-from hilcal.discovery.terms import Term
+from hilcal.discovery.terms import LawTerm
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose
 from hilcal.regression.paired_test import improves
@@ -52,7 +52,7 @@ def search_by_folds(screen: Screen, most: int) -> FoldSearch:
     found: list[Selection | None] = []
     for f in range(int(fold.max()) + 1):
         out = fold == f
-        problem = Problem(screen, ~out)
+        problem = SearchProblem(screen, ~out)
         selections = search(problem, most, beam=1)
         chosen = max(selections, key=lambda s: s.total, default=None)
         found.append(chosen)
@@ -65,7 +65,7 @@ def search_by_folds(screen: Screen, most: int) -> FoldSearch:
     return FoldSearch(share, improves(*of_pose), tuple(found))
 
 
-def predicted(problem: Problem, selection: Selection | None, out: Bools) -> Floats:
+def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -> Floats:
     """Residual of rows that are left out, by model and law refitted to the others."""
     screen = problem.screen
     linear = screen.linear
@@ -87,7 +87,7 @@ def predicted(problem: Problem, selection: Selection | None, out: Bools) -> Floa
     return np.asarray(white[out] - x[out] @ step)
 
 
-def found_again(screen: Screen, folds: FoldSearch, terms: tuple[Term, ...]) -> tuple[Again, ...]:
+def found_again(screen: Screen, folds: FoldSearch, terms: tuple[LawTerm, ...]) -> tuple[Again, ...]:
     """Say of each site and what moves it in how many searches without a fold it was found again."""
     searches = [_causes(screen, s.terms) for s in folds.found if s is not None]
     count = max(len(folds.found), 1)
@@ -98,7 +98,7 @@ def found_again(screen: Screen, folds: FoldSearch, terms: tuple[Term, ...]) -> t
 
 
 def _causes(
-    screen: Screen, terms: tuple[Term, ...]
+    screen: Screen, terms: tuple[LawTerm, ...]
 ) -> dict[tuple[str, frozenset[str]], tuple[str, ...]]:
     """Sites with the quantities that move them; a constant is not one where others do."""
     named = [(screen.sites[s].words, screen.grammar.at(f).names) for t in terms for s, f in t.parts]
@@ -120,7 +120,7 @@ def stability(screen: Screen, folds: FoldSearch, fitted: Floats) -> float:
     for f in folds.found:
         if f is None:
             continue
-        problem = Problem(screen)
+        problem = SearchProblem(screen)
         x = np.hstack([problem.columns(t) for t in f.terms])
         free = screen.linear.project_out(x)
         step = np.linalg.lstsq(free, screen.linear.residual, rcond=1e-8)[0]

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.discovery.terms import Found
+from hilcal.discovery.terms import ScreenedTerm
 from hilcal.regression.projection import Projection
 from hilcal.types import Bools, Floats, Ints
 
@@ -44,14 +44,16 @@ def together(
     return np.where(ok, both, 0.0)
 
 
-def keep_largest(found: list[Found], odds: Floats, s: int, which: Ints | None = None) -> None:
+def keep_largest(
+    found: list[ScreenedTerm], odds: Floats, s: int, which: Ints | None = None
+) -> None:
     """Add the best candidates of a site to those of others, best first."""
     least = found[-1].odds if len(found) == SHORT_LIST else -np.inf
     top = np.flatnonzero(odds > least)
     if len(top) > OF_SITE:
         top = top[np.argpartition(-odds[top], OF_SITE - 1)[:OF_SITE]]
     found += [
-        Found(s, int(f if which is None else which[f]), float(x))
+        ScreenedTerm(s, int(f if which is None else which[f]), float(x))
         for f, x in zip(top.tolist(), odds[top].tolist(), strict=True)
     ]
     found.sort(key=lambda x: -x.odds)

@@ -21,7 +21,7 @@ from hilcal.types import Floats
 
 if TYPE_CHECKING:
     from hilcal.discovery.problem import Beside
-    from hilcal.discovery.terms import Found, Term
+    from hilcal.discovery.terms import LawTerm, ScreenedTerm
 
 MOST = 4
 """Complexity of a product; a choice."""
@@ -37,7 +37,7 @@ QUANTILES = tuple(k / 20 for k in range(1, 20))
 """Places of a bend or a step that are tried, as shares of the readings below; a choice."""
 
 
-def grown(beside: Beside, best: list[Found]) -> list[Term]:
+def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:
     """Return terms of further factors and other numbers.
 
     Args:
@@ -91,7 +91,7 @@ def _values(factor: Factor, n: int, x: Floats) -> list[float]:
     return sorted({float(f"{v:.2g}") for v in values} - {factor.numbers[n]})
 
 
-def _terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[Term]:
+def _terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[LawTerm]:
     """Return the best of products and variants."""
     screen = beside.problem.screen
     ranked: list[tuple[float, int, Amplitude, float]] = []
@@ -109,7 +109,7 @@ def _terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[Ter
             if np.isfinite(x)
         ]
     ranked.sort(key=lambda r: -r[0])
-    out: list[Term] = []
+    out: list[LawTerm] = []
     for _, s, a, price in ranked[:KEPT]:
         k = screen.grammar.index(a)
         if k is None:

@@ -13,7 +13,7 @@ import numpy as np
 from hilcal.diagnosis.effect_ranking import FALSE_ALARM, catalogue_columns
 from hilcal.diagnosis.stepwise import add
 from hilcal.discovery.law import Resemblance, form_of
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.search import LEAST, SAME, Selection
 from hilcal.errors import HilcalError
@@ -83,7 +83,9 @@ class Instead:
     unfitted: tuple[tuple[str, str], ...] = ()
 
 
-def instead_of_law(fit: Fit, problem: Problem, law: Selection, known: KnownEffects) -> Instead:
+def instead_of_law(
+    fit: Fit, problem: SearchProblem, law: Selection, known: KnownEffects
+) -> Instead:
     """Return the effects that explain the misfit as well as a law, at odds of 20 : 1; or none.
 
     A law that the exact model cannot be fitted with is not preferred to effects that it can.
@@ -119,7 +121,7 @@ def _exact_effects(fit: Fit, known: KnownEffects) -> tuple[float, Instead]:
     return best, found
 
 
-def _exact_law(fit: Fit, problem: Problem, law: Selection) -> float:
+def _exact_law(fit: Fit, problem: SearchProblem, law: Selection) -> float:
     """Return the odds of a law by its exact refit; -inf without one, as `discover` tells."""
     screen = problem.screen
     form = refine(screen, form_of(screen, law.terms))
@@ -136,7 +138,9 @@ def _beyond(fit: Fit, left: float, after: Fit) -> float:
     return 0.5 * fit.dof * float(np.log(left / after.variance_factor))
 
 
-def resembling(problem: Problem, s: Selection, known: KnownEffects) -> tuple[Resemblance, ...]:
+def resembling(
+    problem: SearchProblem, s: Selection, known: KnownEffects
+) -> tuple[Resemblance, ...]:
     """Effects that describe what a law does, the nearest first.
 
     An effect is fitted to the law without each fold of poses, and predicts it there: an effect of
@@ -157,7 +161,7 @@ def resembling(problem: Problem, s: Selection, known: KnownEffects) -> tuple[Res
     return tuple(sorted(out, key=lambda r: -r.cosine))
 
 
-def tells_more(problem: Problem, s: Selection, known: KnownEffects, effect: str) -> bool:
+def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
     """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect that is near it.
 
     An effect of the catalogue is preferred to a law that describes the same; a law that readings

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.sites import ORDINARY, Site
-from hilcal.discovery.terms import Term
+from hilcal.discovery.terms import LawTerm
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
 
@@ -16,7 +16,7 @@ LETTERS = "abcdefghklmnoprsuvwxyz"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class LawPart:
     """One product of a law: coefficient × amplitude, at one site."""
 
     site: Site
@@ -32,7 +32,7 @@ class Form:
         parts: its products.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[LawPart, ...]
 
     @property
     def count(self) -> int:
@@ -125,14 +125,14 @@ def _amplitude_latex(letter: str, a: Amplitude) -> str:
     return rf"{letter}\,{a.latex()}" if a.factors else letter
 
 
-def form_of(screen: Screen, terms: tuple[Term, ...]) -> Form:
+def form_of(screen: Screen, terms: tuple[LawTerm, ...]) -> Form:
     """Return the law of chosen terms."""
-    parts: list[Part] = []
+    parts: list[LawPart] = []
     count = 0
     for t in terms:
         for k, (site, amplitude) in enumerate(t.parts):
             at = count if t.common else count + k
-            parts.append(Part(screen.sites[site], screen.grammar.at(amplitude), at))
+            parts.append(LawPart(screen.sites[site], screen.grammar.at(amplitude), at))
         count += 1 if t.common else len(t.parts)
     return Form(tuple(parts))
 

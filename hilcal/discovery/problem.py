@@ -15,7 +15,7 @@ from hilcal.discovery.compose import composed_terms
 from hilcal.discovery.gains import keep_largest, orthonormal, together
 from hilcal.discovery.grow import grown
 from hilcal.discovery.screen import LEAST_MOTION, SEEN, Screen
-from hilcal.discovery.terms import Found, Scored, Screened, Term
+from hilcal.discovery.terms import LawTerm, Scored, ScreenedTerm, Screening
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats
@@ -33,7 +33,7 @@ LEAST_RIDGE = 1e-6
 """Least ridge of the model's directions, not all of which some rows determine; a choice."""
 
 
-class Problem:
+class SearchProblem:
     """The search on some of the rows."""
 
     def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
@@ -107,12 +107,12 @@ class Problem:
         told = u.T @ self._thin_residual
         return [self._inner(d) for d in u.T], told, [self.thinned(d) for d in u.T]
 
-    def columns(self, term: Term) -> Floats:
+    def columns(self, term: LawTerm) -> Floats:
         """(R', P) whitened columns of a term in the rows that are used."""
         x = self.screen.columns(list(term.parts))[self.rows]
         return x.sum(axis=1, keepdims=True) if term.common else x
 
-    def beside(self, chosen: Sequence[Term]) -> "Beside":
+    def beside(self, chosen: Sequence[LawTerm]) -> "Beside":
         """Return the candidates beside chosen terms."""
         return Beside(self, tuple(chosen))
 
@@ -120,7 +120,7 @@ class Problem:
 class Beside:
     """The candidates beside a model and chosen terms, whose coefficients are free."""
 
-    def __init__(self, problem: Problem, chosen: tuple[Term, ...]) -> None:
+    def __init__(self, problem: SearchProblem, chosen: tuple[LawTerm, ...]) -> None:
         """Project the chosen terms out."""
         self.problem, self.chosen = problem, chosen
         self.rss, self.dof = problem.rss, problem.dof
@@ -143,7 +143,7 @@ class Beside:
         yield from zip(told.tolist(), units, strict=True)
 
     @cached_property
-    def screened(self) -> "Screened":
+    def screened(self) -> "Screening":
         """All candidates beside the model and the chosen terms."""
         p = self.problem
         slope, square, across, across_one = p.slope, p.square, p.across, p.across_one
@@ -155,7 +155,7 @@ class Beside:
             across_one = across_one - own * own[:, [one]]
         if self.chosen:
             square = np.where(square > LEFT * p.square, square, np.float32(0.0))
-        return Screened(slope, square, across, across_one)
+        return Screening(slope, square, across, across_one)
 
     @cached_property
     def _known(self) -> tuple[frozenset[int], frozenset[str]]:
@@ -196,14 +196,14 @@ class Beside:
 
     def term(
         self, parts: tuple[tuple[int, int], ...], price: float = 0.0, common: bool = False
-    ) -> Term:
+    ) -> LawTerm:
         """Return a term by its first part's price and what else it costs."""
         s, f = parts[0]
-        return Term(
+        return LawTerm(
             parts, self.price(s, f) + price, common, self.problem.screen.price_of(f) + price
         )
 
-    def best(self) -> dict[str, list["Found"]]:
+    def best(self) -> dict[str, list["ScreenedTerm"]]:
         """Return the candidates with the best odds, by what is free beside the coefficient.
 
         Keys: "" for nothing; "p" for the phase: with the partner; "c" for a constant at the site,
@@ -215,7 +215,7 @@ class Beside:
         partner = words.partner
         has = np.flatnonzero(partner >= 0)
         products = np.flatnonzero((words.less >= 0).all(axis=0))
-        found: dict[str, list[Found]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
+        found: dict[str, list[ScreenedTerm]] = {k: [] for k in ("", "p", "c", "pc", "1", "2")}
         for s in range(len(p.screen.sites)):
             price = self._prices(s).astype(np.float32)
             a, g, h = all_.square[s], all_.slope[s], all_.across[s]
@@ -276,7 +276,7 @@ class Beside:
         gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
         return np.where(seen, self.evidence(gain, 1), -np.inf)
 
-    def score(self, terms: Sequence[Term]) -> list[Scored]:
+    def score(self, terms: Sequence[LawTerm]) -> list[Scored]:
         """Score terms exactly beside the chosen ones."""
         p = self.problem
         out = []
@@ -302,13 +302,13 @@ class Beside:
             g = g - along.T @ (self.unit.T @ p.residual)
         return score_family(s, g, self.rss, self.dof)
 
-    def shortlist(self) -> list[Term]:
+    def shortlist(self) -> list[LawTerm]:
         """Return the candidates with the best odds, extended to phases, axes and joints."""
         found, one = self.best(), self.problem.screen.one
         turned = self.problem.screen.grammar.turned
-        out: dict[tuple[tuple[tuple[int, int], ...], bool], Term] = {}
+        out: dict[tuple[tuple[tuple[int, int], ...], bool], LawTerm] = {}
 
-        def add(t: Term) -> None:
+        def add(t: LawTerm) -> None:
             out.setdefault((tuple(sorted(t.parts)), t.common), t)
 
         for x in found[""]:
@@ -336,7 +336,7 @@ class Beside:
             add(t)
         return list(out.values())
 
-    def _extended(self, s: int, f: int) -> Iterator[Term]:
+    def _extended(self, s: int, f: int) -> Iterator[LawTerm]:
         screen = self.problem.screen
         site, grammar = screen.sites[s], screen.grammar
         amplitude, place = grammar.at(f), grammar.place
@@ -373,7 +373,7 @@ class Beside:
                 by_joint.append((k, at))
         yield from self._apart_and_common(visible(by_joint))
 
-    def _apart_and_common(self, parts: tuple[tuple[int, int], ...]) -> Iterator[Term]:
+    def _apart_and_common(self, parts: tuple[tuple[int, int], ...]) -> Iterator[LawTerm]:
         if len(parts) > 1:
             yield self.term(parts, LOG2)
             yield self.term(parts, LOG2, common=True)

@@ -12,9 +12,9 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.gains import SHORT_LIST
-from hilcal.discovery.problem import Beside, Problem
+from hilcal.discovery.problem import Beside, SearchProblem
 from hilcal.discovery.screen import Screen
-from hilcal.discovery.terms import Scored, Term
+from hilcal.discovery.terms import LawTerm, Scored
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 
@@ -41,7 +41,7 @@ class Selection:
         odds: that each added.
     """
 
-    terms: tuple[Term, ...]
+    terms: tuple[LawTerm, ...]
     odds: tuple[float, ...]
 
     @property
@@ -50,7 +50,7 @@ class Selection:
         return sum(self.odds)
 
 
-def search(problem: Problem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
+def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> list[Selection]:
     """Return the best selection of each number of terms, from one on; none where chance would do.
 
     A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
@@ -96,9 +96,9 @@ def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
     return out
 
 
-def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
+def alternatives(problem: SearchProblem, s: Selection) -> list[tuple[LawTerm, ...]]:
     """Return laws with another term that the rows do not tell from it, at odds of 20 : 1."""
-    found: list[tuple[float, tuple[Term, ...]]] = []
+    found: list[tuple[float, tuple[LawTerm, ...]]] = []
     for k in range(len(s.terms)):
         others = (*s.terms[:k], *s.terms[k + 1 :])
         beside = problem.beside(others)
@@ -115,7 +115,7 @@ def alternatives(problem: Problem, s: Selection) -> list[tuple[Term, ...]]:
     return [*kinds.values()][1:]
 
 
-def _kind(screen: Screen, terms: tuple[Term, ...]) -> frozenset[tuple[object, ...]]:
+def _kind(screen: Screen, terms: tuple[LawTerm, ...]) -> frozenset[tuple[object, ...]]:
     """Sites and functions of a law, without the numbers in these."""
     return frozenset(
         (s, frozenset((f.variable.symbol, f.shape.name) for f in screen.grammar.at(a).factors))
@@ -143,7 +143,7 @@ def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
     return (*simple, -round(c.odds), functions, -c.odds)
 
 
-def _simplicity(screen: Screen, t: Term) -> tuple[float, ...]:
+def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
 
     A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
@@ -172,7 +172,7 @@ def _far(quantity: int, site: int) -> int:
     return 1 if quantity < 0 else 2
 
 
-def _keep(problem: Problem, best: dict[int, Selection], s: Selection) -> None:
+def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> None:
     count = len(s.terms)
     if count not in best or _better(problem, s, best[count]):
         best[count] = s
@@ -183,28 +183,28 @@ def _plainly(screen: Screen, s: Selection) -> Selection:
     return replace(s, terms=tuple(_plain(screen, t) for t in s.terms))
 
 
-def _plain(screen: Screen, t: Term) -> Term:
+def _plain(screen: Screen, t: LawTerm) -> LawTerm:
     places = {place for place, _ in t.parts}
     if len(places) > 1:
         return t
     return replace(t, parts=tuple((screen.alias[place], f) for place, f in t.parts))
 
 
-def _better(problem: Problem, s: Selection, other: Selection) -> bool:
+def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
     """Whether a law is more likely, or simpler where odds of 20 : 1 do not tell them apart."""
     if abs(s.total - other.total) > LEAST:
         return s.total > other.total
     return _extent(problem, s.terms) < _extent(problem, other.terms)
 
 
-def _sure(c: Scored, problem: Problem) -> bool:
+def _sure(c: Scored, problem: SearchProblem) -> bool:
     """Whether chance would not do the same, over the whole search."""
     return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
         FALSE_ALARM
     )
 
 
-def _distinct(problem: Problem, found: list[Scored], count: int) -> list[Scored]:
+def _distinct(problem: SearchProblem, found: list[Scored], count: int) -> list[Scored]:
     """Return the best terms that are not the same law."""
     out: list[Scored] = []
     units: list[Floats] = []
@@ -225,7 +225,7 @@ def _distinct(problem: Problem, found: list[Scored], count: int) -> list[Scored]
     return out
 
 
-def _pruned(problem: Problem, s: Selection) -> Selection:
+def _pruned(problem: SearchProblem, s: Selection) -> Selection:
     """Take out terms that the others make needless."""
     while len(s.terms) > 1:
         worth = []
@@ -241,7 +241,7 @@ def _pruned(problem: Problem, s: Selection) -> Selection:
     return s
 
 
-def _exchanged(problem: Problem, s: Selection, last: int) -> Selection:
+def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
     """Exchange each term, up to some, for a better one beside the others.
 
     These were not there when it was chosen.
@@ -260,7 +260,7 @@ def _exchanged(problem: Problem, s: Selection, last: int) -> Selection:
     return s
 
 
-def _extent(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
+def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
     """Number of quantities, of sites, of coefficients; how simple the terms are."""
     screen = problem.screen
     parts = [part for t in terms for part in t.parts]
@@ -269,7 +269,7 @@ def _extent(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
     return len(names), len({s for s, _ in parts}), *each.tolist()
 
 
-def _chain(problem: Problem, terms: tuple[Term, ...]) -> tuple[float, ...]:
+def _chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
     """Odds of each term beside those before it, whose coefficients keep their priors.
 
     So they add up to the odds of the whole law, and compare with those of effects.

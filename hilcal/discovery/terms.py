@@ -7,7 +7,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class LawTerm:
     """Columns of a law that are chosen together.
 
     Attributes:
@@ -37,7 +37,7 @@ class Scored:
         score: its score as a family.
     """
 
-    term: Term
+    term: LawTerm
     score: FamilyScore
 
     @property
@@ -47,7 +47,7 @@ class Scored:
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ScreenedTerm:
     """A candidate of the screening: site, amplitude, and its odds."""
 
     s: int
@@ -56,7 +56,7 @@ class Found:
 
 
 @dataclass(frozen=True, eq=False)
-class Screened:
+class Screening:
     """All candidates beside some columns, as in `Screen`.
 
     Attributes:

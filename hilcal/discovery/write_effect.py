@@ -7,7 +7,7 @@ from types import ModuleType
 
 import numpy as np
 
-from hilcal.discovery.law import LETTERS, Coefficient, Form, Part
+from hilcal.discovery.law import LETTERS, Coefficient, Form, LawPart
 from hilcal.effects.check import NAME
 from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
@@ -181,7 +181,7 @@ def _misread(form: Form) -> Iterator[str]:
             yield f"        out[:, {p.coefficient}, {p.site.axis}] += by"
 
 
-def _columns(k: int, p: Part) -> str:
+def _columns(k: int, p: LawPart) -> str:
     index = f"np.array([{p.coefficient}]), np.array([{p.site.element}])"
     if p.site.field in ("dq", "scale"):
         return f'Columns("{p.site.field}", {index}, by_{k}[:, None])'

@@ -30,7 +30,7 @@ choice."""
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class BackgroundPart:
     """The parameters of one effect of a background that have one unit.
 
     Attributes:
@@ -56,7 +56,7 @@ class Background:
     """
 
     rms_m: float
-    parts: tuple[Part, ...]
+    parts: tuple[BackgroundPart, ...]
 
     @property
     def effects(self) -> tuple[str, ...]:
@@ -84,7 +84,7 @@ def background_of(fit: Fit) -> Background:
         for unit in dict.fromkeys(units):
             own = np.array([u == unit for u in units])
             rms = float(np.sqrt(np.mean(std[own] ** 2)))
-            parts.append(Part(effect.name, rms, unit, _rms(moves[:, :, mine][:, :, own])))
+            parts.append(BackgroundPart(effect.name, rms, unit, _rms(moves[:, :, mine][:, :, own])))
     return Background(_rms(moves[:, :, inside]), tuple(sorted(parts, key=lambda p: -p.rms_m)))
 
 

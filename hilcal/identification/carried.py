@@ -34,7 +34,7 @@ SAME_M = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class Group:
+class DriftGroup:
     """Parameters that drift together.
 
     Attributes:
@@ -76,7 +76,7 @@ class CarriedPrior:
     drift: Floats | None = None
 
     @cached_property
-    def groups(self) -> tuple[Group, ...]:
+    def groups(self) -> tuple[DriftGroup, ...]:
         """The groups, in the order in which they occur."""
         return tuple(dict.fromkeys(map(group_of, self.posterior.names)))
 
@@ -130,11 +130,11 @@ class CarriedPrior:
         )
 
 
-def group_of(name: str) -> Group:
+def group_of(name: str) -> DriftGroup:
     """Return the group of a parameter "effect.part" or "effect.part.kind"."""
     effect, _, own = name.partition(".")
     part = own.split(".", 1)[0]
-    return Group(effect, part if "." in own or _JOINT.match(part) else "")
+    return DriftGroup(effect, part if "." in own or _JOINT.match(part) else "")
 
 
 def carried_prior(

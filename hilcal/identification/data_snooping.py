@@ -146,7 +146,7 @@ class Snooping:
         """Test them from the readings that agreed before, whose solution this is."""
         return self._screened(linearised(self, self.y), before.agree, before.misfit)
 
-    def _screened(self, at: "_Linearised", used: Bools, misfit: float) -> Screened:
+    def _screened(self, at: "_LinearModel", used: Bools, misfit: float) -> Screened:
         every, kept = np.ones_like(used), np.zeros_like(used)
         count = int(np.count_nonzero(at.linear.tested))
         while True:
@@ -222,7 +222,7 @@ class Snooping:
 
 
 @dataclass(frozen=True, eq=False)
-class _Linearised:
+class _LinearModel:
     """The linear model of all readings at parameters y (P,).
 
     Attributes:
@@ -241,7 +241,7 @@ class _Linearised:
     prediction: Prediction
     linear: ReadingModel
 
-    def moved(self, delta: Floats) -> "_Linearised":
+    def moved(self, delta: Floats) -> "_LinearModel":
         """Return it after a step δ (K,)."""
         y = self.y.copy()
         y[self.live] += self.scale * delta
@@ -269,7 +269,7 @@ class _Linearised:
         return self.linear.with_columns(columns if kept.all() else columns[:, :, kept])
 
 
-def linearised(of: Snooping, y: Floats) -> _Linearised:
+def linearised(of: Snooping, y: Floats) -> _LinearModel:
     """Return the linear model of all readings at the coordinates y (P,)."""
     model, readings, s = of.model, of.readings, of.solution
     theta = s.space.theta(y)
@@ -295,7 +295,7 @@ def linearised(of: Snooping, y: Floats) -> _Linearised:
         root=root,
         members=members,
     )
-    return _Linearised(of, y, live, scale, prediction, linear)
+    return _LinearModel(of, y, live, scale, prediction, linear)
 
 
 def _groups(readings: Readings) -> Ints:

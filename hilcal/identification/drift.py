@@ -26,7 +26,7 @@ import numpy as np
 import scipy.linalg as sl
 from scipy.stats import norm
 
-from hilcal.identification.carried import CarriedPrior, Group
+from hilcal.identification.carried import CarriedPrior, DriftGroup
 from hilcal.identification.coordinates import coordinates_of
 from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import names_of
@@ -57,7 +57,7 @@ class Conflict:
         drift: standard deviation of the drift that the fit gave them, in units of S.
     """
 
-    group: Group
+    group: DriftGroup
     p_value: float
     drift: float
 

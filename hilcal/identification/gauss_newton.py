@@ -12,7 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.identification.coordinates import Coordinates, coordinates_of
-from hilcal.identification.gauss_newton_steps import Point, Problem, linear_problem, minimum
+from hilcal.identification.gauss_newton_steps import (
+    NewtonPoint,
+    NewtonProblem,
+    linear_problem,
+    minimum,
+)
 from hilcal.identification.priors import prior_of
 from hilcal.identification.regularisation import LinearProblem, spent_parameters
 from hilcal.identification.residual import residual
@@ -93,7 +98,7 @@ class Solution:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Point(Point):
+class _Iterate(NewtonPoint):
     """A point with the prediction there, the residual (D, m), also whitened (R,)."""
 
     prediction: Prediction
@@ -102,26 +107,26 @@ class _Point(Point):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Problem(Problem[_Point]):
+class _Problem(NewtonProblem[_Iterate]):
     """Readings that fit into memory, and their scaling."""
 
     readings: Readings
     w: Whitening
 
-    def at(self, y: Floats) -> _Point:
+    def at(self, y: Floats) -> _Iterate:
         theta = self.coordinates.theta(y)
         prediction = self.model.predict(self.readings.states, theta)
         raw = residual(self.readings, prediction, self.w)
         white = self.w.whiten(raw).reshape(-1)
-        return _Point(y, theta, float(np.sum(white**2)), white.size, prediction, raw, white)
+        return _Iterate(y, theta, float(np.sum(white**2)), white.size, prediction, raw, white)
 
-    def linearise(self, point: _Point, prior: Floats) -> LinearProblem:
+    def linearise(self, point: _Iterate, prior: Floats) -> LinearProblem:
         live = np.flatnonzero(prior > 0)
         noise = 1.0 if self.whitened else point.mean_square()
         a = self.columns(point, live)
         return linear_problem(point, prior, a, point.white, self.w.rank, noise, self.whitened)
 
-    def columns(self, point: _Point, live: Ints) -> Tall:
+    def columns(self, point: _Iterate, live: Ints) -> Tall:
         """Whitened derivative (R, L) by the live coordinates."""
         if not len(self.coordinates.index):
             return whitened_columns(self.model, point.prediction, point.theta, self.w, live)

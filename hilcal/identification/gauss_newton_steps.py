@@ -3,8 +3,8 @@
     minimise ‖w(y)‖² + β ‖y/σ‖²
 
 w (R,) whitened residual, y coordinates, σ their prior standard deviations, β the noise factor they
-are weighed against. What a problem has to say of itself is `Problem`: the objective at a point, and
-the linear problem there, whose rows may be any that have the same products.
+are weighed against. What a problem has to say of itself is `NewtonProblem`: the objective at a
+point, and the linear problem there, whose rows may be any that have the same products.
 """
 
 from dataclasses import dataclass, replace
@@ -41,7 +41,7 @@ HALVINGS = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Point:
+class NewtonPoint:
     """A point of the parameters.
 
     Attributes:
@@ -67,7 +67,7 @@ class Point:
         return max(self.rss / max(self.elements - parameters, 1), 1e-300)
 
 
-P = TypeVar("P", bound=Point)
+P = TypeVar("P", bound=NewtonPoint)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,7 +91,7 @@ class Minimum(Generic[P]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Problem(Generic[P]):
+class NewtonProblem(Generic[P]):
     """A model, its coordinates, and the readings that it is fitted to.
 
     Attributes:
@@ -117,7 +117,7 @@ class Problem(Generic[P]):
 
 
 def linear_problem(
-    point: Point,
+    point: NewtonPoint,
     prior: Floats,
     a: Tall,
     white: Floats,
@@ -143,7 +143,7 @@ def linear_problem(
     return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)
 
 
-def minimum(problem: Problem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
+def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:
     """Return the minimum from a start (P,) on, with priors (P,) that are kept where given."""
     model, of = problem.model, problem.coordinates
     sigma, groups = prior_of(model)
@@ -221,7 +221,7 @@ class Acceleration:
 
 
 def _line_search(
-    problem: Problem[P], point: P, aim: Floats, by: Regularisation, shortcut: Floats | None
+    problem: NewtonProblem[P], point: P, aim: Floats, by: Regularisation, shortcut: Floats | None
 ) -> P:
     """Go to the `shortcut` (P,), unless the objective grows; else towards `aim` (P,).
 

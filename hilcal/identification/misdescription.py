@@ -37,9 +37,9 @@ from hilcal.identification.hypotheses import (
 from hilcal.identification.registration import Registration, register
 from hilcal.identification.residual import noise_floor
 from hilcal.identification.rigid_frames import (
+    FrameData,
     Frames,
     Placement,
-    Seen,
     angles,
     best_placement,
     free_parameters,
@@ -117,7 +117,7 @@ class Explanation:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Finding:
+class DescriptionFinding:
     """What is wrong with the description.
 
     Attributes:
@@ -222,7 +222,7 @@ def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
         raise InputError(finding.words(registered.cell, readings))
 
 
-def examine(registered: Registration, readings: Readings) -> Finding | None:
+def examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
     """Return what is wrong with the description; None where the readings fit it.
 
     Args:
@@ -236,36 +236,36 @@ def examine(registered: Registration, readings: Readings) -> Finding | None:
     nothing = np.zeros_like(far)
     if cell.observers:  # what else the arm may be is told by positions in one frame
         rest = _size(registered.off[~far])
-        return Finding(rest, gate, (), far, (), 0) if far.any() or rest > gate else None
+        return DescriptionFinding(rest, gate, (), far, (), 0) if far.any() or rest > gate else None
     if far.any():
         others = _size(registered.off[~far])
-        search = _Search(cell, readings, max(3.0 * noise, others))
+        search = _DescriptionSearch(cell, readings, max(3.0 * noise, others))
         shifted = search.shifted()
         if shifted:
-            return Finding(rms, gate, shifted, nothing, (), search.tried)
+            return DescriptionFinding(rms, gate, shifted, nothing, (), search.tried)
         swapped = search.swapped(far)
-        return Finding(rms if swapped else others, gate, (), far, swapped, 1)
+        return DescriptionFinding(rms if swapped else others, gate, (), far, swapped, 1)
     if rms <= min(LOOK * gate, max(GATE_EXTENT * extent, 5.0 * noise)):
         return None
     close = max(0.02 * min(extent, cell.arm.reach), rms / 50.0)
-    search = _Search(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
+    search = _DescriptionSearch(cell, readings, max(3.0 * noise, min(0.25 * gate, close)))
     near, bad, _ = search.robust(())
     if bad.any() and (shifted := search.shifted()):
-        return Finding(rms, gate, shifted, nothing, (), search.tried)
+        return DescriptionFinding(rms, gate, shifted, nothing, (), search.tried)
     few = bool(bad.any() and bad.mean() <= WRONG_ROWS)
     if few and near <= search.enough:
-        return Finding(rms, gate, (), bad, search.swapped(bad), 1)
+        return DescriptionFinding(rms, gate, (), bad, search.swapped(bad), 1)
     found = search.explain(gate, DEPTH if rms > gate else 1)
     if not found and rms <= gate:
         return None
     if not found and few and near <= gate:
-        return Finding(rms, gate, (), bad, (), search.tried)
+        return DescriptionFinding(rms, gate, (), bad, (), search.tried)
     rows = search.robust(found[0].changes)[1] if found else nothing
     rows = rows if rows.mean() <= WRONG_ROWS else nothing
-    return Finding(rms, gate, found, rows, (), search.tried)
+    return DescriptionFinding(rms, gate, found, rows, (), search.tried)
 
 
-class _Search:
+class _DescriptionSearch:
     """Descriptions that are tried on the same readings."""
 
     def __init__(self, cell: Cell, readings: Readings, enough: float) -> None:
@@ -389,17 +389,19 @@ class _Search:
         at = self._best(*self._problem(way, self._few), rough)
         return _rms(at) * max(1.0, self._extent / max(_extent(at.seen.value), 1e-12))
 
-    def _best(self, seen: Seen, given: Frames, free: Bools, rough: bool = False) -> Placement:
+    def _best(self, seen: FrameData, given: Frames, free: Bools, rough: bool = False) -> Placement:
         steps, rotated = (6, 0) if rough else (15, 2)
         return best_placement(seen, given, free, self.enough, steps, rotated)
 
-    def _problem(self, way: Way, rows: Ints) -> tuple[Seen, Frames, Bools]:
+    def _problem(self, way: Way, rows: Ints) -> tuple[FrameData, Frames, Bools]:
         """Flange poses and readings of some rows under some hypotheses, and what is estimated."""
         d = self._described(way)
         rows = rows[d.paired[rows]]
         turn, m = (None, 3) if d.turn is None else (d.turn[rows], 6)
         root = np.broadcast_to(np.diag(_levers(m)), (len(rows), m, m))
-        seen = Seen.at(d.arm, d.q[rows], d.value[rows], turn, root, self._readings.target[rows])
+        seen = FrameData.at(
+            d.arm, d.q[rows], d.value[rows], turn, root, self._readings.target[rows]
+        )
         cell = self._cell
         # What was estimated with the wrong description is no start for another one.
         base = cell.registration if cell.registration_known else np.eye(4)
@@ -543,6 +545,6 @@ def _others(cell: Cell) -> Iterator[Arm]:
 
 def _left(cell: Cell, arm: Arm, readings: Readings) -> float:
     """Rms misfit of the positions with another arm, from the frames of the described one, m."""
-    seen = Seen.of(arm, readings)
+    seen = FrameData.of(arm, readings)
     off = minimise(Placement(seen, *given_and_free(cell, seen.m == 6)), ARM_STEPS).off
     return float(np.sqrt(np.mean(np.sum(off[:, :3] ** 2, axis=1))))

@@ -49,7 +49,7 @@ NOISE_SPREAD = 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Part:
+class NoisePart:
     """A part of the noise of N readings.
 
     Attributes:
@@ -203,7 +203,7 @@ def sizes_at(problem: MixedProblem, model: Model, theta: Floats) -> Floats:
 
 
 def variances_with_noise(
-    model: Model, readings: Readings, mode: Mode, instrument: Sequence[Part], arm: Part
+    model: Model, readings: Readings, mode: Mode, instrument: Sequence[NoisePart], arm: NoisePart
 ) -> tuple[Variances, Floats]:
     """Estimate the variances of effects, of parts of the instrument's noise and of the arm's.
 
@@ -221,7 +221,7 @@ def variances_with_noise(
 
 
 def _iterated(
-    model: Model, readings: Readings, w: Whitening, parts: Sequence[Part] = ()
+    model: Model, readings: Readings, w: Whitening, parts: Sequence[NoisePart] = ()
 ) -> tuple[Variances, Floats]:
     """Estimate the variances, linearised at the parameters (P,) that they predict; and those.
 
@@ -279,7 +279,7 @@ def _linearise(
     readings: Readings,
     w: Whitening,
     theta: Floats,
-    parts: Sequence[Part] = (),
+    parts: Sequence[NoisePart] = (),
 ) -> _Linearised:
     """Linearise at theta (P,)."""
     prediction = model.predict(readings.states, theta)
@@ -322,7 +322,7 @@ def _noise(
 
 
 def _noise_of(
-    parts: Sequence[Part], readings: Readings, w: Whitening, rows: Floats
+    parts: Sequence[NoisePart], readings: Readings, w: Whitening, rows: Floats
 ) -> tuple[Floats, list[Noise]]:
     """Whitened rows (R, ...), turned so that the parts of the noise are diagonal, and these.
 
@@ -355,10 +355,10 @@ def _noise_of(
     ]
 
 
-def scatter_part(model: Model, readings: Readings) -> Part:
+def scatter_part(model: Model, readings: Readings) -> NoisePart:
     """Return the arm's scatter, of `SCATTER_RAD` in each joint, as a part of the noise."""
     of = scatter_alone(readings, _scatter_factors(model, readings))
-    return Part(SCATTER, of.covariance, LogStdPrior(0.0, NOISE_SPREAD), of.common)
+    return NoisePart(SCATTER, of.covariance, LogStdPrior(0.0, NOISE_SPREAD), of.common)
 
 
 def _scatter_factors(model: Model, readings: Readings) -> Floats:

@@ -39,7 +39,7 @@ from hilcal.identification.full_covariance import with_joint_scatter, with_noise
 from hilcal.identification.mixed_fit import (
     SCATTER,
     SCATTER_RAD,
-    Part,
+    NoisePart,
     scatter_part,
     variances_with_noise,
     with_all_effects,
@@ -268,7 +268,7 @@ def _factors(
         if joint_std.any():
             known = with_joint_scatter(model.cell, kept, joint_std)
             more = known.covariance - kept.covariance
-            arm = Part(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
+            arm = NoisePart(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
         else:
             arm = scatter_part(model, kept)
         found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
@@ -325,7 +325,7 @@ def _with(
     return replace(readings, covariance=total)
 
 
-def _instrument(readings: Readings, station: Sequence[float] | None) -> Iterator[Part]:
+def _instrument(readings: Readings, station: Sequence[float] | None) -> Iterator[NoisePart]:
     """Yield the instrument's covariance along the beam, across it, and of the rotations."""
     beam = _beam(readings, station)
     u = beam / np.linalg.norm(beam, axis=1)[:, None]
@@ -333,11 +333,11 @@ def _instrument(readings: Readings, station: Sequence[float] | None) -> Iterator
     for name, of in ((ALONG, line), (ACROSS, np.eye(3) - line)):
         part = np.zeros_like(readings.covariance)
         part[:, :3, :3] = of @ readings.covariance[:, :3, :3] @ of
-        yield Part(name, part, LogStdPrior(0.0, SPREAD))
+        yield NoisePart(name, part, LogStdPrior(0.0, SPREAD))
     if readings.m == 6:
         part = np.zeros_like(readings.covariance)
         part[:, 3:, 3:] = readings.covariance[:, 3:, 3:]
-        yield Part(ORIENTATION, part, LogStdPrior(0.0, SPREAD))
+        yield NoisePart(ORIENTATION, part, LogStdPrior(0.0, SPREAD))
 
 
 def _beam(readings: Readings, station: Sequence[float] | None) -> Floats:

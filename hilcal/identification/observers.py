@@ -18,7 +18,7 @@ from hilcal.identification.rigid_frames import (
     ROUGH,
     TARGET_M,
     TELL,
-    Seen,
+    FrameData,
     angles,
     best_placement,
     cube,
@@ -190,7 +190,7 @@ def _starts(cell: Cell, readings: Readings) -> Iterator[Cell]:
     rows = np.isin(readings.observer, main)
     if rows.any() and len(np.unique(readings.pose[rows])) >= 4:
         given, free = given_and_free(cell, readings.m == 6)
-        of = Seen.of(cell.arm, readings[rows])
+        of = FrameData.of(cell.arm, readings[rows])
         at = best_placement(of, given, free, GOOD * np.sqrt(of.m), STEPS, TRIED).frames
         yield replace(cell.with_targets(at.targets), registration=at.base)
     elif cell.registration_known:

@@ -37,7 +37,7 @@ LISTED = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class ParameterDifference:
     """One parameter in both fits.
 
     Attributes:
@@ -89,7 +89,7 @@ class Differences:
         apart: effects of the arm that only one of them has, or with other parameters.
     """
 
-    rows: tuple[Difference, ...]
+    rows: tuple[ParameterDifference, ...]
     effects: tuple[EffectDifference, ...]
     apart: tuple[str, ...]
 
@@ -122,7 +122,7 @@ def parameter_differences(earlier: Posterior, later: Posterior) -> Differences:
     d, names = np.asarray(after - before, dtype=float), np.array(of)
     effects = [_effect(e, covariance, d, np.flatnonzero(names == e)) for e in dict.fromkeys(of)]
     rows = tuple(
-        Difference(
+        ParameterDifference(
             name=name,
             unit=earlier.units[one[k]],
             before=float(earlier.mean[one[k]]),

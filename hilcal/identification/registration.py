@@ -16,9 +16,9 @@ from hilcal.identification.common_cause import off_alike
 from hilcal.identification.least_trimmed_squares import MOST, limit, robust_start, variance
 from hilcal.identification.observers import Sightings, placed
 from hilcal.identification.rigid_frames import (
+    FrameData,
     Frames,
     Placement,
-    Seen,
     angles,
     best_placement,
     given_and_free,
@@ -152,7 +152,7 @@ def register(cell: Cell, readings: Readings) -> Registration:
     """
     if readings.states.observer is not None:
         return _of_several(cell.observed_by(readings.observers), readings)
-    angle, seen = angles(readings), Seen.of(cell.arm, readings)
+    angle, seen = angles(readings), FrameData.of(cell.arm, readings)
     given, free = given_and_free(cell, seen.m == 6)
     known = cell.registration_known and cell.target_known
     if known:
@@ -246,7 +246,7 @@ def _parts(cell: Cell, v: Floats) -> Iterator[tuple[Observer, bool]]:
         at += len(o.free)
 
 
-def _fitted(seen: Seen, given: Frames, free: Bools) -> tuple[Placement, Floats]:
+def _fitted(seen: FrameData, given: Frames, free: Bools) -> tuple[Placement, Floats]:
     """Return the best frames by a part of the readings, then all, and what they do not determine.
 
     The undetermined directions (6 + 6 T, U) are of unit length, in ordinary sizes.
@@ -323,7 +323,7 @@ def _direction(row: Floats) -> Undetermined:
     return Undetermined(target, mine[:3], mine[3:], moved[:3], moved[3:6])
 
 
-def _refuse_lines(seen: Seen, frames: Frames) -> None:
+def _refuse_lines(seen: FrameData, frames: Frames) -> None:
     """Refuse positions that do not tell how the base is turned."""
     x = seen.points(frames)
     spread = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)

@@ -56,7 +56,7 @@ class Frames:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Seen:
+class FrameData:
     """What the frames are found from.
 
     Attributes:
@@ -76,7 +76,7 @@ class Seen:
     target: Ints
 
     @classmethod
-    def of(cls, arm: Arm, readings: Readings) -> "Seen":
+    def of(cls, arm: Arm, readings: Readings) -> "FrameData":
         """Return the readings beside the flange poses of a nominal arm."""
         value, root = readings.value, inverse_roots(readings.covariance)
         turn = value[:, 3:] if readings.m == 6 else None
@@ -85,7 +85,7 @@ class Seen:
     @classmethod
     def at(
         cls, arm: Arm, q: Floats, value: Floats, turn: Floats | None, root: Floats, target: Ints
-    ) -> "Seen":
+    ) -> "FrameData":
         """Return what was read at joint values (N, n); `turn` (N, 3) the attitudes read, rad."""
         chain = evaluate(arm, q)
         return cls(
@@ -106,7 +106,7 @@ class Seen:
         """Return the number of readings."""
         return len(self.value)
 
-    def __getitem__(self, rows: Ints | Bools | slice) -> "Seen":
+    def __getitem__(self, rows: Ints | Bools | slice) -> "FrameData":
         """Return the chosen readings."""
         given = {f.name: a for f in fields(self) if (a := getattr(self, f.name)) is not None}
         return replace(self, **{name: a[rows] for name, a in given.items()})
@@ -209,7 +209,7 @@ class Placement:
         hold: prior of the targets.
     """
 
-    seen: Seen
+    seen: FrameData
     frames: Frames
     free: Bools
     hold: Hold | None = None
@@ -305,7 +305,7 @@ class Placement:
 
 
 def best_placement(
-    seen: Seen, given: Frames, free: Bools, good: float, steps: int, rotated: int
+    seen: FrameData, given: Frames, free: Bools, good: float, steps: int, rotated: int
 ) -> Placement:
     """Return the best placement from several starts: closed forms, then rotations of a cube.
 
@@ -372,7 +372,7 @@ def rotation_of_attitudes(attitude: Floats, flange: Floats) -> Floats:
     return nearest_rotation(a * (np.sign(np.linalg.det(a)) or 1.0))
 
 
-def _closed_forms(seen: Seen, given: Frames, free: Bools) -> Iterator[Frames]:
+def _closed_forms(seen: FrameData, given: Frames, free: Bools) -> Iterator[Frames]:
     """Yield base and targets from attitudes and from positions."""
     if not free[:6].any():
         yield _with_translations(seen, given, given.base[:3, :3], free)
@@ -391,7 +391,7 @@ def cube() -> Floats:
     return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
 
 
-def _with_translations(seen: Seen, given: Frames, rotation: Floats, free: Bools) -> Frames:
+def _with_translations(seen: FrameData, given: Frames, rotation: Floats, free: Bools) -> Frames:
     """Complete a rotation of the base by the best translations and the targets' axes."""
     count, size = len(seen), len(given.targets)
     turned = rotation @ seen.rotation
@@ -419,7 +419,7 @@ def _with_translations(seen: Seen, given: Frames, rotation: Floats, free: Bools)
     return Frames(base, targets)
 
 
-def _alternated(seen: Seen, given: Frames, free: Bools) -> Frames:
+def _alternated(seen: FrameData, given: Frames, free: Bools) -> Frames:
     """Positions alone: Procrustes for R, then linear for τ and t, a few times."""
     out, y = given, seen.value - seen.value.mean(axis=0)
     for _ in range(ALTERNATIONS):

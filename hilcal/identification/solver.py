@@ -23,7 +23,7 @@ SMALL = 1e-12
 """A step below this in every coordinate ends the search: rounding."""
 
 
-class Point(Protocol):
+class SolverPoint(Protocol):
     """A point of the parameters, whose coordinates δ are of ordinary size 1."""
 
     @property
@@ -41,7 +41,7 @@ class Point(Protocol):
         """
 
 
-P = TypeVar("P", bound=Point)
+P = TypeVar("P", bound=SolverPoint)
 T = TypeVar("T")
 
 

@@ -29,7 +29,14 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
-from hilcal.tables.guessing.proposal import FAR, GUESSED, SIDE_BY_SIDE, TURN, Proposal, Understood
+from hilcal.tables.guessing.proposal import (
+    FAR,
+    GUESSED,
+    SIDE_BY_SIDE,
+    TURN,
+    Proposal,
+    UnderstoodColumn,
+)
 from hilcal.tables.guessing.propose import Proposed, propose
 from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
@@ -165,7 +172,7 @@ def _decide_travels(found: Proposed, arm: Arm) -> None:
     row = int(np.flatnonzero(np.isfinite(q).all(axis=1))[0])
     example = tuple(f"{grid.numbers(name)[row]:g}" for name in names)
     k = next(k for k, told in enumerate(proposal.understood) if told.what == "joints")
-    proposal.understood[k] = Understood(
+    proposal.understood[k] = UnderstoodColumn(
         "joints", tuple(names), f"{unit}, {section['slide_unit']}", example
     )
 
@@ -208,7 +215,7 @@ def _decide_convention(found: Proposed, arm: Arm) -> list[str]:
     for k, u in enumerate(proposal.understood):
         if u.what == "orientation":
             meaning = ", ".join(str(v) for key, v in section.items() if key != "columns")
-            proposal.understood[k] = Understood(u.what, u.columns, meaning, u.example)
+            proposal.understood[k] = UnderstoodColumn(u.what, u.columns, meaning, u.example)
     return [
         f"orientation: {section['convention']}, since the nominal {arm.name} fits best with it: "
         f"{_left(best)} are left, with the next convention {_left(second)}"
@@ -252,7 +259,7 @@ def _decide_columns(table: Path, found: Proposed, settings: CellConfig, cell: Ce
             section = proposal.sections[u.what]
             chosen = tuple(section["columns"])
             example = tuple(grid.text(c)[0] for c in chosen)
-            proposal.understood[k] = Understood(u.what, chosen, section["unit"], example)
+            proposal.understood[k] = UnderstoodColumn(u.what, chosen, section["unit"], example)
     doubts = [d for d in proposal.unsure if RIVALS not in d[1] and BY_VALUES not in d[1]]
     proposal.unsure[:] = doubts
     others = f", others {1e3 * fits[1][0]:.0f} mm" if len(fits) > 1 else ""

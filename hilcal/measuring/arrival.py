@@ -13,7 +13,7 @@ from hilcal.measuring.devices import (
     TrackerDevice,
     WrenchSample,
 )
-from hilcal.measuring.measure import Measured, Measurer
+from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.progress import Remark, Watcher
 from hilcal.readings.covariance import joint_scatter
 from hilcal.robot import chain as chains
@@ -246,7 +246,7 @@ class TargetReading:
     """
 
     target: int | None
-    measured: Measured
+    measured: MeasuredStop
     ended: float
 
 
@@ -332,7 +332,7 @@ class ArrivalReader:
         k: int,
         name: str,
         force: WrenchSample | None,
-    ) -> Measured:
+    ) -> MeasuredStop:
         """Aim at a target and measure it.
 
         Raises:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.cell import Cell, tracker_place
-from hilcal.config import CellConfig, Load, Obstacle
+from hilcal.config import CellConfig, CellLoad, Obstacle
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.body import Capsule, flange_capsule
@@ -43,7 +43,7 @@ class Clearance:
         found = {radius: self.near(self.cell.load_point, radius) for radius in radii}
         object.__setattr__(self, "_at_hook", found)
 
-    def load(self, name: str) -> Load | None:
+    def load(self, name: str) -> CellLoad | None:
         """Return a load by name; None unloaded, and for a name that the cell lacks."""
         return next((load for load in self.config.loads if load.name == name), None)
 

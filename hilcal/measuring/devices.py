@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from hilcal.config import Load
+from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.robot.factory import FactoryKinematics
 from hilcal.types import Floats
@@ -331,7 +331,7 @@ class OperatorDevice(Protocol):
         """Say who is asked."""
         ...
 
-    def hang(self, load: Load | None, why: str) -> None:
+    def hang(self, load: CellLoad | None, why: str) -> None:
         """Ask for a load (None: take everything off) and wait until it is said to be done.
 
         Args:

@@ -56,7 +56,7 @@ class Margins:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Violation:
     """What a state or a motion does not keep.
 
     Attributes:
@@ -144,7 +144,7 @@ class Feasibility:
             good[left] = self.keeps(kind, q[left], load)
         return good
 
-    def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Finding]:
+    def findings(self, q: Floats, load: str, kinds: tuple[str, ...] = STATE) -> Iterator[Violation]:
         """Yield what any of the states (N, n) does not keep under a load, each at its worst."""
         at = _Placed(self.cell.arm, q)
         for kind in kinds:
@@ -184,7 +184,7 @@ class Feasibility:
             good[left] = self._search(kind, start, ends[left], load)[0]
         return good
 
-    def findings_between(self, start: Floats, end: Floats, load: str) -> Iterator[Finding]:
+    def findings_between(self, start: Floats, end: Floats, load: str) -> Iterator[Violation]:
         """Yield what a straight motion between two states (n,) does not keep, at its worst."""
         for kind in WAY:
             good, bad = self._search(kind, start, end[None], load)
@@ -263,8 +263,8 @@ class Feasibility:
         low, high = arm.q_min + kept, arm.q_max - kept
         more = self.margins.joint
 
-        def told(k: int, over: float, state: int) -> Finding:
-            return Finding(
+        def told(k: int, over: float, state: int) -> Violation:
+            return Violation(
                 JOINTS, arm.joint_names[k], UNLOADED,
                 f"{arm.joint_names[k]} is at {q[state, k]:.4g} {arm.unit(k)}; usable are "
                 f"{low[k]:.4g} to {high[k]:.4g} (joint_margin_rad {kept:g})",
@@ -282,7 +282,7 @@ class Feasibility:
         body, side = np.nonzero(held)
         margin = self.margins.inside
 
-        def told(k: int, over: float, state: int) -> Finding:
+        def told(k: int, over: float, state: int) -> Violation:
             name, (axis, below) = names[body[k]], _SIDES[side[k]]
             far, limit = over - margin, self._box[0 if below else 1][axis]
             if below and self._floor:
@@ -295,7 +295,7 @@ class Feasibility:
                     f"{name} is {far:.3g} m outside the workspace, whose {'xyz'[axis]} ends at "
                     f"{limit:g} m"
                 )
-            return Finding(WORKSPACE, f"{name} {axis} {below}", UNLOADED, text)
+            return Violation(WORKSPACE, f"{name} {axis} {below}", UNLOADED, text)
 
         chosen = over.reshape(len(over), len(names), len(_SIDES))[:, body, side] + margin
         return _Bounds(chosen, rates[body], np.full(len(body), BETWEEN_M), told)
@@ -309,14 +309,14 @@ class Feasibility:
         usable = share * np.asarray(arm.torque_max, dtype=float)
         slides = arm.slides
 
-        def told(k: int, over: float, state: int) -> Finding:
+        def told(k: int, over: float, state: int) -> Violation:
             name = arm.joint_names[k]
             text = (
                 f"{name} bears {torque[state, k]:.4g} {'N' if slides[k] else 'N·m'}; usable are "
                 f"{usable[k]:.4g} "
                 f"(torque_share {share:g} of {arm.torque_max[k]:g})"
             )
-            return Finding(TORQUE, name, load, text)
+            return Violation(TORQUE, name, load, text)
 
         # A joint turns what is beyond it, or, before the axis, the axis against the forces.
         gravity, joint = float(np.linalg.norm(cell.gravity)), np.arange(arm.n)
@@ -343,9 +343,9 @@ class Feasibility:
         size = np.linalg.norm(moment, axis=1)[:, None]
         most = sensor.max_moment_Nm
 
-        def told(k: int, over: float, state: int) -> Finding:
+        def told(k: int, over: float, state: int) -> Violation:
             text = f"{size[state, k]:.4g} N·m on the force sensor; max_moment_Nm is {most:g}"
-            return Finding(SENSOR, "moment", load, text)
+            return Violation(SENSOR, "moment", load, text)
 
         levers = (cell.load_point - at, pull[:3]), (cell.tool_com - at, weight)
         rate = sum(float(np.linalg.norm(a) * np.linalg.norm(f)) for a, f in levers)
@@ -438,7 +438,7 @@ class _Bounds:
     over: Floats
     rates: Floats
     fine: Floats
-    told: Callable[[int, float, int], Finding]
+    told: Callable[[int, float, int], Violation]
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether states are over zero, or might be within turns (R, n)."""
@@ -447,9 +447,9 @@ class _Bounds:
             over = over + np.maximum(turn @ self.rates.T - self.fine, 0.0)
         return np.asarray(~np.all(over <= _ROUNDING, axis=1))  # what is not a number is beyond
 
-    def findings(self, kind: str) -> Iterator[Finding]:
+    def findings(self, kind: str) -> Iterator[Violation]:
         worst = self.over.argmax(axis=0)
-        told: dict[str, tuple[float, Finding]] = {}
+        told: dict[str, tuple[float, Violation]] = {}
         for k, state in enumerate(worst.tolist()):
             over = float(self.over[state, k])
             if not over <= _ROUNDING:
@@ -491,14 +491,14 @@ class _Touch:
             out[a:b] = self.pairs.touching(self.q[some], near, self._of(some))
         return out
 
-    def findings(self, kind: str) -> Iterator[Finding]:
+    def findings(self, kind: str) -> Iterator[Violation]:
         for (a, b), gap in self.pairs.named(self.q, self.margin, self.segment).items():
             if gap < 0.0:
                 text = f"they overlap by {-gap:.3g} m"
             else:
                 text = f"they are {gap:.3g} m apart, {self.margin:g} m are kept"
             text += f" ({self.guessed})" if self.guessed else ""
-            yield Finding(kind, f"{a} and {b}", UNLOADED, f"{a} and {b} collide: {text}")
+            yield Violation(kind, f"{a} and {b}", UNLOADED, f"{a} and {b} collide: {text}")
 
     def _of(self, rows: Ints) -> Segment | None:
         x = self.segment

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.cell import Cell
+from hilcal.config import CellLoad, Operator
 from hilcal.config import ForceSensor as Settings
-from hilcal.config import Load, Operator
 from hilcal.errors import CannotAnswerError, DeviceError
 from hilcal.measuring.devices import ForceSensorDevice, WrenchSample
 from hilcal.measuring.tool_load import PARAMETERS, ToolLoad, identify_tool_load, shift, tare
@@ -275,7 +275,9 @@ class ForceMeter:
         frame = self.frame(tared.q)
         return shift(self.tool.load_wrench(tared.wrench, frame.rotation), frame.arm)
 
-    def verify(self, load: Load | None, tared: TaredWrench, operator: Operator) -> tuple[bool, str]:
+    def verify(
+        self, load: CellLoad | None, tared: TaredWrench, operator: Operator
+    ) -> tuple[bool, str]:
         """Whether a load is what hangs, within the operator's tolerance; and the finding.
 
         Compared at the load point, where a dead weight and a pull have no moment.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, Load
+from hilcal.config import CellConfig, CellLoad
 from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
 from hilcal.measuring.force import MOMENT_LEVER_M, ForceMeter, TaredWrench
@@ -131,12 +131,12 @@ class LoadWatch:
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
         """Nothing is compared before `expect`."""
         self._meter, self._cell, self._config = meter, cell, config
-        self._load: Load | None = None
+        self._load: CellLoad | None = None
         self.watching = False
         self.differed = 0
         self._since: tuple[int, int] | None = None
 
-    def expect(self, load: Load | None) -> None:
+    def expect(self, load: CellLoad | None) -> None:
         """Compare with this load from now on; None: nothing hangs."""
         self._load, self.watching, self._since = load, True, None
 

@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, Load
+from hilcal.config import CellConfig, CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import (
     ArmDevice,
@@ -29,7 +29,7 @@ SWINGING_S = 2.0
 """A load that seems wrong is weighed once more after so long, cell seconds."""
 
 
-def payload(cell: Cell, load: Load | None) -> tuple[float, Floats]:
+def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
     """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight.
 
     m = m_tool + m_load, c = (m_tool c_tool + m_load p_load) / m; pulls have no mass.
@@ -63,7 +63,7 @@ class Hook:
         self._arm, self._operator, self._meter, self._mover = arm, operator, meter, mover
         self._cell, self._config, self._clock, self._watcher = cell, config, clock, watcher
 
-    def load(self, name: str) -> Load | None:
+    def load(self, name: str) -> CellLoad | None:
         """Return a load by name, None for the unloaded state."""
         return next((load for load in self._config.loads if load.name == name), None)
 
@@ -124,7 +124,7 @@ class Hook:
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
         self._asked(partial(operator.confirm, question))
 
-    def _carry(self, load: Load | None) -> None:
+    def _carry(self, load: CellLoad | None) -> None:
         """Tell the controller what it carries."""
         self._arm.set_payload(*payload(self._cell, load))
 
@@ -152,10 +152,10 @@ class Hook:
 
     def _ask(
         self,
-        load: Load | None,
+        load: CellLoad | None,
         wrong: Wrong,
         why: str = "",
-        answered: Callable[[Load | None], None] | None = None,
+        answered: Callable[[CellLoad | None], None] | None = None,
     ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
@@ -184,7 +184,7 @@ class Hook:
             why += ". If nothing does, the tool was touched while the sensor was tared"
         raise WrongLoadError(f"operator: asked {TRIES} times to {what}; {why}")
 
-    def _differs(self, load: Load | None) -> str:
+    def _differs(self, load: CellLoad | None) -> str:
         """Why the measured wrench is not that of a load; weighed twice, for it may swing."""
         if self._meter is None:
             return ""

@@ -314,7 +314,7 @@ PATIENCE = 4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Measured:
+class MeasuredStop:
     """What was measured at one stop.
 
     Attributes:
@@ -362,7 +362,7 @@ class Measurer:
         name: str,
         find: Callable[[], None] | None = None,
         force: WrenchSample | None = None,
-    ) -> Measured:
+    ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
         Args:
@@ -422,7 +422,7 @@ class Measurer:
 
     def _averaged(
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
-    ) -> tuple[Measured | None, str]:
+    ) -> tuple[MeasuredStop | None, str]:
         """Average over the window; None and the reason where that cannot be a reading."""
         differed, before = self._mover.differed, self._mover.look()
         tracker: list[TrackerSample] = []
@@ -457,7 +457,9 @@ class Measurer:
         torques = [look.torque for look in looks if look.torque is not None]
         torque = np.mean(torques, axis=0) if len(torques) == len(looks) else None
         said = (*remarks, *mean.warnings)
-        return Measured(mean, q, before, after, tuple(tracker), force, settling, said, torque), ""
+        return MeasuredStop(
+            mean, q, before, after, tuple(tracker), force, settling, said, torque
+        ), ""
 
     def _wrong(self, force: WrenchSample | None, at: ArmSample) -> bool:
         """Whether the mean wrench is not that of what hangs either: such a reading is kept."""

@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.measuring.devices import ArmSample, Losses, TrackerSample, WrenchSample
 from hilcal.measuring.force import TaredWrench
-from hilcal.measuring.measure import Measured
+from hilcal.measuring.measure import MeasuredStop
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import Step
 from hilcal.types import Floats
@@ -49,7 +49,7 @@ class Store(Protocol):
 def reading_of(
     step: Step,
     q: Floats,
-    measured: Measured,
+    measured: MeasuredStop,
     wrench: Floats,
     time: float,
     load_time: float,
@@ -101,7 +101,7 @@ def reading_of(
 
 def detail(
     step: Step,
-    measured: Measured,
+    measured: MeasuredStop,
     tared: TaredWrench | None,
     zero: Floats | None,
     session: dict[str, Any],

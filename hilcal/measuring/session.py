@@ -18,7 +18,7 @@ from hilcal.measuring.devices import Clock, LoadChangedError, TargetLostError, W
 from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.guard import Guard
 from hilcal.measuring.loads import TRIES, Hook, payload
-from hilcal.measuring.measure import Measured, Measurer
+from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
 from hilcal.measuring.reading_record import Store, detail, reading_of, sample_json, stored_wrench
@@ -389,7 +389,7 @@ class Session:
     def _name(self, target: int) -> str:
         return self._cell.target_names[target]
 
-    def _tared_wrench(self, measured: Measured) -> TaredWrench | None:
+    def _tared_wrench(self, measured: MeasuredStop) -> TaredWrench | None:
         if self._meter is None or measured.force is None:
             return None
         return self._meter.tared(measured.force, measured.q)
@@ -406,7 +406,7 @@ class Session:
             return self._meter.load_wrench(tared)
         return load.wrench(self._cell.gravity)
 
-    def _temperature(self, measured: Measured) -> Floats | None:
+    def _temperature(self, measured: MeasuredStop) -> Floats | None:
         """(n,) °C, or None in a campaign without."""
         if not self._temperatures:
             return None
@@ -415,7 +415,7 @@ class Session:
             raise DeviceError("arm: it no longer reports the temperatures of its joints")
         return np.asarray(mean)
 
-    def _torque(self, measured: Measured) -> Floats | None:
+    def _torque(self, measured: MeasuredStop) -> Floats | None:
         """(n,) measured torques of the drives, N·m, NaN where lost; None in a campaign without."""
         if self._torques is None:
             self._torques = measured.torque is not None

@@ -28,7 +28,7 @@ RANK = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class Evidence:
+class FamilyEvidence:
     """Evidence for one family, or one effect.
 
     Attributes:
@@ -47,7 +47,7 @@ def evidence(
     families: int | Sequence[int],
     rng: np.random.Generator,
     start: Floats | None = None,
-) -> Evidence:
+) -> FamilyEvidence:
     """Return the evidence for a family, or for several of one effect.
 
     Several are tested by one multiple of their ordinary standard deviations, the priors' means.
@@ -68,13 +68,13 @@ def evidence(
     mu, u = np.linalg.eigh((inner + inner.T) / 2)
     seen = mu > RANK * max(float(np.sum(own**2)), 1e-300)
     if not seen.any():
-        return Evidence(0.0, 1.0, 0)
+        return FamilyEvidence(0.0, 1.0, 0)
     mu = mu[seen]
     w2 = (u[:, seen].T @ score) ** 2 / mu
     ratio = float(_ratios(mu, w2[None])[0])
     drawn = _ratios(mu, rng.standard_normal((DRAWS, len(mu))) ** 2)
     p = (1 + int(np.count_nonzero(drawn >= ratio))) / (1 + DRAWS) if ratio > 0 else 1.0
-    return Evidence(ratio, float(p), len(mu))
+    return FamilyEvidence(ratio, float(p), len(mu))
 
 
 def _ratios(mu: Floats, w2: Floats) -> Floats:

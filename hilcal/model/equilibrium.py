@@ -18,7 +18,7 @@ from functools import partial
 import numpy as np
 
 from hilcal.effects.protocol import Effect, Situation
-from hilcal.model.observe import Motion, SlotFrames
+from hilcal.model.observe import ReadingDerivative, SlotFrames
 from hilcal.robot import se3
 from hilcal.robot.batch import zeros
 from hilcal.robot.chain import Chain
@@ -37,7 +37,7 @@ FORCE, MOMENT = slice(0, 3), slice(3, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Block:
+class SlotResponse:
     """Derivative of the deviation at one slot by the wrench through one slot.
 
     Attributes:
@@ -57,7 +57,7 @@ class Block:
     values: Floats
 
 
-def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Block]:
+def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[SlotResponse]:
     """Derivative of the elastic deviations by the slot wrenches, without what is zero."""
     blocks = (b for e, theta in parts if theta.any() for b in _of_effect(e, theta, s))
     whole = (pruned for b in blocks if (pruned := _pruned(b)) is not None)
@@ -69,7 +69,7 @@ def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Blo
     return [c for b in found for c in _of_joints(b, drive, borne)]
 
 
-def _halves(b: Block) -> Iterator[Block]:
+def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
     """Yield the parts of a block by the force and by the moment."""
     first, last = b.components.start, b.components.stop
     if first >= MOMENT.start or last <= FORCE.stop:
@@ -80,7 +80,7 @@ def _halves(b: Block) -> Iterator[Block]:
     yield replace(b, components=slice(MOMENT.start, last), values=b.values[:, middle:])
 
 
-def _of_joints(b: Block, drive: Floats, borne: list[int]) -> Iterator[Block]:
+def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
     Forces and moments across an axis are those of the slot itself. `borne`: the component that the
@@ -103,7 +103,9 @@ def _of_joints(b: Block, drive: Floats, borne: list[int]) -> Iterator[Block]:
                 yield replace(moved, slot=int(slot), components=at, values=values)
 
 
-def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Block]) -> Motion:
+def at_equilibrium(
+    moves: ReadingDerivative, stiffness: GeometricStiffness, blocks: list[SlotResponse]
+) -> ReadingDerivative:
     """Add to the motions of a reading how the arm yields to the change of the wrenches.
 
     Args:
@@ -132,7 +134,9 @@ def at_equilibrium(moves: Motion, stiffness: GeometricStiffness, blocks: list[Bl
     return replace(moves, dq=dq, yielding=yielding)
 
 
-def wrench_form(moves: Motion, blocks: list[Block]) -> dict[tuple[int, bool], Floats]:
+def wrench_form(
+    moves: ReadingDerivative, blocks: list[SlotResponse]
+) -> dict[tuple[int, bool], Floats]:
     """Derivatives (N, m, 3) of a reading by the force (False) and moment (True) of each slot."""
     return by_wrenches(blocks, lambda j: moves.dq[:, :, j], moves.by_slot)
 
@@ -175,7 +179,7 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 
 
 def by_wrenches(
-    blocks: list[Block],
+    blocks: list[SlotResponse],
     by_joint: Callable[[int], Floats],
     by_slot: Callable[[int, slice], Floats],
 ) -> dict[tuple[int, bool], Floats]:
@@ -227,7 +231,7 @@ def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
     return math.sqrt(sum(float(b @ b) for b in flat))
 
 
-def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
+def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[SlotResponse]:
     """Compliance of one effect, from its response to unit wrenches."""
     slots = s.wrench.shape[1]
     every = range(slots)
@@ -240,13 +244,13 @@ def _of_effect(effect: Effect, theta: Floats, s: Situation) -> Iterator[Block]:
         for to in every:
             slot = to if effect.local_response else group[0]
             if r.twist is not None:
-                yield Block(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
+                yield SlotResponse(slot, to, False, slice(0, 6), slice(0, 6), r.twist[:, :, to])
             follows = r.dq is not None and not s.torque_measured  # measured torques stay
             if r.dq is not None and follows and to < r.dq.shape[2]:
-                yield Block(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
+                yield SlotResponse(slot, to, True, slice(0, 6), slice(0, 1), r.dq[:, :, to, None])
 
 
-def _pruned(b: Block) -> Block | None:
+def _pruned(b: SlotResponse) -> SlotResponse | None:
     """Return the block without components and elements that are zero in all states."""
     if not b.values.any():
         return None

@@ -14,8 +14,8 @@ from hilcal.effects.protocol import Columns, Effect, Situation
 from hilcal.effects.spec import EffectSpec
 from hilcal.effects.total import total
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.model.equilibrium import Block, at_equilibrium, compliance
-from hilcal.model.observe import Motion, Observation, motion, observe
+from hilcal.model.equilibrium import SlotResponse, at_equilibrium, compliance
+from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.model.reading_columns import ReadingColumns
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
@@ -271,7 +271,7 @@ class Model:
         prediction: Prediction,
         theta: Floats,
         scale: Floats | None,
-    ) -> Motion:
+    ) -> ReadingDerivative:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
@@ -296,7 +296,9 @@ class Model:
         columns.write(out)
         return moves
 
-    def _motion(self, prediction: Prediction, theta: Floats, m: int) -> tuple[Motion, list[Block]]:
+    def _motion(
+        self, prediction: Prediction, theta: Floats, m: int
+    ) -> tuple[ReadingDerivative, list[SlotResponse]]:
         """Derivative of a chunk of readings by the deviation, at equilibrium; the compliance."""
         s = prediction.situation
         moves = motion(self.cell, prediction.observation, s.chain, prediction.deviation, m)

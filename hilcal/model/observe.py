@@ -165,7 +165,7 @@ def _sensed(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Motion:
+class ReadingDerivative:
     """Derivative of the reading by each field of the deviation, sensor axes.
 
     Only the first m rows (position, or position and rotation) are kept. Without
@@ -340,11 +340,11 @@ class SlotFrames:
 
 def motion(
     cell: Cell, observation: Observation, chain: Chain, deviation: Deviation, m: int
-) -> Motion:
+) -> ReadingDerivative:
     """Prepare the motions of a reading with m elements, the wrenches held as they are."""
     moved = joint_jacobian(chain, observation.base_position)
     dq = _to_sensor(observation, deviation, moved, m)
-    return Motion(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
+    return ReadingDerivative(cell, observation, chain, deviation, m, SlotFrames(chain), dq)
 
 
 def _once(x: Floats) -> Floats:

@@ -10,8 +10,8 @@ from dataclasses import replace
 import numpy as np
 
 from hilcal.effects.protocol import Columns
-from hilcal.model.equilibrium import Block, by_load, by_wrench_changes, wrench_form
-from hilcal.model.observe import Motion
+from hilcal.model.equilibrium import SlotResponse, by_load, by_wrench_changes, wrench_form
+from hilcal.model.observe import ReadingDerivative
 from hilcal.robot.batch import along_states, empty
 from hilcal.robot.geometric_stiffness import rows_times, rows_times_constant
 from hilcal.robot.statics import Load
@@ -29,7 +29,11 @@ class ReadingColumns:
     """
 
     def __init__(
-        self, moves: Motion, blocks: list[Block], load: Load, scale: Floats | None = None
+        self,
+        moves: ReadingDerivative,
+        blocks: list[SlotResponse],
+        load: Load,
+        scale: Floats | None = None,
     ) -> None:
         """Begin without any.
 

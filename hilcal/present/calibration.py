@@ -26,7 +26,7 @@ from hilcal.types import Floats
 
 if TYPE_CHECKING:
     from hilcal.procedure.decision import Decision
-    from hilcal.procedure.state import Step
+    from hilcal.procedure.state import ProcedureStep
 
 TITLES: Mapping[str, str] = {
     "plan": "Choose a plan",
@@ -63,7 +63,7 @@ MOST_LEFT = 6
 """Points without a correction that are listed."""
 
 
-def step_heading(step: "Step", clock: float = 1.0) -> Iterator[Block]:
+def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
     """Yield what comes next, and how long it takes.
 
     Args:
@@ -87,7 +87,7 @@ def lasting(seconds: float, clock: float = 1.0) -> str:
     return f"about {spoken(seconds)}{faster}"
 
 
-def standing(step: "Step") -> str:
+def standing(step: "ProcedureStep") -> str:
     """Say in a line where a calibration stands."""
     if step.kind == "done":
         return "it is complete"

@@ -216,7 +216,7 @@ NONE = "–"
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class RevisionDifference:
     """What two revisions say of one thing.
 
     Attributes:
@@ -232,13 +232,15 @@ class Row:
     difference: str
 
 
-def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[Row, ...]:
+def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[RevisionDifference, ...]:
     """Return model, cell, verdict, errors and parameters of two revisions, as they were stored."""
     added = [f"+ {name}" for name in b.effects if name not in a.effects]
     removed = [f"− {name}" for name in a.effects if name not in b.effects]
     rows = [_row("model", model_name(a.effects), model_name(b.effects))]
     if added or removed:
-        rows = [Row("model", rows[0].first, rows[0].second, " ".join([*added, *removed]))]
+        rows = [
+            RevisionDifference("model", rows[0].first, rows[0].second, " ".join([*added, *removed]))
+        ]
     if a.cell or b.cell:
         cells = [cell_words(r.cell) or "as told at first" for r in (a, b)]
         rows.append(_row("cell", *cells))
@@ -250,7 +252,7 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[Row, ...]:
         sign = "+" if by > 0 else ""
         first, second = (numbers.length(x) for x in errors)
         differs = f"{sign}{numbers.length(by)}{share}".replace("-", "−")
-        rows.append(Row(what, first, second, differs if first != second else ""))
+        rows.append(RevisionDifference(what, first, second, differs if first != second else ""))
     factors = [float(r.result_json["identify"]["variance_factor"]) for r in (a, b)]
     rows.append(_row("variance factor", *(numbers.digits(x) for x in factors)))
     count = [str(r.result_json["identify"]["n_readings"]) for r in (a, b)]
@@ -287,11 +289,11 @@ def refitted(before: Fit, after: Fit) -> str:
     )
 
 
-def _row(what: str, first: str, second: str) -> Row:
-    return Row(what, first, second, "differs" if first != second else "")
+def _row(what: str, first: str, second: str) -> RevisionDifference:
+    return RevisionDifference(what, first, second, "differs" if first != second else "")
 
 
-def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[Row]:
+def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[RevisionDifference]:
     known: list[dict[str, Mapping[str, Any]]] = [
         {p["name"]: p for p in r.result_json["identify"]["parameters"]} for r in (a, b)
     ]
@@ -307,7 +309,7 @@ def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[Row]:
         if first != second and not {first, second} & {NONE, UNSEEN}:
             by = factor * (values[1] - values[0])
             difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
-        yield Row(f"{name} [{unit}]" if unit else name, first, second, difference)
+        yield RevisionDifference(f"{name} [{unit}]" if unit else name, first, second, difference)
 
 
 UNSEEN = "not determined"

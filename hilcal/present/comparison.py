@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER
 from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.diagnosis.change_found import Change, Limit, Size
+from hilcal.diagnosis.change_found import Change, ChangeSize, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.parameter_differences import Differences
 from hilcal.names import quoted
@@ -184,7 +184,7 @@ def _table(found: Sequence[Change]) -> Table:
     return out
 
 
-def _name(change: Change, size: Size) -> str:
+def _name(change: Change, size: ChangeSize) -> str:
     return f"{change.candidate.effect}.{size.parameter}"
 
 

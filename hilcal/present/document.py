@@ -109,7 +109,7 @@ Block = str | Words | Items | Table | Chart
 
 
 @dataclass(frozen=True, slots=True)
-class Section:
+class PageSection:
     """A section of a page; `id` is what links lead to."""
 
     id: str

@@ -10,7 +10,7 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
-from hilcal.identification.carried import Group as CarriedGroup
+from hilcal.identification.carried import DriftGroup as CarriedGroup
 from hilcal.identification.drift import Conflict
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes

@@ -8,7 +8,7 @@ from hilcal.present.document import Block, heading, note, table
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
-    from hilcal.transfer.pooled import Odd, Pooled, Seen, Spread
+    from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled, Spread
 
 FAR = 3.0
 """Standard deviations between which most arms lie; a choice."""
@@ -100,7 +100,7 @@ def unlike_words(o: "Odd") -> str:
     return f"{o.arm}: {o.parameter} {off} ({o.sigma:.1f} σ)"
 
 
-def _seen(s: "Seen") -> str:
+def _seen(s: "DiagnosedEffect") -> str:
     kind = f", {KINDS[s.kind]}" if KINDS[s.kind] else ""
     who = f": {', '.join(s.arms)}" if s.kind == "defect" else ""
     return f"{s.effect}: on {len(s.arms)} of {s.of} arms{kind}{who}"

@@ -3,7 +3,7 @@
 import itertools
 from collections.abc import Iterator, Sequence
 
-from hilcal.config.reference import NOT_SET, REQUIRED, Key, Table
+from hilcal.config.reference import NOT_SET, REQUIRED, Key, KeyTable
 from hilcal.doctor.finding import Finding
 from hilcal.present.document import Block, Words, heading, pairs, table
 from hilcal.tables.guessing.proposal import Proposal
@@ -17,14 +17,14 @@ begin with.
 """
 
 
-def sections_overview(tables: Sequence[Table]) -> Iterator[Block]:
+def sections_overview(tables: Sequence[KeyTable]) -> Iterator[Block]:
     """Yield the list of sections."""
     yield heading("Sections of CELL.toml")
     yield from (pairs((t.header, t.about) for t in tables), "")
     yield "hilcal config SECTION explains the keys of one; hilcal init writes a file."
 
 
-def section_report(t: Table) -> Iterator[Block]:
+def section_report(t: KeyTable) -> Iterator[Block]:
     """Yield all keys of a section."""
     yield heading(t.header)
     yield t.about
@@ -40,7 +40,7 @@ def _facts(key: Key) -> str:
     return unit + (REQUIRED if key.default == REQUIRED else f"default: {key.default}")
 
 
-def reference_page(tables: Sequence[Table]) -> str:
+def reference_page(tables: Sequence[KeyTable]) -> str:
     """Return the page of the reference, in Markdown."""
     lines = [_HEAD]
     for t in tables:

@@ -62,7 +62,7 @@ def worst_and_even(badness: Floats, most: int) -> Ints:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Curve:
+class DependenceCurve:
     """Something over a variable that it may follow; units as the labels name them.
 
     Attributes:
@@ -122,8 +122,8 @@ class StoryRevision:
     holdout: ErrorBlock
     cells: tuple[str, ...] = ()
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
-    follows: Curve | None = None
-    laws: tuple[Curve, ...] = ()
+    follows: DependenceCurve | None = None
+    laws: tuple[DependenceCurve, ...] = ()
 
     @property
     def size_m(self) -> Floats:
@@ -391,7 +391,7 @@ def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
     }
 
 
-def _follows(d: Diagnosis) -> Curve | None:
+def _follows(d: Diagnosis) -> DependenceCurve | None:
     known = 0.0 if d.lead is None else d.lead.holdout_share
     explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
@@ -401,7 +401,7 @@ def _follows(d: Diagnosis) -> Curve | None:
     return regressor(d.fit, suspects[0]) if suspects else None
 
 
-def laws(fit: Fit) -> tuple[Curve, ...]:
+def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
     """Return the curves of laws from files, in units for people; see `drawn_laws`."""
     out = []
     for law in drawn_laws(fit):
@@ -418,7 +418,7 @@ def laws(fit: Fit) -> tuple[Curve, ...]:
             x_unit, x_factor = numbers.angle_or(c.quantity_unit)
             y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
             out.append(
-                Curve(
+                DependenceCurve(
                     law.name,
                     f"{law.formula}: where it is right, the readings lie on it.",
                     x_factor * x,
@@ -433,11 +433,11 @@ def laws(fit: Fit) -> tuple[Curve, ...]:
     return tuple(out)
 
 
-def curve(d: Dependence) -> Curve:
+def curve(d: Dependence) -> DependenceCurve:
     """Return a dependence in units for people."""
     x_unit, x_factor = _unit_of(d)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
-    return Curve(
+    return DependenceCurve(
         d.variable,
         f"{numbers.percent(d.share)} of the misfit on poses left out follows {d.variable}.",
         x_factor * d.x,
@@ -459,13 +459,13 @@ def _unit_of(d: Dependence) -> tuple[str, float]:
     return d.unit, 1.0
 
 
-def regressor(fit: Fit, suspect: Suspect) -> Curve | None:
+def regressor(fit: Fit, suspect: Suspect) -> DependenceCurve | None:
     """Return the added variable of a suspect, see `added_variable`; None where it has none."""
     found = added_variable(fit, suspect)
     return (
         None
         if found is None
-        else Curve(
+        else DependenceCurve(
             suspect.effect,
             f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
             1e6 * found[0],

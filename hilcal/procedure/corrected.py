@@ -34,7 +34,7 @@ POINTS, LEFT_OUT = "points", "left_out"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Points:
+class CorrectedPoints:
     """K readings of a validation campaign whose poses are to be corrected.
 
     Attributes:
@@ -50,7 +50,7 @@ class Points:
     loads: tuple[str, ...]
 
 
-def points_of(readings: Readings, mode: str) -> Points:
+def points_of(readings: Readings, mode: str) -> CorrectedPoints:
     """Return what is corrected: of the first target each pose under its load.
 
     For deflections it is each loaded reading that has an unloaded one in its pose and cycle.
@@ -78,7 +78,7 @@ def points_of(readings: Readings, mode: str) -> Points:
         pose if load == UNLOADED else f"{pose} {load}"
         for pose, load in zip(poses, loads, strict=True)
     )
-    return Points(np.array(rows, dtype=int), np.array(unloaded, dtype=int), names, loads)
+    return CorrectedPoints(np.array(rows, dtype=int), np.array(unloaded, dtype=int), names, loads)
 
 
 def corrected_plan(
@@ -143,7 +143,7 @@ def corrected_plan(
 def _ordered(
     space: Space,
     config: CellConfig,
-    of: Points,
+    of: CorrectedPoints,
     keep: Ints,
     q: Floats,
     reference: Floats,
@@ -160,7 +160,7 @@ def _ordered(
 
 
 def _compensated(
-    calibration: Calibration, states: States, validation: Readings, of: Points, order: Ints
+    calibration: Calibration, states: States, validation: Readings, of: CorrectedPoints, order: Ints
 ) -> Compensation:
     """Correct the points for the states that are expected, in the order of the plan."""
     columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
@@ -190,7 +190,7 @@ def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -
     return out
 
 
-def _told(of: Points, order: Ints, found: Compensation) -> list[dict[str, Any]]:
+def _told(of: CorrectedPoints, order: Ints, found: Compensation) -> list[dict[str, Any]]:
     """Return what is expected of each point, for the plan's file."""
     before, band = found.before.error_m, found.after.band_m
     return [
@@ -206,7 +206,7 @@ def _told(of: Points, order: Ints, found: Compensation) -> list[dict[str, Any]]:
 
 def _with_targets(
     plan: Plan,
-    of: Points,
+    of: CorrectedPoints,
     order: Ints,
     q: Floats,
     told: list[dict[str, Any]],

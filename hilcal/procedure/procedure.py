@@ -33,15 +33,15 @@ from hilcal.procedure.state import (
     MEASURE,
     REFINED,
     STOP,
+    ProcedureStep,
     Settings,
-    Step,
     next_step,
     settings_of,
 )
 from hilcal.procedure.validation_steps import ValidationSteps
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.refinement import Refinement, refine
-from hilcal.refinement import Step as RefinementStep
+from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
@@ -92,7 +92,7 @@ class Procedure(ValidationSteps):
         usual = Settings(seed=config.simulation.seed, readings=readings)
         return cls(path, cell, config, cell.base_dir.absolute(), known, replace(usual, **asked))
 
-    def next(self) -> Step:
+    def next(self) -> ProcedureStep:
         """Return the next step."""
         return next_step(self.run)
 
@@ -159,7 +159,7 @@ class Procedure(ValidationSteps):
 
     # measuring
 
-    def measure(self, step: Step, measure: Measure) -> int:
+    def measure(self, step: ProcedureStep, measure: Measure) -> int:
         """Measure what is missing of a plan; returns how many readings its campaign then holds.
 
         Raises:
@@ -246,7 +246,7 @@ class Procedure(ValidationSteps):
         with CampaignFile.open(self.run) as campaign:
             ProcedureLog(campaign).append(DECIDED, {"action": STOP, "reason": "asked"})
 
-    def compute(self, step: Step, say: Say = lambda words: None) -> object:
+    def compute(self, step: ProcedureStep, say: Say = lambda words: None) -> object:
         """Do a step after the first in which nothing moves; returns what came of it."""
         steps: dict[str, Callable[[Say], object]] = {
             "refine": self.refine,

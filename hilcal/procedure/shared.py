@@ -34,7 +34,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, eq=False)
-class Shared:
+class CalibrationContext:
     """A calibration in a cell, as far as all steps need it.
 
     Attributes:

@@ -107,7 +107,7 @@ class Files:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class ProcedureStep:
     """What a calibration does next.
 
     Attributes:
@@ -132,7 +132,7 @@ class Step:
         return self.kind in MOVING
 
 
-def next_step(run: Path) -> Step:
+def next_step(run: Path) -> ProcedureStep:
     """Return the next step of a calibration.
 
     Raises:
@@ -140,38 +140,38 @@ def next_step(run: Path) -> Step:
     """
     files = Files(run)
     if not run.exists():
-        return Step("plan", run)
+        return ProcedureStep("plan", run)
     with CampaignFile.open(run, read_only=True) as campaign:
         log = ProcedureLog(campaign)
         if log.last(BEGUN) is None:
             raise _another(run)
         decided = log.last(DECIDED)
         if decided is not None and not files.validation.exists() and _asked_anew(log):
-            return Step("decide", run)
+            return ProcedureStep("decide", run)
         if decided is None or decided["action"] == MEASURE:
             missing = _missing("measure", campaign)
             if missing is not None:
                 return missing
             refined = log.last(REFINED)
             if refined is None or refined["readings_sha256"] != campaign.data_hash():
-                return Step("refine", run)
-            return Step("decide", run)
+                return ProcedureStep("refine", run)
+            return ProcedureStep("decide", run)
         looked, improved = log.last(VALIDATED) is not None, log.last(IMPROVED) is not None
     if not files.validation.exists():
-        return Step("plan_validation", files.validation)
+        return ProcedureStep("plan_validation", files.validation)
     with opened(files.validation, VALIDATION, run) as campaign:
         missing = _missing("measure_validation", campaign)
     if missing is not None:
         return missing
     if not looked:
-        return Step("validate", files.validation)
+        return ProcedureStep("validate", files.validation)
     if not files.corrected.exists():
-        return Step("correct", files.corrected)
+        return ProcedureStep("correct", files.corrected)
     with opened(files.corrected, CORRECTED, run) as campaign:
         missing = _missing("measure_corrected", campaign)
     if missing is not None:
         return missing
-    return Step("done" if improved else "compare", run)
+    return ProcedureStep("done" if improved else "compare", run)
 
 
 def _asked_anew(log: ProcedureLog) -> bool:
@@ -226,7 +226,7 @@ def duration_of(plan: Plan) -> float:
     return float(told.get("total", 0.0)) if isinstance(told, dict) else 0.0
 
 
-def _missing(kind: Kind, campaign: CampaignFile) -> Step | None:
+def _missing(kind: Kind, campaign: CampaignFile) -> ProcedureStep | None:
     """Return the step that measures what is missing of the last plan; None where nothing is."""
     log = RunLog(campaign)
     last, done = log.plans[-1], log.done()
@@ -237,4 +237,4 @@ def _missing(kind: Kind, campaign: CampaignFile) -> Step | None:
     changes = sum(a != b for a, b in zip(["none", *loads], [*loads, "none"], strict=True))
     share = len(left) / len(last.steps)
     seconds = share * duration_of(last)
-    return Step(kind, campaign.path, len(left), len(last.steps), changes, seconds)
+    return ProcedureStep(kind, campaign.path, len(left), len(last.steps), changes, seconds)

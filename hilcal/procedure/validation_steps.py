@@ -14,7 +14,7 @@ from hilcal.identification import validation
 from hilcal.identification.acceptance import Acceptance, acceptance
 from hilcal.identification.extrapolation import extrapolation
 from hilcal.procedure.corrected import corrected_plan, expected_of, paired
-from hilcal.procedure.shared import Shared, reference_in, reference_of
+from hilcal.procedure.shared import CalibrationContext, reference_in, reference_of
 from hilcal.procedure.state import (
     FROZEN,
     IMPROVED,
@@ -36,7 +36,7 @@ VALIDATING, CORRECTING = 2, 3
 
 
 @dataclass(frozen=True, eq=False)
-class ValidationSteps(Shared):
+class ValidationSteps(CalibrationContext):
     """Steps after the last refinement: what they test is never fitted."""
 
     def plan_validation(self, say: Say = lambda words: None) -> Plan:

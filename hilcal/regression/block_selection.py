@@ -44,7 +44,7 @@ def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: F
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Sums:
+class _BlockSums:
     """Products over some rows: BᵀB, Bᵀ[X, y], X_lᵀX_l (L, W, W), Xᵀy, yᵀy, and their number."""
 
     gram: Floats
@@ -54,9 +54,9 @@ class _Sums:
     square: float
     rows: int
 
-    def plus(self, other: "_Sums", sign: int = 1) -> "_Sums":
+    def plus(self, other: "_BlockSums", sign: int = 1) -> "_BlockSums":
         """Return those over these rows and others; without the others where the sign is −1."""
-        return _Sums(
+        return _BlockSums(
             self.gram + sign * other.gram,
             self.cross + sign * other.cross,
             self.blocks + sign * other.blocks,
@@ -85,12 +85,12 @@ class BlockSelection:
         self._fold = fold
         folds = range(int(fold.max()) + 1)
         self._of = [self._sums(fold == f) for f in folds]
-        self._all = reduce(_Sums.plus, self._of)
+        self._all = reduce(_BlockSums.plus, self._of)
 
-    def _sums(self, rows: Bools) -> _Sums:
+    def _sums(self, rows: Bools) -> _BlockSums:
         own, x, y = self._own[rows], self._x[rows], self._y[rows]
         blocks = x.reshape(len(y), *self._shape).transpose(1, 2, 0)
-        return _Sums(
+        return _BlockSums(
             own.T @ own,
             np.column_stack([own.T @ x, own.T @ y]),
             blocks @ blocks.transpose(0, 2, 1),

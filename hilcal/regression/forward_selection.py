@@ -19,7 +19,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Families:
+class CandidateFamilies:
     """Families that can be added to a model.
 
     Attributes:
@@ -54,18 +54,18 @@ class Families:
             for name, k in self.columns.items()
         }
 
-    def without(self, names: Collection[str]) -> "Families":
+    def without(self, names: Collection[str]) -> "CandidateFamilies":
         """Leave families out of the choice."""
         return replace(self, columns={n: k for n, k in self.columns.items() if n not in names})
 
-    def with_family(self, name: str, found: FamilyScore) -> "Families":
+    def with_family(self, name: str, found: FamilyScore) -> "CandidateFamilies":
         """Add a family to the model, with the ridge of its score."""
         s, g, rss = eliminate(
             self.information, self.gradient, self.rss, self.columns[name], found.ridge
         )
         others = {n: k for n, k in self.columns.items() if n != name}
         spent = self.spent + found.effective
-        return Families(s, g, rss, self.dof, others, spent, self.most)
+        return CandidateFamilies(s, g, rss, self.dof, others, spent, self.most)
 
 
 def families_beside(
@@ -75,7 +75,7 @@ def families_beside(
     x: Floats,
     columns: Mapping[str, slice],
     most: Mapping[str, float],
-) -> Families:
+) -> CandidateFamilies:
     """Return families beside a model.
 
     Args:
@@ -87,7 +87,7 @@ def families_beside(
         most: largest plausible strength of each family that has one.
     """
     rss = float(residual @ residual)
-    return Families(information, x.T @ residual, rss, dof, columns, most=most)
+    return CandidateFamilies(information, x.T @ residual, rss, dof, columns, most=most)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,15 +104,15 @@ class Addition:
     name: str
     score: FamilyScore
     scores: Mapping[str, FamilyScore]
-    before: Families
+    before: CandidateFamilies
 
     @cached_property
-    def after(self) -> Families:
+    def after(self) -> CandidateFamilies:
         """Return the families beside the model with it."""
         return self.before.with_family(self.name, self.score)
 
 
-def forward_selection(families: Families, most: int) -> Iterator[Addition]:
+def forward_selection(families: CandidateFamilies, most: int) -> Iterator[Addition]:
     """Yield up to `most` additions, each with the earlier ones in the model.
 
     An addition is made when the next one is asked for, so that the caller decides when to stop.

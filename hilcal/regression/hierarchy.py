@@ -41,7 +41,7 @@ FEWEST = 5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Found:
+class FleetEstimates:
     """What C campaigns of A arms found of K parameters, in ordinary magnitudes.
 
     Attributes:
@@ -126,7 +126,7 @@ class Unlike:
     p_value: float
 
 
-def hierarchy(of: Found) -> tuple[Hierarchy, tuple[Unlike, ...]]:
+def hierarchy(of: FleetEstimates) -> tuple[Hierarchy, tuple[Unlike, ...]]:
     """Fit the model, name what is unlike, and fit again without it."""
     apart = np.zeros((of.arms, of.mean.shape[1]), dtype=bool)
     found = _em(of, apart)
@@ -189,7 +189,7 @@ def _spread(y: Floats, s2: Floats) -> float:
     return tau2
 
 
-def _em(of: Found, apart: Bools) -> Hierarchy:
+def _em(of: FleetEstimates, apart: Bools) -> Hierarchy:
     k, arms = of.mean.shape[1], of.arms
     repeated = of.repeated
     timed = repeated and bool(np.ptp(of.time) > 0)
@@ -228,7 +228,9 @@ class _Expected:
     arm_variance: Floats
 
 
-def _expectation(of: Found, tau2: Floats, omega2: Floats, apart: Bools, timed: bool) -> _Expected:
+def _expectation(
+    of: FleetEstimates, tau2: Floats, omega2: Floats, apart: Bools, timed: bool
+) -> _Expected:
     """E-step: the joint normal distribution of b = (μ, β), u and e, given the variances."""
     k, arms = of.mean.shape[1], of.arms
     eye = np.eye(k)

@@ -102,7 +102,7 @@ def variance_components(blocks: Sequence[BlockRows], ridge: Floats) -> VarianceC
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Point:
+class _RemlPoint:
     """The s_i, ℓ, its slope (C,) and AI (C, C)."""
 
     variance: Floats
@@ -111,7 +111,7 @@ class _Point:
     information: Floats
 
 
-def _start(blocks: Sequence[BlockRows], zero: _Point) -> Floats:
+def _start(blocks: Sequence[BlockRows], zero: _RemlPoint) -> Floats:
     """Each component alone would explain the excess of yᵀPy; all together share it."""
     reach = sum(np.einsum("cgii->c", b.components) for b in blocks)
     size = sum(b.y.size for b in blocks)
@@ -120,7 +120,7 @@ def _start(blocks: Sequence[BlockRows], zero: _Point) -> Floats:
     return np.asarray(excess / np.maximum(reach, 1e-300) / len(zero.variance))
 
 
-def _step(blocks: Sequence[BlockRows], ridge: Floats, here: _Point) -> _Point:
+def _step(blocks: Sequence[BlockRows], ridge: Floats, here: _RemlPoint) -> _RemlPoint:
     """Go up, half as far each time while ℓ falls."""
     free = (here.variance > 0) | (here.slope > 0)
     if not free.any():
@@ -138,7 +138,7 @@ def _step(blocks: Sequence[BlockRows], ridge: Floats, here: _Point) -> _Point:
     return here
 
 
-def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
+def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _RemlPoint:
     """Evaluate ℓ, its slope and AI."""
     inverses, log_det = [], 0.0
     h = np.diag(ridge).astype(float)
@@ -172,7 +172,7 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _Point:
     pairs = list(zip(moved, py, strict=True))
     quadratic = sum(np.einsum("gic,gi->c", u, p) for u, p in pairs)
     information = sum(np.einsum("gic,gid->cd", u, v) for u, v in zip(moved, turned, strict=True))
-    return _Point(
+    return _RemlPoint(
         variance,
         -0.5 * (log_det + square),
         np.asarray(-0.5 * (trace - quadratic)),

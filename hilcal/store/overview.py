@@ -20,7 +20,7 @@ _SERIAL = re.compile(r"serial(?: number)?:? (\S+)", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
-class Instrument:
+class MeasuringDevice:
     """A device that measured, as it answered when a session began.
 
     Attributes:
@@ -108,7 +108,7 @@ class Overview:
     planned: int | None
     measured: int
     plans: int
-    instruments: tuple[Instrument, ...]
+    instruments: tuple[MeasuringDevice, ...]
     tares: tuple[Tare, ...]
     returns: tuple[Return, ...]
     tool: Mapping[str, Any] | None
@@ -174,8 +174,8 @@ def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
     return {name: counts[k] for k, name in enumerate(names) if counts[k]}
 
 
-def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[Instrument, ...]:
-    found: dict[tuple[str, str], Instrument] = {}
+def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, ...]:
+    found: dict[tuple[str, str], MeasuringDevice] = {}
     for event in events:
         for answer in event["answers"] if event["kind"] == "devices" else ():
             facts, name = dict(answer["facts"]), str(answer["name"])
@@ -183,7 +183,9 @@ def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[Instrument, ...]:
             serial = facts.get("serial number") or (told and told[1].rstrip(",;"))
             found.setdefault(
                 (answer["device"], name),
-                Instrument(answer["device"], answer["driver"], name, serial, facts, event["utc"]),
+                MeasuringDevice(
+                    answer["device"], answer["driver"], name, serial, facts, event["utc"]
+                ),
             )
     return tuple(found.values())
 

@@ -9,7 +9,7 @@ from typing import Any
 from hilcal.config.changes import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
-from hilcal.store.stored_schema import Options, Result, check
+from hilcal.store.stored_schema import Result, StoredOptions, check
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -150,7 +150,7 @@ def _check(record: RevisionRecord) -> None:
     if not all(isinstance(text, str) for text in (*texts, *named)):
         raise TypeError("a name is no text")
     check_names([*texts, *named], f"revision {record.number}, name")
-    check(Options, record.options)
+    check(StoredOptions, record.options)
     check(Result, record.result_json)
     if record.parent is not None and not isinstance(record.parent, int):
         raise TypeError("parent is no number")

@@ -61,7 +61,7 @@ class Result(_Document):
     diagnose: _Diagnosed | None = None
 
 
-class Options(_Document):
+class StoredOptions(_Document):
     """What was chosen for a revision."""
 
     readings: Literal["deflection", "absolute"]

@@ -32,7 +32,12 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.gauss_newton import over_all_parameters, prior_coordinates
-from hilcal.identification.gauss_newton_steps import Point, Problem, linear_problem, minimum
+from hilcal.identification.gauss_newton_steps import (
+    NewtonPoint,
+    NewtonProblem,
+    linear_problem,
+    minimum,
+)
 from hilcal.identification.least_trimmed_squares import bulk, limit
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.regularisation import LinearProblem, Regularisation, spent_parameters
@@ -50,7 +55,14 @@ from hilcal.readings.readings import Readings
 from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
-from hilcal.stream.passes import Errors, Reduced, Work, errors_of_group, reduce_group, sample_group
+from hilcal.stream.passes import (
+    Errors,
+    PassTask,
+    Reduced,
+    errors_of_group,
+    reduce_group,
+    sample_group,
+)
 from hilcal.tables import columns
 from hilcal.tables.parquet_stream import ReadingStream
 from hilcal.types import Bools, Floats, Ints
@@ -75,7 +87,7 @@ def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Point(Point):
+class _StreamPoint(NewtonPoint):
     """A point with the triangle of all parameters' columns and the residual, by fold."""
 
     folds: Mapping[int, Floats]
@@ -85,17 +97,17 @@ class _Point(Point):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stream(Problem[_Point]):
+class _Stream(NewtonProblem[_StreamPoint]):
     """Readings of a stream; a point takes one pass."""
 
     same_rows: ClassVar[bool] = False
 
-    work: Work
+    work: PassTask
     engine: Engine
     counting: Counting = _unseen
     passed: list[int] = field(default_factory=list)
 
-    def at(self, y: Floats) -> _Point:
+    def at(self, y: Floats) -> _StreamPoint:
         theta = self.coordinates.theta(y)
         return _point(y, theta, self.over(partial(reduce_group, work=self.work, theta=theta)))
 
@@ -104,7 +116,7 @@ class _Stream(Problem[_Point]):
         self.passed.append(1)
         return _over(self.work.stream, run, self.engine, self.counting, 1 + len(self.passed))
 
-    def linearise(self, point: _Point, prior: Floats) -> LinearProblem:
+    def linearise(self, point: _StreamPoint, prior: Floats) -> LinearProblem:
         live = np.flatnonzero(prior > 0)
         a = self.coordinates.columns(point.triangle[:, :-1])[:, live]
         white = point.triangle[:, -1]
@@ -119,7 +131,7 @@ def _over(
         return engine.map(run, groups, advance=advance)
 
 
-def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _Point:
+def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _StreamPoint:
     size = len(theta) + 1
     numbers = sorted({fold for part in parts for fold in part.triangles})
     folds = {
@@ -130,7 +142,7 @@ def _point(y: Floats, theta: Floats, parts: tuple[Reduced, ...]) -> _Point:
     rss = float(triangle[:, -1] @ triangle[:, -1])
     rank = sum(part.rank for part in parts)
     count = sum(part.readings for part in parts)
-    return _Point(y, theta, rss, rank, folds, triangle, count, rank)
+    return _StreamPoint(y, theta, rss, rank, folds, triangle, count, rank)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +225,7 @@ def fit_stream(
         InputError: a row that cannot be right, or effects that cannot be.
         CannotAnswerError: too few readings, or an unknown frame that they do not determine.
     """
-    work = Work(stream, Model(cell, ()), _scatter(stream, cell), {})
+    work = PassTask(stream, Model(cell, ()), _scatter(stream, cell), {})
     readings = with_joint_scatter(cell, _sample(work, engine, counting), work.joint_std)
     if effects is None:
         model = baseline(cell, readings, "absolute", catalogue, prior)
@@ -245,7 +257,7 @@ def _scatter(stream: ReadingStream, cell: Cell) -> Floats:
     return np.zeros(cell.arm.n) if whole else config.repeatability.per_joint(cell.arm.n)
 
 
-def _sample(work: Work, engine: Engine, counting: Counting) -> Readings:
+def _sample(work: PassTask, engine: Engine, counting: Counting) -> Readings:
     step = -(-len(work.stream) // SAMPLE)
     run = partial(sample_group, work=work, step=step)
     parts = _over(work.stream, run, engine, counting, 1)
@@ -263,7 +275,7 @@ class _Found:
     """The minimum, and the normal equations there: of all, and without each fold."""
 
     problem: _Stream
-    point: _Point
+    point: _StreamPoint
     by: Regularisation
     converged: bool
     equations: NormalEquations

@@ -24,7 +24,7 @@ from hilcal.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Work:
+class PassTask:
     """What a worker needs to know.
 
     Attributes:
@@ -87,7 +87,7 @@ class _Chunk:
     kept: Bools
 
 
-def reduce_group(group: int, work: Work, theta: Floats) -> Reduced:
+def reduce_group(group: int, work: PassTask, theta: Floats) -> Reduced:
     """Reduce the whitened rows of a row group at parameters (P,)."""
     every, size = np.arange(work.model.size), work.model.size + 1
     found: dict[int, Triangle] = {}
@@ -105,7 +105,9 @@ def reduce_group(group: int, work: Work, theta: Floats) -> Reduced:
     return Reduced({fold: t.r for fold, t in found.items()}, count, rank)
 
 
-def errors_of_group(group: int, work: Work, theta: Floats, change: Floats, far: float) -> Errors:
+def errors_of_group(
+    group: int, work: PassTask, theta: Floats, change: Floats, far: float
+) -> Errors:
     """Return the errors of a row group at parameters (P,).
 
     Args:
@@ -135,7 +137,7 @@ def errors_of_group(group: int, work: Work, theta: Floats, change: Floats, far: 
     return Errors(sums, most, floor, rank, np.concatenate(rows), np.concatenate(distances))
 
 
-def sample_group(group: int, work: Work, step: int) -> Readings | None:
+def sample_group(group: int, work: PassTask, step: int) -> Readings | None:
     """Return every `step`-th reading of the stream that lies in a row group, None for none.
 
     All its rows are read, and what cannot be right is refused before anything is computed.
@@ -151,7 +153,7 @@ def sample_group(group: int, work: Work, step: int) -> Readings | None:
     return Readings.joined(found) if found else None
 
 
-def _chunks(group: int, work: Work, theta: Floats) -> Iterator[_Chunk]:
+def _chunks(group: int, work: PassTask, theta: Floats) -> Iterator[_Chunk]:
     row, total = work.stream.first_row(group), len(work.stream)
     aside = work.outliers.get(group, np.zeros(0, dtype=np.int64))
     cell = work.model.cell

@@ -21,7 +21,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import SCALINGS, Scaling, Whitening, whitening
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
-from hilcal.study.scaling_design import Design, bound, make_design, make_readings
+from hilcal.study.scaling_design import StudyDesign, bound, make_design, make_readings
 from hilcal.types import Floats
 
 LEVEL = 0.95
@@ -182,7 +182,7 @@ class _Experiment:
 
 
 def _experiments(
-    rng: np.random.Generator, design: Design, correlations: Sequence[float], runs: int
+    rng: np.random.Generator, design: StudyDesign, correlations: Sequence[float], runs: int
 ) -> list[_Experiment]:
     """Give each experiment the generator as it is when those before have drawn their noise.
 
@@ -210,7 +210,7 @@ class _Fit:
     variance_factor: float | None
 
 
-def _cells(of: _Experiment, design: Design, runs: int) -> list[StudyCell]:
+def _cells(of: _Experiment, design: StudyDesign, runs: int) -> list[StudyCell]:
     """All scalings and units on the same noise."""
     rho, shared = of.rho, of.shared
     covariance = design.covariance(rho)

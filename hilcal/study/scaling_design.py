@@ -37,7 +37,7 @@ _CANDIDATES = 4000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Design:
+class StudyDesign:
     """P poses with L wrenches each; SI units.
 
     Attributes:
@@ -68,7 +68,7 @@ class Design:
         return self.std[:, :, None] * mixed * self.std[:, None, :]
 
 
-def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> Design:
+def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> StudyDesign:
     """Draw feasible poses and set up the regression.
 
     Feasible: joints within limits, joint centres above the floor, target off the base axis,
@@ -92,7 +92,7 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> Design:
     arm_noise = joint_scatter(jacobian, np.full(arm.n, JOINT_STD), np.eye(3), 6)
     total = arm_noise + tracker_covariance(target, TRACKER, STATION, 6)
     std = np.sqrt(np.diagonal(total, axis1=-2, axis2=-1))
-    return Design(
+    return StudyDesign(
         arm=arm,
         q=q,
         wrenches=WRENCHES,
@@ -103,7 +103,7 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> Design:
     )
 
 
-def make_readings(design: Design, covariance: Floats, shared: bool) -> Readings:
+def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Readings:
     """Readings (values left at zero) of the design: unloaded and loaded, pose by pose.
 
     Args:
@@ -130,7 +130,7 @@ def make_readings(design: Design, covariance: Floats, shared: bool) -> Readings:
     )
 
 
-def bound(design: Design, covariance: Floats, shared: bool) -> Floats:
+def bound(design: StudyDesign, covariance: Floats, shared: bool) -> Floats:
     """Cramér–Rao bound (n, n) on the covariance of any unbiased estimate of c.
 
         F⁻¹,  F = Σ_p Σ_kl (C⁻¹)_kl A_pkᵀ V_p⁻¹ A_pl,   C = I + 1 1ᵀ (shared) or 2 I

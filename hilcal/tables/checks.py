@@ -9,7 +9,7 @@ from hilcal.readings.covariance import smallest_correlation
 from hilcal.readings.readings import SAME_POSE
 from hilcal.robot.arm import Arm
 from hilcal.tables.columns import POSITION, ROTATION, WRENCH
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 from hilcal.types import Floats, Ints
 
 MAX_DISTANCE = 100.0  # m; no instrument measures an arm from further away
@@ -20,7 +20,7 @@ _TRACKING = 0.1  # rad; actual and commanded joints of an arm at rest are closer
 _G = 9.80665
 
 
-def check_joints(table: Table, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
+def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
     """Refuse commanded joints beyond the arm's limits; (N, n), rad.
 
     Raises:
@@ -42,7 +42,9 @@ def check_joints(table: Table, names: tuple[str, ...], q: Floats, arm: Arm) -> N
     )
 
 
-def check_actual_joints(table: Table, names: tuple[str, ...], actual: Floats, q: Floats) -> None:
+def check_actual_joints(
+    table: ColumnTable, names: tuple[str, ...], actual: Floats, q: Floats
+) -> None:
     """Refuse encoder readings that are not near the commanded joints; (N, n), rad.
 
     Raises:
@@ -59,7 +61,7 @@ def check_actual_joints(table: Table, names: tuple[str, ...], actual: Floats, q:
         )
 
 
-def check_positions(table: Table, position: Floats, q: Floats, arm: Arm) -> None:
+def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -> None:
     """Refuse positions (N, 3) that cannot be metres.
 
     No reading is further than 100 m from its instrument; all lie within a few reaches of each
@@ -100,7 +102,7 @@ def _looks_like(position: Floats, distance: float) -> str:
     return " (looks like millimetres)" if 10.0 < distance < 1e3 * MAX_DISTANCE else ""
 
 
-def check_rotations(table: Table, rotation: Floats) -> None:
+def check_rotations(table: ColumnTable, rotation: Floats) -> None:
     """Refuse rotation vectors (N, 3) of more than a turn.
 
     Raises:
@@ -115,7 +117,7 @@ def check_rotations(table: Table, rotation: Floats) -> None:
         )
 
 
-def check_covariances(table: Table, covariance: Floats) -> None:
+def check_covariances(table: ColumnTable, covariance: Floats) -> None:
     """Refuse covariances (N, m, m) that no error can have.
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
@@ -159,7 +161,9 @@ def check_covariances(table: Table, covariance: Floats) -> None:
         )
 
 
-def check_wrenches(table: Table, wrench: Floats, load: Ints, names: list[str], arm: Arm) -> None:
+def check_wrenches(
+    table: ColumnTable, wrench: Floats, load: Ints, names: list[str], arm: Arm
+) -> None:
     """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm.
 
     Raises:
@@ -174,7 +178,7 @@ def check_wrenches(table: Table, wrench: Floats, load: Ints, names: list[str], a
     table.refuse(heavy, WRENCH, lambda v: f"{v:g}: {beyond}")
 
 
-def check_names(table: Table) -> None:
+def check_names(table: ColumnTable) -> None:
     """Refuse empty poses and loads, and other spellings of `none`.
 
     Raises:
@@ -191,7 +195,7 @@ def check_names(table: Table) -> None:
         raise InputError(f"{table.at(i, 'load')}: '{odd[0]}' must be spelled 'none'")
 
 
-def check_same_pose(table: Table, pose: Ints, names: list[str], q: Floats) -> None:
+def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats) -> None:
     """Refuse a pose whose commanded joints (N, n) differ between its rows.
 
     Raises:

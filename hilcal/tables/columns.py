@@ -10,7 +10,7 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 
 POSITION = ("x_m", "y_m", "z_m")
 ROTATION = ("rx_rad", "ry_rad", "rz_rad")
@@ -233,7 +233,7 @@ def own_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]
     return tuple(name for name, own in zip(names, arm.own, strict=True) if own)
 
 
-def with_following(table: Table, arm: Arm) -> Table:
+def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
     """Return the table with the values of mimic joints as they follow from the others.
 
     Raises:

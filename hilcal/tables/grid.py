@@ -1,7 +1,7 @@
 """A table as a file holds it, named columns of cells, and the columns that were understood.
 
 Files become a `Grid` in `hilcal.tables.files`; what its columns mean is said by their names (the
-exchange table) or by a mapping, and makes a `Table` of numbers and texts of it.
+exchange table) or by a mapping, and makes a `ColumnTable` of numbers and texts of it.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -134,7 +134,7 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Table:
+class ColumnTable:
     """Columns that were understood, in SI units where they are numbers.
 
     Attributes:
@@ -158,7 +158,7 @@ class Table:
         text: Sequence[str],
         number: Sequence[str],
         sparse: Collection[str] = (),
-    ) -> "Table":
+    ) -> "ColumnTable":
         """Return the columns of these names; each of their cells has a value but for `sparse` ones.
 
         Raises:
@@ -167,7 +167,7 @@ class Table:
         numbers = {name: grid.numbers(name, complete=name not in sparse) for name in number}
         return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
 
-    def taken(self, rows: Bools) -> "Table":
+    def taken(self, rows: Bools) -> "ColumnTable":
         """Return the chosen rows."""
         at = np.flatnonzero(rows).tolist()
         return replace(

@@ -17,7 +17,7 @@ from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
 from hilcal.tables.columns import own_columns
 from hilcal.tables.files import open_tables
-from hilcal.tables.grid import Cell, Grid, Table
+from hilcal.tables.grid import Cell, ColumnTable, Grid
 from hilcal.tables.mapping import (
     Column,
     Joints,
@@ -82,7 +82,7 @@ class MappedTable(Generic[M]):
         notes: one sentence for each decision.
     """
 
-    table: Table
+    table: ColumnTable
     grid: Grid
     mapping: M
     raw: dict[str, Floats]
@@ -116,7 +116,7 @@ def mapped_table(
     notes += left_out + nowhere
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
-    table = Table(grid.path, grid.rows, {}, {})
+    table = ColumnTable(grid.path, grid.rows, {}, {})
     for names, named, convert in _quantities(mapping, arm):
         for name, column in zip(names, named, strict=True):
             _put(table, grid, name, column, convert(raw[grid.name(column)]))
@@ -217,7 +217,9 @@ def _sparse(grid: Grid, mapping: PointMapping) -> list[str]:
     return [grid.name(c) for c in (*position, *(s.column for s in mapping.one.values()))]
 
 
-def _observers(table: Table, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]) -> None:
+def _observers(
+    table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
+) -> None:
     """Add distances and heights in m, their variances, and who observed the rows."""
     for kind, section in mapping.one.items():
         value, of, variance = columns.ONE[kind]
@@ -268,7 +270,7 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
     return tall, mapping.model_copy(update=update)
 
 
-def _put(table: Table, grid: Grid, name: str, column: Column, values: Floats) -> None:
+def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floats) -> None:
     """Add a column, and what the file calls it."""
     table.number[name] = values
     table.alias[name] = grid.name(column)
@@ -417,7 +419,7 @@ def _block(raw: dict[str, Floats], grid: Grid, names: Sequence[Column]) -> Float
 
 
 def _rotations(
-    grid: Grid, o: Orientation | None, raw: dict[str, Floats], table: Table
+    grid: Grid, o: Orientation | None, raw: dict[str, Floats], table: ColumnTable
 ) -> Floats | None:
     """Add rotation vectors; returns the orientation's numbers (N, k) in the file's unit."""
     if o is None:
@@ -442,7 +444,7 @@ def _rotations(
     return angles
 
 
-def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: Table) -> Floats:
+def _wrench(grid: Grid, mapping: PointMapping, gravity: Floats, table: ColumnTable) -> Floats:
     """(N, 6) wrench, N and N·m; zero where the table has none."""
     wrench = np.zeros((len(grid.rows), 6))
     if (w := mapping.wrench) is not None:
@@ -478,7 +480,7 @@ def _loads(grid: Grid, mapping: PointMapping, wrench: Floats) -> list[str]:
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
-def _as_commanded(table: Table, q: Floats, arm: Arm) -> None:
+def _as_commanded(table: ColumnTable, q: Floats, arm: Arm) -> None:
     """Take the angles of a pose's first row as commanded, those of each row as actual."""
     first: dict[str, int] = {}
     rows = [first.setdefault(name, k) for k, name in enumerate(table.text["pose"])]

@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.tables import columns
 from hilcal.tables.checks import MAX_DISTANCE, MAX_STD
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 from hilcal.tables.uncertainty import LEAST
 from hilcal.types import Bools, Floats, Ints
 
@@ -37,7 +37,7 @@ class Observed:
     scalar: Bools
 
     def put(
-        self, table: Table, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
+        self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
     ) -> tuple[Floats, Floats]:
         """Return values (N, m) and covariances (N, m, m) with distances and heights put in.
 
@@ -63,7 +63,7 @@ class Observed:
 
     def _variance(
         self,
-        table: Table,
+        table: ColumnTable,
         rows: Ints,
         column: str,
         kind: ObserverKind,
@@ -88,7 +88,7 @@ class Observed:
         return np.asarray(found)
 
 
-def observed_of(table: Table) -> Observed | None:
+def observed_of(table: ColumnTable) -> Observed | None:
     """Return who observed the rows of a table; None where all are positions by one tracker.
 
     Raises:
@@ -121,7 +121,7 @@ def observed_of(table: Table) -> Observed | None:
     return Observed(np.array([at[n] for n in names]), tuple(order), np.asarray(~whole))
 
 
-def _name(table: Table, row: int, column: str) -> str:
+def _name(table: ColumnTable, row: int, column: str) -> str:
     name = table.text[column][row]
     if not name:
         raise InputError(f"{table.at(row, column)}: the cell is empty; name what observed the row")

@@ -20,7 +20,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
 from hilcal.tables.files import is_plain, package
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 from hilcal.tables.table import (
     check_covers,
     instrument_covariance,
@@ -83,7 +83,7 @@ class ReadingStream:
             name: _numbers(self.path, name, found.column(k), row)
             for k, name in enumerate(self.columns)
         }
-        table = Table(str(self.path), rows, {}, number)
+        table = ColumnTable(str(self.path), rows, {}, number)
         states, value = measured_of(table, self.arm)
         count = len(rows)
         alone, none = np.arange(count), np.zeros(count, dtype=np.int64)

@@ -14,7 +14,7 @@ from hilcal.robot.arm import Arm
 from hilcal.tables import checks, columns
 from hilcal.tables.columns import following_columns, with_following
 from hilcal.tables.files import open_grid
-from hilcal.tables.grid import Table
+from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.observed import observed_of, observer_columns
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
@@ -90,12 +90,12 @@ def import_table(
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
     sparse = columns.sparse_columns(grid.names)
-    table = Table.of(grid, chosen[0], chosen[1], sparse)
+    table = ColumnTable.of(grid, chosen[0], chosen[1], sparse)
     return readings_of(table, arm, noise, station, targets=targets, std=std)
 
 
 def readings_of(
-    table: Table,
+    table: ColumnTable,
     arm: Arm,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None = None,
@@ -156,7 +156,7 @@ def readings_of(
 
 
 def _covariance(
-    table: Table,
+    table: ColumnTable,
     value: Floats,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,
@@ -211,7 +211,7 @@ def _index(names: list[str]) -> tuple[Ints, list[str]]:
     return np.fromiter((order[n] for n in names), dtype=np.int64, count=len(names)), list(order)
 
 
-def _targets(table: Table, names: Sequence[str]) -> Ints | None:
+def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
     """(N,) numbers of the targets by the cell's names; None where there is one target.
 
     Raises:
@@ -247,7 +247,7 @@ def _targets(table: Table, names: Sequence[str]) -> Ints | None:
     return np.array([names.index(name) for name in given], dtype=np.int64)
 
 
-def _covers(table: Table) -> tuple[str, bool]:
+def _covers(table: ColumnTable) -> tuple[str, bool]:
     """What the table's covariances cover, by its column `covers`, and whether rounding, too.
 
     Without the column it is the instrument.
@@ -280,7 +280,7 @@ def check_covers(word: str, where: str) -> None:
         )
 
 
-def measured_of(table: Table, arm: Arm, whole: Bools | None = None) -> tuple[States, Floats]:
+def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tuple[States, Floats]:
     """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
 
     Args:
@@ -309,7 +309,7 @@ def measured_of(table: Table, arm: Arm, whole: Bools | None = None) -> tuple[Sta
     return states, value
 
 
-def _states(table: Table, arm: Arm) -> States:
+def _states(table: ColumnTable, arm: Arm) -> States:
     table = with_following(table, arm)
     number, n = table.number, arm.n
     joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
@@ -353,11 +353,11 @@ def _states(table: Table, arm: Arm) -> States:
     )
 
 
-def _group(table: Table, names: Sequence[str]) -> Floats | None:
+def _group(table: ColumnTable, names: Sequence[str]) -> Floats | None:
     return table.matrix(names) if names[0] in table.number else None
 
 
-def _in_range(table: Table, names: Sequence[str], low: float, high: float, unit: str) -> None:
+def _in_range(table: ColumnTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
     value = table.matrix(names)
     table.refuse(
         (value < low) | (value > high),
@@ -366,7 +366,7 @@ def _in_range(table: Table, names: Sequence[str], low: float, high: float, unit:
     )
 
 
-def _cycles(table: Table) -> Ints:
+def _cycles(table: ColumnTable) -> Ints:
     if "cycle" not in table.number:
         return np.zeros(len(table.rows), dtype=np.int64)
     cycle = table.matrix(("cycle",))
@@ -375,7 +375,7 @@ def _cycles(table: Table) -> Ints:
     return cycle[:, 0].astype(np.int64)
 
 
-def stated_covariance(table: Table, m: int) -> Floats | None:
+def stated_covariance(table: ColumnTable, m: int) -> Floats | None:
     """Covariances (N, m, m) that the table states, None where it states none."""
     names = columns.covariance_columns(m)
     if names[0] not in table.number:
@@ -387,7 +387,7 @@ def stated_covariance(table: Table, m: int) -> Floats | None:
 
 
 def instrument_covariance(
-    table: Table,
+    table: ColumnTable,
     value: Floats,
     noise: TrackerNoise | None,
     station: Floats | Sequence[float] | None,

@@ -10,7 +10,7 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables import units
-from hilcal.tables.grid import Grid, Table
+from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.orientation import angle_axes
 from hilcal.types import Bools, Floats
@@ -33,7 +33,7 @@ _PLAUSIBLE = (1e-6, 1e-3)
 
 
 def mapped_covariance(
-    table: Table,
+    table: ColumnTable,
     grid: Grid,
     mapping: Mapping,
     position: Floats,
@@ -216,7 +216,7 @@ def _doubt(mapping: Mapping, cov: Floats, instrument: Floats) -> tuple[str, ...]
 
 
 def floored(
-    table: Table, covariance: Floats, instrument: Floats | None
+    table: ColumnTable, covariance: Floats, instrument: Floats | None
 ) -> tuple[Floats, tuple[str, ...]]:
     """Raise variances that are zero, or far below the others, to those of the instrument.
 

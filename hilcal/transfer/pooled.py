@@ -19,7 +19,7 @@ from hilcal.readings.ranges import Range
 from hilcal.regression.hierarchy import (
     FALSE_ALARM,
     UNDETERMINED,
-    Found,
+    FleetEstimates,
     Hierarchy,
     Unlike,
     hierarchy,
@@ -92,7 +92,7 @@ class Spread:
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class DiagnosedEffect:
     """An effect that diagnoses added.
 
     Attributes:
@@ -130,7 +130,7 @@ class Pooled:
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
     odd: tuple[Odd, ...]
-    seen: tuple[Seen, ...]
+    seen: tuple[DiagnosedEffect, ...]
     wear: tuple[str, ...]
     prior: Posterior
     off: Floats
@@ -148,7 +148,7 @@ class Pooled:
         return np.where(seen, self.off / std, np.nan)
 
 
-def effects_seen(members: Sequence[Member]) -> tuple[Seen, ...]:
+def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
     """Return the effects that diagnoses added, and on how many arms."""
     arms: dict[str, list[str]] = {}
     for m in members:
@@ -160,11 +160,11 @@ def effects_seen(members: Sequence[Member]) -> tuple[Seen, ...]:
         some = tuple(dict.fromkeys(of))
         share = len(some) / count
         kind = "trait" if share >= COMMON else "defect" if share <= RARE else "some"
-        found.append(Seen(name, some, count, kind))
+        found.append(DiagnosedEffect(name, some, count, kind))
     return tuple(sorted(found, key=lambda s: -len(s.arms)))
 
 
-def pooled(members: Sequence[Member], seen: Sequence[Seen]) -> Pooled:
+def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
     """Pool the campaigns of arms of one type.
 
     Args:
@@ -260,7 +260,7 @@ def _units(members: Sequence[Member]) -> dict[str, str]:
 
 def _found(
     members: Sequence[Member], arms: Sequence[str], names: Sequence[str], scale: Floats
-) -> Found:
+) -> FleetEstimates:
     """The members' parameters in ordinary magnitudes; others than `names` marginalised out."""
     k = len(names)
     mean, information = np.zeros((len(members), k)), np.zeros((len(members), k, k))
@@ -276,12 +276,12 @@ def _found(
     arm = np.array([arms.index(m.arm) for m in members])
     begun = np.full(len(arms), np.inf)
     np.minimum.at(begun, arm, seconds)
-    return Found(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
+    return FleetEstimates(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
 
 
 def _changed(
     members: Sequence[Member],
-    found: Found,
+    found: FleetEstimates,
     arms: Sequence[str],
     h: Hierarchy,
     names: Sequence[str],

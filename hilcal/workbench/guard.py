@@ -41,7 +41,7 @@ _ENTERED = b"""<!doctype html><title>hilcal</title><link rel="icon" href="data:,
 cookie along with a redirection."""
 
 
-class Guard:
+class AccessGuard:
     """An ASGI application that passes on only what the operator's browser asks for."""
 
     def __init__(self, app: App, port: int, token: str) -> None:

@@ -8,7 +8,7 @@ from nicegui import ui
 
 from hilcal.present.plan import power_rows, powers_summary
 from hilcal.workbench.elements import answer, button, title
-from hilcal.workbench.session import Session
+from hilcal.workbench.session import WorkbenchSession
 from hilcal.workbench.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def next_measurement(view: View, d: Snapshot) -> None:
     answer(view, "next")
 
 
-def planned(session: Session) -> None:
+def planned(session: WorkbenchSession) -> None:
     """Draw the next measurements."""
     if session.planned is None:
         return

@@ -16,7 +16,7 @@ from hilcal.present.campaign import refitted
 from hilcal.present.diagnosis import addition_lines, fell, rose
 from hilcal.workbench import cards, next_card
 from hilcal.workbench.elements import Status
-from hilcal.workbench.session import Say, Session
+from hilcal.workbench.session import Say, WorkbenchSession
 from hilcal.workbench.snapshot import Snapshot
 from hilcal.workbench.viewer import WebViewer
 from hilcal.workbench.work import Answer, Work
@@ -60,18 +60,18 @@ class Tab:
 
 
 @dataclass
-class Shared:
+class TabsShared:
     """What all tabs share."""
 
-    session: Session
+    session: WorkbenchSession
     work: Work = field(default_factory=Work)
     viewer: WebViewer = field(default_factory=WebViewer)
     drawing: tuple[Snapshot, tuple[str, ...]] | None = None
 
 
-def install(app: FastAPI, session: Session) -> None:
+def install(app: FastAPI, session: WorkbenchSession) -> None:
     """Add the page, and the files of the 3-D viewer, to an application; begin to read."""
-    shared = Shared(session)
+    shared = TabsShared(session)
 
     @app.get("/viewer/{name:path}")
     def viewer(name: str) -> Response:
@@ -91,7 +91,7 @@ def install(app: FastAPI, session: Session) -> None:
     bench.on_startup(lambda: shared.work.start(f"Reading {session.path.name}", read(session)))
 
 
-def read(session: Session, revision: int | None = None) -> Callable[[Say], str]:
+def read(session: WorkbenchSession, revision: int | None = None) -> Callable[[Say], str]:
     """Return what reads the file and shows a revision."""
 
     def do(say: Say) -> str:
@@ -114,7 +114,7 @@ def told(c: Changed | None) -> str:
 class View:
     """One tab of the page."""
 
-    def __init__(self, shared: Shared, address: str) -> None:
+    def __init__(self, shared: TabsShared, address: str) -> None:
         """Begin with what is there.
 
         Args:
@@ -133,7 +133,7 @@ class View:
         self._planned: object = None
 
     @property
-    def session(self) -> Session:
+    def session(self) -> WorkbenchSession:
         """The session."""
         return self.shared.session
 

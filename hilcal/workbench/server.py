@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from hilcal.errors import InputError
-from hilcal.workbench.session import Session
+from hilcal.workbench.session import WorkbenchSession
 
 HOST = "127.0.0.1"
 PORT = 8787
@@ -86,7 +86,7 @@ def leading_to(url: str) -> Iterator[Path]:
 
 
 def serve(
-    session: Session, port: int | None, told: Callable[[str], None], *, browser: bool
+    session: WorkbenchSession, port: int | None, told: Callable[[str], None], *, browser: bool
 ) -> bool:
     """Serve the workbench of a campaign until Ctrl-C; whether somebody opened it.
 
@@ -109,7 +109,7 @@ def serve(
     from fastapi import FastAPI
     from nicegui import core, ui
 
-    from hilcal.workbench.guard import TOKEN, Guard
+    from hilcal.workbench.guard import TOKEN, AccessGuard
     from hilcal.workbench.page import install
 
     # What a click fails by is told on the page; the library's own remarks are for its developers.
@@ -126,7 +126,7 @@ def serve(
             show_welcome_message=False,
             reconnect_timeout=10.0,
         )
-        guard = Guard(app, number, token)
+        guard = AccessGuard(app, number, token)
         core.sio.eio.cors_allowed_origins = list(guard.origins)
         url = f"http://{HOST}:{number}/?{TOKEN}={token}"
 

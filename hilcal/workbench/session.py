@@ -26,7 +26,7 @@ from hilcal.errors import InputError
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.names import quoted
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import Chapter, Curve, build_story, regressor
+from hilcal.present.story import Chapter, DependenceCurve, build_story, regressor
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import RevisionRecord
@@ -41,7 +41,7 @@ def silent(words: str) -> None:
     """Say nothing."""
 
 
-class Session:
+class WorkbenchSession:
     """A campaign file at the workbench.
 
     Attributes:
@@ -251,7 +251,7 @@ class Session:
         except InputError:
             return True
 
-    def evidence(self, snapshot: Snapshot, effect: str) -> Curve | None:
+    def evidence(self, snapshot: Snapshot, effect: str) -> DependenceCurve | None:
         """Return residual and regressor of a suspect, for its added-variable plot."""
         found = next((s for s in snapshot.diagnosis.suspects if s.effect == effect), None)
         return None if found is None else regressor(snapshot.fit, found)

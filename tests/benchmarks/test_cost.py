@@ -21,7 +21,7 @@ from hilcal.effects.joint_compliance import JointCompliance
 from hilcal.effects.joint_tilt_compliance import JointTiltCompliance
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.gauss_newton_steps import Point, linear_problem
+from hilcal.identification.gauss_newton_steps import NewtonPoint, linear_problem
 from hilcal.identification.priors import prior_of, scales_of
 from hilcal.identification.regularisation import regularise
 from hilcal.identification.residual import residual
@@ -91,7 +91,7 @@ def solve(p: Problem, prediction: Prediction, w: Whitening, a: Floats) -> Floats
     """A step of `gauss_newton_steps`: rank analysis, normal equations and solution."""
     white = w.whiten(residual(p.readings, prediction, w)).reshape(-1)
     prior, scale = prior_of(p.model)[0], scales_of(p.model)
-    point = Point(p.theta, p.theta, float(white @ white), white.size)
+    point = NewtonPoint(p.theta, p.theta, float(white @ white), white.size)
     linear = linear_problem(point, prior, a, white, w.rank, 1.0, whitened=True)
     by = regularise(linear, scale, prior, np.full(p.model.size, -1), choose=False)
     return np.asarray(by.basis.transform @ linear.equations(by.basis).solve(by.beta))

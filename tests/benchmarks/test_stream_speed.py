@@ -68,7 +68,7 @@ def given_rows(path: Path, kind: type[Product] | type[Triangle]) -> Floats:
     return total.r
 
 
-def the_whole(work: passes.Work, theta: Floats) -> list[passes.Reduced]:
+def the_whole(work: passes.PassTask, theta: Floats) -> list[passes.Reduced]:
     return [passes.reduce_group(k, work, theta) for k in range(len(work.stream.rows))]
 
 
@@ -78,13 +78,13 @@ def seconds(work: Callable[[], object]) -> float:
     return time.process_time() - begun
 
 
-def work_of(stream: ReadingStream) -> tuple[passes.Work, Floats]:
+def work_of(stream: ReadingStream) -> tuple[passes.PassTask, Floats]:
     of = cell()
     states = next(stream.chunks(0)).states
     effects: tuple[Effect, ...] = tuple(effect(of, states) for effect in EFFECTS)
     model = Model(of, effects)
     assert model.size == PARAMETERS
-    return passes.Work(stream, model, np.zeros(6), {}), 1e-3 * scales_of(model)
+    return passes.PassTask(stream, model, np.zeros(6), {}), 1e-3 * scales_of(model)
 
 
 def test_a_stream_against_reading_and_multiplying(

@@ -15,7 +15,7 @@ from hilcal.config.write import to_toml
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery
-from hilcal.discovery.law import Coefficient, Form, Part
+from hilcal.discovery.law import Coefficient, Form, LawPart
 from hilcal.discovery.law import Law as FoundLaw
 from hilcal.discovery.sites import sites
 from hilcal.discovery.variables import variables
@@ -36,7 +36,7 @@ from tests.support.cli_cases import CELL, ok, run
 SITUATION = example_situation(example_cell(), example_states(example_cell()))
 VARIABLES = {v.symbol: v for v in variables(SITUATION)}
 PRODUCT = (Factor(VARIABLES["q_5"], shapes.COS, (1.0,)), Factor(VARIABLES["τ_3"], shapes.LINEAR))
-COMPLIANCE = Form((Part(sites(6)[2], Amplitude(PRODUCT), 0),))
+COMPLIANCE = Form((LawPart(sites(6)[2], Amplitude(PRODUCT), 0),))
 BASELINE = ["base_frame", "joint_compliance"]
 Capsys = pytest.CaptureFixture[str]
 
@@ -65,7 +65,7 @@ def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
 def test_a_law_is_written_as_an_effect_and_told(
     campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    form = Form((Part(sites(6)[1], Amplitude(()), 0),))
+    form = Form((LawPart(sites(6)[1], Amplitude(()), 0),))
     law = FoundLaw(
         "bent",
         form,
@@ -219,7 +219,7 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
     square = Factor(VARIABLES["q_5"], shapes.EVEN, (2.0, 0.01))
-    other = Form((Part(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
+    other = Form((LawPart(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
     given: list[str | Path] = []
     for name, form in (("found", COMPLIANCE), ("found_or_1", other)):
         path = tmp_path / f"{name}.py"

@@ -16,7 +16,7 @@ from hilcal.store.appended import joined, with_new_names
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, load_plan
 from hilcal.store.run_log import RunLog
-from hilcal.workbench.session import Session
+from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import Site, site
 from tests.support.cli_cases import ok, refused
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
@@ -181,7 +181,7 @@ def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
     site.bench.world.again()
     path, further = site.directory / "run.hilcal", further_plan(site)
     planned: Any = SimpleNamespace(path=path, planned=(None, further))
-    line = Session.run_line(planned)
+    line = WorkbenchSession.run_line(planned)
     named = line.replace("CELL.toml", str(site.directory / "cell.toml"))
     assert ok(capsys, *shlex.split(named)[1:]).code == 0
 

@@ -29,7 +29,7 @@ from hilcal.config.write import to_toml
 from hilcal.import_campaign import import_campaign
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
-from hilcal.workbench.guard import Guard, Message, Receive, Scope, Send
+from hilcal.workbench.guard import AccessGuard, Message, Receive, Scope, Send
 from tests.support.bench_cases import BASE, TILT, stored
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
@@ -170,7 +170,7 @@ def test_the_token_is_good_for_one_exchange(served: Served) -> None:
     assert (again.status, again.headers["Set-Cookie"]) == (403, None)
     assert "has been opened" in again.text
 
-    guard = Guard(nothing, 8787, "secret")
+    guard = AccessGuard(nothing, 8787, "secret")
     for path, heads in (
         ("/?token=wrong", {}),
         ("/?token=", {}),
@@ -186,7 +186,7 @@ def test_the_token_is_good_for_one_exchange(served: Served) -> None:
 
 def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilcal.workbench.guard.UNUSED_S", 0.1)
-    unused, used = (Guard(nothing, 8787, "secret") for _ in range(2))
+    unused, used = (AccessGuard(nothing, 8787, "secret") for _ in range(2))
     assert asked(used, "/?token=secret") == 200
     assert not unused.abandoned
     time.sleep(0.2)
@@ -215,7 +215,7 @@ async def nothing(scope: Scope, receive: Receive, send: Send) -> None:
     """An application that answers nothing."""
 
 
-def asked(guard: Guard, path: str, method: str = "GET", **heads: str) -> int:
+def asked(guard: AccessGuard, path: str, method: str = "GET", **heads: str) -> int:
     """The status of an answer."""
     told: list[Message] = []
 

@@ -10,7 +10,7 @@ import numpy as np
 from drivers import emscon, netft
 from drivers import emscon_packets as es
 from drivers import natnet_frames as nn
-from drivers.emscon import Connection, EmsconTracker
+from drivers.emscon import EmsconConnection, EmsconTracker
 from drivers.natnet import NatNetTracker
 from drivers.simulated.natnet_server import BODY, Cameras
 from hilcal.config.cell import Tracker
@@ -43,12 +43,12 @@ def _emscon() -> Parser:
         return bytes([k]) + (sound[k] if by.random() < 0.1 else bytes_damaged(sound[k], by, sound))
 
     def parse(data: bytes) -> bool:
-        line = Connection.__new__(Connection)
+        line = EmsconConnection.__new__(EmsconConnection)
         line.where, line.changes, line.open = "fuzz", [], True
         line._came, line._socket = bytearray(), _Line(data[1:])  # type: ignore[assignment]
         tracker = EmsconTracker.__new__(EmsconTracker)
         target = "pose" if data[0] else "position"
-        tracker._options = emscon.Options(target=target)  # type: ignore[arg-type]
+        tracker._options = emscon.EmsconOptions(target=target)  # type: ignore[arg-type]
         tracker._config, tracker._remarks, tracker._line = Tracker(), [], line
         tracker._ready = lambda seconds=0.0: np.inf  # type: ignore[method-assign]
         tracker._clock = None  # type: ignore[assignment]
@@ -80,7 +80,7 @@ def _natnet() -> Parser:
         tracker = NatNetTracker.__new__(NatNetTracker)
         tracker.where, tracker._newest = "fuzz", -1
         version = versions[data[0] % 4]
-        tracker._server = nn.Server("fuzz", "1", version)
+        tracker._server = nn.NatNetServer("fuzz", "1", version)
         if data[0] < 4:
             bodies = tracker._next(_Line(data[1:]))  # type: ignore[arg-type]
             for body in bodies or ():
@@ -102,7 +102,7 @@ def _page() -> Parser:
         return words if by.random() < 0.1 else bytes_damaged(words, by)
 
     def parse(data: bytes) -> bool:
-        sensor = netft.sensor_format(data.decode("utf-8", "replace"), netft.Options(), "fuzz")
+        sensor = netft.sensor_format(data.decode("utf-8", "replace"), netft.NetFtOptions(), "fuzz")
         counter = sensor.losses()
         if not (np.isfinite(sensor.unit).all() and (sensor.unit > 0).all() and counter.rate >= 0):
             raise Accepted("netft: units that cannot be")

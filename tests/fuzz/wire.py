@@ -19,7 +19,7 @@ from geocompy.geo import GeoCom
 
 from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
 from drivers.force_stream import RING, ForceStream, SensorFormat
-from drivers.geocom import GeoComTracker, Options
+from drivers.geocom import GeoComOptions, GeoComTracker
 from drivers.geocom_line import Link
 from hilcal.config.cell import Tracker
 from hilcal.measuring.devices import Clock
@@ -142,7 +142,7 @@ def _geocom() -> Parser:
     with instead(geocom_line, quiet), instead(geo, {"sleep": lambda _: None}):
         GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
     config = Tracker(driver="geocom", port="fuzz")
-    tracker = GeoComTracker(link, config, Options(), Clock(1.0))
+    tracker = GeoComTracker(link, config, GeoComOptions(), Clock(1.0))
 
     def answers(values: Sequence[object], code: int = 0) -> bytes:
         text = ",".join(str(v) for v in values)

@@ -8,9 +8,9 @@ from hilcal.cell import cell_from_config
 from hilcal.config import (
     Acquire,
     CellConfig,
+    CellLoad,
     ForceSensor,
     Limits,
-    Load,
     Motion,
     Repeatability,
     Robot,
@@ -37,9 +37,9 @@ def configuration(**changes: Any) -> CellConfig:
         "tracker": Tracker(frame="tracker"),
         "repeatability": Repeatability(joint_std_rad=1e-5),
         "loads": (
-            Load(name="3kg", mass_kg=3.0, hang_m=0.1),
-            Load(name="6kg", mass_kg=6.0, hang_m=0.1),
-            Load(name="pull", force_N=(40.0, 0.0, 0.0)),
+            CellLoad(name="3kg", mass_kg=3.0, hang_m=0.1),
+            CellLoad(name="6kg", mass_kg=6.0, hang_m=0.1),
+            CellLoad(name="pull", force_N=(40.0, 0.0, 0.0)),
         ),
         "force_sensor": ForceSensor(driver="fake", port="nowhere"),
         "motion": Motion(speed_rad_s=0.5, acceleration_rad_s2=5.0),

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hilcal.config import Load
+from hilcal.config import CellLoad
 from hilcal.measuring.devices import (
     ArmSample,
     Clock,
@@ -165,7 +165,7 @@ class FakeOperator:
     def report(self) -> Report:
         return Report("operator", "fake")
 
-    def hang(self, load: Load | None, why: str) -> None:
+    def hang(self, load: CellLoad | None, why: str) -> None:
         w = self.world
         w.call("operator.hang")
         assert not w.is_moving, "a person asked to work at a moving arm"

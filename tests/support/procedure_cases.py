@@ -8,7 +8,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
-from hilcal.procedure.state import Settings, Step
+from hilcal.procedure.state import ProcedureStep, Settings
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.whitening import Mode
 from hilcal.robot.catalogue import configs_dir
@@ -75,7 +75,7 @@ class Drawn:
             rows = drawn[slice(k * each, (k + 1) * each)]
             log.record(rows, step, *({"epoch_wall_s": 0.0} for _ in range(each)))
 
-    def do(self, step: Step) -> object:
+    def do(self, step: ProcedureStep) -> object:
         """Do one step."""
         self.kinds.append(step.kind)
         p = self.procedure

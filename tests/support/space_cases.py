@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Obstacle
-from hilcal.design.draw import Drawn, draw
+from hilcal.design.draw import DrawnPoses, draw
 from hilcal.design.feasible import Space
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot.arm import Arm
@@ -172,7 +172,7 @@ def space_of(config: CellConfig) -> Space:
     return Space(cell_from_config(config), config)
 
 
-def drawn_of(config: CellConfig, count: int = 40, seed: int = 0, **how: Any) -> Drawn:
+def drawn_of(config: CellConfig, count: int = 40, seed: int = 0, **how: Any) -> DrawnPoses:
     return draw(space_of(config), count, np.random.default_rng(seed), **how)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
-from hilcal.present.story import Curve, Story, StoryRevision
+from hilcal.present.story import DependenceCurve, Story, StoryRevision
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
 
@@ -96,7 +96,7 @@ def story(
     )
 
 
-ANGLE = Curve(
+ANGLE = DependenceCurve(
     title="joint 4 angle",
     says="71 % of the misfit on poses left out follows joint 4 angle.",
     x=np.array([-150.0, -90.0, -20.0, 35.0, 110.0]),
@@ -105,7 +105,7 @@ ANGLE = Curve(
     x_label="joint 4 angle [°]",
     y_label="error of joint 2 [µrad]",
 )
-LOAD = Curve(
+LOAD = DependenceCurve(
     title="load",
     says="23 % of the misfit on poses left out follows load.",
     x=np.arange(3.0),
@@ -158,7 +158,7 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else []))},
-        follows=Curve(
+        follows=DependenceCurve(
             left[0],
             "",
             torque[:, 1],

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from drivers.geocom import GeoComTracker, Options, open_tracker
+from drivers.geocom import GeoComOptions, GeoComTracker, open_tracker
 from drivers.geocom_line import Link
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, TargetLostError
@@ -44,7 +44,7 @@ def opened(instrument):
         table.update(answers)
         asked.clear()
         config = cell("unused", **tracker)
-        return GeoComTracker(link, config.tracker, Options(), Clock(20.0)), asked
+        return GeoComTracker(link, config.tracker, GeoComOptions(), Clock(20.0)), asked
 
     return start
 

@@ -275,7 +275,7 @@ EARLY = (
 SERIAL_NUMBER = "20235500001"
 
 
-class Dashboard:
+class DashboardServer:
     """Answers the lines of every client."""
 
     def __init__(self, controller: Controller, faults: Faults, model: str) -> None:

@@ -21,7 +21,7 @@ _BODY = 1 << 16  # bytes of the longest body that is read
 Answer = tuple[int, dict[str, Any]]
 
 
-class RobotApi:
+class RobotApiServer:
     """Answers the requests of every client."""
 
     def __init__(self, controller: Controller, faults: Faults, model: str) -> None:

@@ -40,7 +40,7 @@ Edits = list[tuple[Span, str]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Step:
+class ChainPlace:
     """One place of a chain.
 
     Attributes:
@@ -75,7 +75,7 @@ class Redrawn:
     rough: float
 
 
-def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn:
+def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> Redrawn:
     """Return the places that a corrected arm has in a file.
 
     Args:
@@ -122,7 +122,7 @@ def redrawn(steps: Sequence[Step], nominal: Arm, arm: Arm, file: str) -> Redrawn
 
 
 def _frames(
-    steps: Sequence[Step],
+    steps: Sequence[ChainPlace],
     turning: Sequence[int],
     old: Floats,
     drawn: Sequence[Floats],
@@ -183,7 +183,7 @@ def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
     return screw(float(turn), 0.0) @ before
 
 
-def edits_of(steps: Sequence[Step], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
+def edits_of(steps: Sequence[ChainPlace], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
     """Edits of all steps that move, and the names of these.
 
     Raises:

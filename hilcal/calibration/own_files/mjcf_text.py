@@ -11,7 +11,7 @@ import re
 
 import numpy as np
 
-from hilcal.calibration.own_files.chain_text import Edits, Step, numbers, z_to
+from hilcal.calibration.own_files.chain_text import ChainPlace, Edits, numbers, z_to
 from hilcal.calibration.own_files.xml_text import Document, Node
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
@@ -22,7 +22,7 @@ from hilcal.types import Floats
 _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 
-def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Step]:
+def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
     """Return the steps from a base body to a tip, a body or a site.
 
     Args:
@@ -82,7 +82,7 @@ def _named(document: Document, world: Node, name: str, tags: tuple[str, ...]) ->
     return found[0]
 
 
-def _step(document: Document, node: Node) -> Step:
+def _step(document: Document, node: Node) -> ChainPlace:
     """Return the step of a body or a site; raises as `mjcf_steps` does."""
     joints = [c for c in node.children if c.tag in ("joint", "freejoint")]
     if node.tag == "frame" or len(joints) > 1:
@@ -114,7 +114,7 @@ def _step(document: Document, node: Node) -> Step:
             out += _put_quat(document, node, new[:3, :3])
         return out
 
-    return Step(_name(node), node.line, place, turn, write)
+    return ChainPlace(_name(node), node.line, place, turn, write)
 
 
 def _put_quat(document: Document, node: Node, r: Floats) -> Edits:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import LEFT, Edits, Step, moved, numbers, z_to
+from hilcal.calibration.own_files.chain_text import LEFT, ChainPlace, Edits, moved, numbers, z_to
 from hilcal.calibration.own_files.xml_text import Document, Node
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
@@ -34,7 +34,7 @@ class SdfChain:
         joints: of the steps.
     """
 
-    steps: list[Step]
+    steps: list[ChainPlace]
     document: Document
     joints: list[Node]
     model: "_Model"
@@ -214,7 +214,7 @@ def _pose_edit(node: Node, text: str) -> tuple[Span, str]:
     return Span(0, pose.end, pose.close), text
 
 
-def _step(model: _Model, joint: Node) -> Step:
+def _step(model: _Model, joint: Node) -> ChainPlace:
     """Return the step of a joint; raises as `sdf_chain` does."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     parent, child = model.ends(joint)
@@ -232,4 +232,4 @@ def _step(model: _Model, joint: Node) -> Step:
             f"{model.document.name}: line {joint.line}: joint '{escaped(name)}' is {escaped(kind)};"
             " valid between base and tip: revolute, continuous, fixed"
         )
-    return Step(name, joint.line, place, turn, lambda _: [])
+    return ChainPlace(name, joint.line, place, turn, lambda _: [])

@@ -11,7 +11,7 @@ import re
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import Edits, Step, numbers, z_to
+from hilcal.calibration.own_files.chain_text import ChainPlace, Edits, numbers, z_to
 from hilcal.calibration.own_files.xml_text import Document, Node
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
@@ -23,7 +23,7 @@ _EXPRESSION = re.compile(r"\$\{([^{}]*)\}")
 _TURNING, _FIXED = ("revolute", "continuous"), "fixed"
 
 
-def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Step]:
+def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
     """Return the steps from a base link to a tip link.
 
     Args:
@@ -111,7 +111,7 @@ def _leaf(document: Document, parents: dict[str, tuple[str, Node]], links: set[s
     return leaves[0]
 
 
-def _step(document: Document, joint: Node, *, turned: bool = False) -> Step:
+def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlace:
     """Return the step of a joint; `turned`: from its child to its parent.
 
     Raises:
@@ -155,7 +155,7 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> Step:
             out.append(document.put(origin, key, numbers(values[key])))
         return out
 
-    return Step(name, joint.line, se3.inverse(place) if turned else place, turn, write)
+    return ChainPlace(name, joint.line, se3.inverse(place) if turned else place, turn, write)
 
 
 def _of_rpy(rpy: Floats) -> Floats:

@@ -20,7 +20,7 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     JOINTS,
     UNSTATED,
-    Frames,
+    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
@@ -144,7 +144,7 @@ def _instructions(text: str, name: str) -> Iterator[tuple[int, str]]:
         yield line, re.sub(r"^\s*\d*\s*:\s*", "", body)
 
 
-def _point(bare: ProgramPoint, text: str, place: int, known: Frames) -> ProgramPoint:
+def _point(bare: ProgramPoint, text: str, place: int, known: ControllerFrames) -> ProgramPoint:
     """Return a position of `/POS`; `place` is where its text begins."""
     group = _GROUP.search(text)
     if group is None:
@@ -184,7 +184,7 @@ def _point(bare: ProgramPoint, text: str, place: int, known: Frames) -> ProgramP
     )
 
 
-def _flags(config: re.Match[str], known: Frames) -> tuple[int, ...] | str:
+def _flags(config: re.Match[str], known: ControllerFrames) -> tuple[int, ...] | str:
     """Flags of a CONFIG, or why they are not known."""
     letters, turns = config[1].split(), [int(t) for t in re.findall(r"-?\d+", config[2])]
     pairs = (("N", "F"), ("U", "D"), ("T", "B"))

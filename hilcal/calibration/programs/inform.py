@@ -18,7 +18,7 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     JOINTS,
     UNSTATED,
-    Frames,
+    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
@@ -145,7 +145,7 @@ def _instruction(
 
 
 def _point(
-    m: re.Match[str], at: int, line: int, said: dict[str, str], known: Frames
+    m: re.Match[str], at: int, line: int, said: dict[str, str], known: ControllerFrames
 ) -> ProgramPoint:
     """Return a position; `at` is where its line begins."""
     bare = ProgramPoint(line, f"{m[1]}{m[2]} (line {line})")

@@ -24,7 +24,7 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     JOINTS,
     UNSTATED,
-    Frames,
+    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
@@ -130,7 +130,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     data: dict[str, list[_Value]] = {}
     if frames_file is not None and frames_file.suffix.lower() == ".dat":
         _collect(read_text(frames_file)[0], -1, data)
-    known = Frames()
+    known = ControllerFrames()
     if frames_file is not None and frames_file.suffix.lower() == ".toml":
         known = frames_of_toml(frames_file, of_euler, len(POSE))
     elif frames_file is not None and frames_file.suffix.lower() != ".dat":
@@ -138,7 +138,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     for k, text in enumerate(texts):
         _collect(text, k, data)
     names = [p.name for p in paths]
-    points = _Reader(names, data, replace(known, tool=tool)).points(texts[0])
+    points = _KrlReader(names, data, replace(known, tool=tool)).points(texts[0])
     return Program(
         KRL,
         tuple(p.suffix for p in paths),
@@ -225,10 +225,12 @@ class _Block:
     ends: list[_State] = field(default_factory=list)
 
 
-class _Reader:
+class _KrlReader:
     """Goes through the statements of a `.src` file in the order of its text."""
 
-    def __init__(self, files: Sequence[str], data: Mapping[str, list[_Value]], known: Frames):
+    def __init__(
+        self, files: Sequence[str], data: Mapping[str, list[_Value]], known: ControllerFrames
+    ):
         self.files, self.data, self.known = files, data, known
         self.found: dict[str, ProgramPoint] = {}
         self.at_name: dict[str, str] = {}

@@ -33,7 +33,7 @@ READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Understood:
+class UnderstoodProgram:
     """A program with N points that are understood.
 
     Attributes:
@@ -55,7 +55,7 @@ class Understood:
         """Points of `compensate`."""
         return Points(tuple(p.name for p in self.program.understood), self.q)
 
-    def without(self, refused: list[str]) -> "Understood":
+    def without(self, refused: list[str]) -> "UnderstoodProgram":
         """Return the program without points that are refused; "" for those that are not."""
         why = iter(refused)
         points = tuple(p if p.left else replace(p, left=next(why)) for p in self.program.points)
@@ -85,7 +85,7 @@ def understood(
     tool: Floats | None = None,
     near: Floats | None = None,
     leave: bool = False,
-) -> Understood:
+) -> UnderstoodProgram:
     """Read a program.
 
     Args:
@@ -111,7 +111,7 @@ def understood(
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
     longest, more = longest_tool(program.understood)
-    found = Understood(program, arm, q, longest, said + more).without(doubts)
+    found = UnderstoodProgram(program, arm, q, longest, said + more).without(doubts)
     _refuse(path, found.program.points, leave)
     return found
 

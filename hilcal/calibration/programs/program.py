@@ -275,7 +275,7 @@ class _FramesFile(Section):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Frames:
+class ControllerFrames:
     """What the controller keeps apart from programs.
 
     Attributes:
@@ -293,7 +293,7 @@ class Frames:
     tool: Floats | None = None
 
 
-def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> Frames:
+def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> ControllerFrames:
     """Read `--frames F.toml`.
 
     Args:
@@ -322,25 +322,25 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
     if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
         raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
     per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
-    return Frames(groups[0], groups[1], per_rad, axes)
+    return ControllerFrames(groups[0], groups[1], per_rad, axes)
 
 
 def toml_frames(
     path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
-) -> Frames:
+) -> ControllerFrames:
     """Read `--frames F.toml`, where there is one; raises as `frames_of_toml` does.
 
     Raises:
         InputError: it is no TOML file.
     """
     if path is None:
-        return Frames(tool=tool)
+        return ControllerFrames(tool=tool)
     if path.suffix.lower() != ".toml":
         raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
     return replace(frames_of_toml(path, language.pose, count), tool=tool)
 
 
-def frame_of(known: Frames, what: str, number: str) -> Floats | str:
+def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:
     """Pose of a tool ("tool") or frame ("frame") by its number, or why it is not known."""
     table = known.tools if what == "tool" else known.bases
     if number in table:

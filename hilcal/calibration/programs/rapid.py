@@ -23,7 +23,7 @@ import numpy as np
 from hilcal.calibration.programs.program import (
     JOINTS,
     UNSTATED,
-    Frames,
+    ControllerFrames,
     Language,
     Program,
     ProgramPoint,
@@ -130,12 +130,12 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known, more = Frames(), ""
+    known, more = ControllerFrames(), ""
     if frames_file is not None and frames_file.suffix.lower() == ".toml":
         known = frames_of_toml(frames_file, of_quaternion, POSE)
     elif frames_file is not None:
         more = read_text(frames_file)[0]
-    reader = _Reader(path.name, text, more, replace(known, tool=tool))
+    reader = _RapidReader(path.name, text, more, replace(known, tool=tool))
     return Program(RAPID, (path.suffix,), (text,), reader.points(), encoding)
 
 
@@ -160,10 +160,10 @@ _ROBTARGET = "[[0,0,0],[0,0,0,0],[0,0,0,0],[0,0,0,0,0,0]]"
 _JOINTTARGET = "[[0,0,0,0,0,0],[0,0,0,0,0,0]]"
 
 
-class _Reader:
+class _RapidReader:
     """Goes through the statements of a module in the order of its text."""
 
-    def __init__(self, name: str, text: str, more: str, known: Frames):
+    def __init__(self, name: str, text: str, more: str, known: ControllerFrames):
         self.name, self.text, self.known = name, text, known
         self.statements = list(_statements(text))
         self.data: dict[str, list[tuple[str, str, int]]] = {}

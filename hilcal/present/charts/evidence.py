@@ -10,13 +10,13 @@ from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.identification.fit import Fit
 from hilcal.present.charts import style
 from hilcal.present.fit import CERTAIN, follows
-from hilcal.present.story import Curve, worst_and_even
+from hilcal.present.story import DependenceCurve, worst_and_even
 from hilcal.types import Floats, Ints
 
 MOST_POINTS = 1500
 
 
-def added_variable(r: Curve, effect: str) -> go.Figure:
+def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
     """Draw residual over regressor, both freed of what the model can do.
 
     Where the suspect is right the points lie on the line of slope 1, where it explains nothing
@@ -63,7 +63,7 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     return style.bars(names, shares, hover, says, "share of the misfit [%]", colors)
 
 
-def curve_chart(c: Curve) -> go.Figure:
+def curve_chart(c: DependenceCurve) -> go.Figure:
     """Draw means over a variable with standard uncertainties, and the law, where there is one."""
     points = style.marks(
         [style.label(n) for n in c.names] if c.names else c.x,

@@ -18,7 +18,7 @@ MOST = 1500
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drawn:
+class ChartReadings:
     """The readings that a chart draws of one revision.
 
     Attributes:
@@ -64,9 +64,9 @@ class Drawn:
         ]
 
 
-def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> Drawn:
+def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
     """Choose at most `most` readings."""
-    return Drawn(story, revision, worst_and_even(revision.whitened_norm2, most))
+    return ChartReadings(story, revision, worst_and_even(revision.whitened_norm2, most))
 
 
 def place(story: Story, i: int) -> str:
@@ -179,7 +179,7 @@ def over(revision: StoryRevision, x: Floats, name: str, unit: str) -> str:
     return f"Residual over {name}: {a:.2g} times the noise rms up to {at}, {b:.2g} times beyond."
 
 
-def chart(d: Drawn, x: Floats, title: str, words: str) -> go.Figure:
+def chart(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
     """Draw residuals over x (K,); each point carries the number of its reading."""
     traces = [
         style.marks(

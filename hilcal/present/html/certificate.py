@@ -12,7 +12,7 @@ from hilcal.identification.fit import Fit
 from hilcal.present.document import (
     Block,
     Items,
-    Section,
+    PageSection,
     Table,
     Words,
     captioned,
@@ -30,7 +30,7 @@ from hilcal.robot.arm import Arm
 from hilcal.store.plan import UNLOADED
 
 
-def certificate(m: ReportContent) -> Section:
+def certificate(m: ReportContent) -> PageSection:
     """Return the certificate for a quality manager."""
     fit = m.fit
     parts: list[Block] = [replace(errors(fit), caption="Error before and after")]
@@ -41,7 +41,7 @@ def certificate(m: ReportContent) -> Section:
     parts += [heading("Poses and loads"), *_conditions(m)]
     parts += [heading("What was not tested"), Items(tuple(not_tested(m)))]
     parts += [heading("Measured with"), *_instruments(m)]
-    return Section("certificate", "Certificate", tuple(parts))
+    return PageSection("certificate", "Certificate", tuple(parts))
 
 
 def _corrected(found: Mapping[str, Any]) -> Table:

@@ -8,7 +8,7 @@ from hilcal.diagnosis.comparison import Comparison
 from hilcal.names import quoted
 from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_by_pose
 from hilcal.present.comparison import comparison_report, headline, next_step, sentence
-from hilcal.present.document import Block, Chart, Section, Words, captioned, heading, table
+from hilcal.present.document import Block, Chart, PageSection, Words, captioned, heading, table
 from hilcal.present.fleet import closing, type_report, unlike_words
 from hilcal.present.html.page import Card, FirstScreen, render
 
@@ -53,9 +53,9 @@ def comparison_page(
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
     )
     sections = (
-        Section("changes", "What has changed", told),
-        Section("today", "The earlier calibration today", tuple(charts)),
-        Section("provenance", "Provenance", provenance),
+        PageSection("changes", "What has changed", told),
+        PageSection("today", "The earlier calibration today", tuple(charts)),
+        PageSection("provenance", "Provenance", provenance),
     )
     return render("Comparison of two campaigns", f"{arm}, {earlier} and {later}, {made[:10]}",
                   comparison_screen(c, earlier), sections)  # fmt: skip
@@ -104,11 +104,11 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
     for k, t in enumerate(fleet.types):
         drawn: tuple[Block, ...] = (Chart("Arms of the type", arms_chart(t), wide=True, height=0),)
         told = captioned(list(type_report(t))[1:], f"Parameters of the {t.type}")
-        sections.append(Section(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
+        sections.append(PageSection(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
     sections.append(
-        Section(
+        PageSection(
             "campaigns",
             "Campaigns",
             (table(*heads, rows=rows, caption="Campaigns"), *closing(fleet)),

@@ -13,7 +13,7 @@ from plotly.offline import get_plotlyjs
 
 from hilcal.names import escaped
 from hilcal.present.charts import style
-from hilcal.present.document import Block, Chart, Section, captioned
+from hilcal.present.document import Block, Chart, PageSection, captioned
 
 HERE = Path(__file__).parent
 
@@ -48,7 +48,7 @@ class FirstScreen:
     passed: bool | None
 
 
-def render(title: str, about: str, first: FirstScreen, parts: tuple[Section, ...]) -> str:
+def render(title: str, about: str, first: FirstScreen, parts: tuple[PageSection, ...]) -> str:
     """Return a page.
 
     Args:

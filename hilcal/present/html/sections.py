@@ -32,7 +32,7 @@ from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubt
 from hilcal.present.document import (
     Block,
     Chart,
-    Section,
+    PageSection,
     Table,
     Words,
     captioned,
@@ -65,13 +65,13 @@ def page(m: ReportContent) -> str:
     return render("Calibration report", about, first_screen(m), parts)
 
 
-def sections(m: ReportContent) -> tuple[Section, ...]:
+def sections(m: ReportContent) -> tuple[PageSection, ...]:
     """Return all sections after the certificate."""
     found = (_revisions(m), _where(m), _evidence(m), _laws(m), _parameters(m))
     return tuple(s for s in found if s is not None)
 
 
-def _where(m: ReportContent) -> Section:
+def _where(m: ReportContent) -> PageSection:
     story, last, d = m.story, m.left_out, m.diagnosis
     parts: list[Block] = [
         "Errors are those of poses left out: each is predicted by a fit to the others."
@@ -95,21 +95,21 @@ def _where(m: ReportContent) -> Section:
         told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
     parts.append(_noise(m))
-    return Section("where", "Where it fails", tuple(parts))
+    return PageSection("where", "Where it fails", tuple(parts))
 
 
-def _evidence(m: ReportContent) -> Section:
+def _evidence(m: ReportContent) -> PageSection:
     d, title = m.diagnosis, "What is missing, with its evidence"
     if d is None:
         said = "Not diagnosed: only a model fitted with scaling gc can be."
-        return Section("evidence", title, (said,))
+        return PageSection("evidence", title, (said,))
     parts: list[Block] = []
     if d.verdict == "adequate":  # else the first screen has it
         parts.append(numbers.sentence(message(d)))
     parts.append(suspects_table(d.suspects[:MOST_LISTED], "Suspects, best first"))
     parts += [*doubtful(d), *redundant_line(d)]
     parts += added_variables(d, [s for s in d.suspects if s.passes][:MOST_CURVES])
-    return Section("evidence", title, tuple(parts))
+    return PageSection("evidence", title, tuple(parts))
 
 
 def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
@@ -120,7 +120,7 @@ def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
             yield Chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
 
 
-def _laws(m: ReportContent) -> Section | None:
+def _laws(m: ReportContent) -> PageSection | None:
     found = m.story.revisions[-1].laws
     if not found:
         return None
@@ -134,7 +134,7 @@ def _laws(m: ReportContent) -> Section | None:
             "Nothing is known outside of the range that is drawn, nor within its gaps.",
         )
     )
-    return Section("laws", "Laws beyond the catalogue", tuple(parts))
+    return PageSection("laws", "Laws beyond the catalogue", tuple(parts))
 
 
 def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
@@ -158,7 +158,7 @@ def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
     )
 
 
-def _revisions(m: ReportContent) -> Section:
+def _revisions(m: ReportContent) -> PageSection:
     parts: list[Block] = [
         Chart("Error per revision", error_per_revision(m.story), wide=True, height=0),
         table(*REVISION_HEADS, rows=(r.cells for r in m.story.revisions), caption="Revisions"),
@@ -168,10 +168,10 @@ def _revisions(m: ReportContent) -> Section:
             "No revision is stored in the campaign: the baseline was fitted for this report "
             "and is not kept. hilcal refine finds the effects that are missing."
         )
-    return Section("revisions", "How the error fell", tuple(parts))
+    return PageSection("revisions", "How the error fell", tuple(parts))
 
 
-def _parameters(m: ReportContent) -> Section:
+def _parameters(m: ReportContent) -> PageSection:
     fit = m.fit
     parts: list[Block] = []
     for name in fit.model.named:
@@ -183,7 +183,7 @@ def _parameters(m: ReportContent) -> Section:
     parts += background_line(fit)
     if sizes := family_sizes(fit):
         parts.append(Chart("What this arm is made of", made_of(sizes), wide=True, height=0))
-    return Section("parameters", "Parameters", tuple(parts))
+    return PageSection("parameters", "Parameters", tuple(parts))
 
 
 def _halves(t: Table) -> Iterator[Table]:
@@ -224,7 +224,7 @@ def _too_few_repeats(fit: Fit) -> str:
 NOT_KEPT = "not kept: made by a program of one's own, at the workbench, or before hilcal kept it"
 
 
-def appendix(m: ReportContent) -> tuple[Section, ...]:
+def appendix(m: ReportContent) -> tuple[PageSection, ...]:
     """Return the sections of the appendix."""
     found = {
         "joints": ("Over each joint", _joints(m)),
@@ -235,7 +235,9 @@ def appendix(m: ReportContent) -> tuple[Section, ...]:
         "provenance": ("Provenance", _provenance(m)),
     }
     told = ((name, title, tuple(parts)) for name, (title, parts) in found.items())
-    return tuple(Section(name, f"Appendix: {title}", parts) for name, title, parts in told if parts)
+    return tuple(
+        PageSection(name, f"Appendix: {title}", parts) for name, title, parts in told if parts
+    )
 
 
 def _joints(m: ReportContent) -> Iterator[Block]:

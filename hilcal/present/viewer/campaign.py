@@ -15,7 +15,7 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.present.diagnosis import REVISION_HEADS
 from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
-from hilcal.present.story import LEVEL_NAMES, Curve, Story, StoryRevision, levels
+from hilcal.present.story import LEVEL_NAMES, DependenceCurve, Story, StoryRevision, levels
 from hilcal.present.viewer import campaign_scene, layout, recording, style
 from hilcal.types import Floats, Ints
 
@@ -302,7 +302,7 @@ def _bar_places(story: Story) -> tuple[Ints, Floats, Floats]:
     return starts, edges[:-1], np.diff(edges)
 
 
-def curve_bars(rec: rr.RecordingStream, entity: str, c: Curve | None) -> None:
+def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
     """Log a curve as bars over its variable, and beside each that of the law, where it has one.
 
     Single readings are drawn by their mean in bins of equal count.
@@ -338,7 +338,7 @@ def _edges(x: Floats) -> Floats:
     return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
 
 
-def _means(c: Curve) -> tuple[Floats, Floats]:
+def _means(c: DependenceCurve) -> tuple[Floats, Floats]:
     order = np.argsort(c.x, kind="stable")
     bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
     return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])

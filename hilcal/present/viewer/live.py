@@ -30,7 +30,7 @@ _NEVER = timedelta(days=1)
 _END_S = 8.0
 
 
-class Reply(Protocol):
+class ViewerReply(Protocol):
     """Tells the command something: `url`, or a `problem` in one line."""
 
     def __call__(self, **told: object) -> None:
@@ -38,7 +38,7 @@ class Reply(Protocol):
         ...
 
 
-def follow(messages: BinaryIO, reply: Reply, record: Path, port: int) -> None:
+def follow(messages: BinaryIO, reply: ViewerReply, record: Path, port: int) -> None:
     """Show what messages tell, until they end.
 
     Args:
@@ -84,7 +84,7 @@ class _Outlet:
     def __init__(
         self,
         identifier: str,
-        reply: Reply,
+        reply: ViewerReply,
         name: str,
         sink: Callable[[], Sink],
         file: Path | None = None,

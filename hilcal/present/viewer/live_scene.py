@@ -41,7 +41,7 @@ GROUPS = 150
 
 
 @dataclass(frozen=True, slots=True)
-class Judged:
+class LiveJudgement:
     """A reading against the model.
 
     Attributes:
@@ -86,7 +86,7 @@ class LiveTally:
         worst: those that are farthest from the model.
         remarks: that people should look at, newest last.
         places: index of each pose by its name; filled when it is first asked for.
-        group_worst: largest `Judged.norm2` of the group that is being measured.
+        group_worst: largest `LiveJudgement.norm2` of the group that is being measured.
     """
 
     told: Measuring
@@ -99,7 +99,7 @@ class LiveTally:
     judged: int = 0
     outside: int = 0
     loads: dict[str, list[int]] = field(default_factory=dict)
-    worst: list[Judged] = field(default_factory=list)
+    worst: list[LiveJudgement] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     places: dict[str, int] = field(default_factory=dict)
     group_worst: float = 0.0
@@ -130,7 +130,7 @@ class LiveTally:
             self.places.update({name: k for k, name in enumerate(self.told.plan.pose_names)})
         return np.asarray(self.anchor[self.places[step.pose], target])
 
-    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, Judged | None]]:
+    def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
         """Take note of a reading.
 
         Returns:
@@ -140,7 +140,7 @@ class LiveTally:
         read = ((event.target, event.live), *event.others)
         return [(k, live, self._judge(event.step, k, live)) for k, live in read]
 
-    def _judge(self, step: Step, target: int, live: LiveResidual) -> Judged | None:
+    def _judge(self, step: Step, target: int, live: LiveResidual) -> LiveJudgement | None:
         found = judged(step, live, self.told.names[target] if self.told.names else "")
         if found is None:
             return None
@@ -168,15 +168,15 @@ class LiveTally:
         return any(step.load != UNLOADED for step in self.told.plan.steps)
 
 
-def judged(step: Step, live: LiveResidual, target: str = "") -> Judged | None:
-    """Return a reading as `Judged`; None where it was not compared."""
+def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
+    """Return a reading as `LiveJudgement`; None where it was not compared."""
     if live.vector is None or live.covariance is None:
         return None
     r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
-    return Judged(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+    return LiveJudgement(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
 
 
-def arrow(live: LiveResidual, found: Judged) -> Floats:
+def arrow(live: LiveResidual, found: LiveJudgement) -> Floats:
     """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
     length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
     return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
@@ -235,7 +235,7 @@ def _status(d: LiveTally) -> Iterator[Block]:
     yield Items(tuple(f"note: {text}" for text in d.remarks[-_REMARKS:]))
 
 
-def residual(found: Judged) -> str:
+def residual(found: LiveJudgement) -> str:
     """Return a residual for people, with its size in σ."""
     return f"{numbers.length(found.length)} ({found.sigma:.1f} σ)"
 

@@ -27,7 +27,7 @@ SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Understood:
+class UnderstoodColumn:
     """One thing that the table holds.
 
     Attributes:
@@ -59,7 +59,7 @@ class Proposal:
     """
 
     sections: dict[str, dict[str, Any]] = field(default_factory=dict)
-    understood: list[Understood] = field(default_factory=list)
+    understood: list[UnderstoodColumn] = field(default_factory=list)
     unsure: list[tuple[str, str]] = field(default_factory=list)
     unused: list[tuple[str, str]] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
@@ -147,7 +147,7 @@ class Guesser:
         section = {key: names[0] if key == "column" else list(names)} | section
         self.proposal.sections[what] = section
         examples = tuple(self.grid.text(name)[0] for name in names)
-        self.proposal.understood.append(Understood(what, tuple(names), meaning, examples))
+        self.proposal.understood.append(UnderstoodColumn(what, tuple(names), meaning, examples))
         for name in names:
             self.free.pop(name, None)
 

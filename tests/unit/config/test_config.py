@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.cell import STANDARD_GRAVITY, cell_from_config
-from hilcal.config import CellConfig, Load, load_config
+from hilcal.config import CellConfig, CellLoad, load_config
 from hilcal.config.write import to_toml
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -310,11 +310,11 @@ def test_the_work_may_be_a_box(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("load", "hangs"),
     [
-        (Load(name="a", mass_kg=1.0), 0.3),
-        (Load(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
-        (Load(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
-        (Load(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1),
+        (CellLoad(name="a", mass_kg=1.0), 0.3),
+        (CellLoad(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
+        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
+        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1),
     ],
 )
-def test_only_a_load_with_a_mass_hangs_unless_told(load: Load, hangs: float) -> None:
+def test_only_a_load_with_a_mass_hangs_unless_told(load: CellLoad, hangs: float) -> None:
     assert load.hanging_m == hangs

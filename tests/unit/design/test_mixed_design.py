@@ -9,7 +9,7 @@ from hilcal.config import CellConfig
 from hilcal.design import mixed_design as condensing
 from hilcal.design.candidates import absolute_rows, deflection_rows, reading_derivatives
 from hilcal.design.choice import choose, objective_of
-from hilcal.design.information import Problem, problem
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.mixed_design import MixedDesign, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.prediction_poses import (
@@ -35,7 +35,7 @@ def config(mode: Mode) -> CellConfig:
     return found.model_copy(update={"repeatability": scatter})
 
 
-def scene(mode: Mode, *, fitted: bool) -> tuple[Problem, PredictionPoses]:
+def scene(mode: Mode, *, fitted: bool) -> tuple[DesignProblem, PredictionPoses]:
     known = config(mode)
     if fitted:
         c = campaign(mode=mode, poses=8, seed=3, registration_known=True)
@@ -46,7 +46,9 @@ def scene(mode: Mode, *, fitted: bool) -> tuple[Problem, PredictionPoses]:
     return of, prediction_poses(of.nominal, known, poses_of(5, 9))
 
 
-def mean_variance_of_all(of: Problem, work: PredictionPoses, mode: Mode, counts: Floats) -> float:
+def mean_variance_of_all(
+    of: DesignProblem, work: PredictionPoses, mode: Mode, counts: Floats
+) -> float:
     """tr(C M⁻¹) by all parameters as they are."""
     known, nominal = config(mode), of.nominal
     more, std = other_effects(nominal, known)

@@ -16,7 +16,7 @@ from hilcal.design.discriminated_pairs import (
     power,
     supported_parameters,
 )
-from hilcal.design.information import Problem, problem
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.next import DRAWS, measure_next
 from hilcal.design.nominal_model import after
 from hilcal.design.planner import Request
@@ -123,7 +123,7 @@ def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
 # how strong suspects are
 
 
-def told(effect: str, strength: float, seed: int = 2) -> tuple[Fit, Floats, Problem]:
+def told(effect: str, strength: float, seed: int = 2) -> tuple[Fit, Floats, DesignProblem]:
     c = campaign(effect, "deflection", seed, poses=10, strength=strength)
     found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
     config = config_of("deflection", against=(effect, LINK))

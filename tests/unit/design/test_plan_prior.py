@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilcal.cell import cell_from_config
-from hilcal.design.information import Problem, problem
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import nominal_model
 from hilcal.design.predicted import predicted
 from hilcal.errors import InputError
@@ -27,7 +27,7 @@ def learnt() -> Posterior:
     return Posterior.of(found)
 
 
-def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = NAMES) -> Problem:
+def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = NAMES) -> DesignProblem:
     config = configuration()
     planning = config.planning.model_copy(update={"model": names, "against": ()})
     config = config.model_copy(update={"planning": planning})
@@ -35,7 +35,7 @@ def problem_with(prior: CarriedPrior | None, names: tuple[str, ...] = NAMES) -> 
     return problem(nominal, config, np.unique(plan(4, 5).states.q, axis=0))
 
 
-def std(of: Problem) -> dict[str, float]:
+def std(of: DesignProblem) -> dict[str, float]:
     return predicted(of, np.ones(len(of.units))).by_name()
 
 

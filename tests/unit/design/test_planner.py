@@ -14,7 +14,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.feasible import Space
-from hilcal.design.information import Problem
+from hilcal.design.information import DesignProblem
 from hilcal.design.planner import Planned, Request, make
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
@@ -87,7 +87,7 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyP
     module = sys.modules["hilcal.design.planner"]
     reached, rounds = module._unreachable, []
 
-    def lost(space: Space, of: Problem, home: Floats, units: Ints) -> Ints:
+    def lost(space: Space, of: DesignProblem, home: Floats, units: Ints) -> Ints:
         chosen = {of.what[k][0] for k in units}
         odd = {pose for pose in chosen if pose % 2} if rounds else set()
         rounds.append(chosen)

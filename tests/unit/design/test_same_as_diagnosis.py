@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.design.discriminated_pairs import LEVEL, discriminated_pairs, estimate, pair_of, power
-from hilcal.design.information import Problem, problem
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import after
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.identification.baseline import baseline
@@ -23,7 +23,7 @@ TILT, LINK = "joint_tilt_compliance", "link_compliance"
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 
 
-def case(mode: Mode) -> tuple[Fit, Problem]:
+def case(mode: Mode) -> tuple[Fit, DesignProblem]:
     """A fit without tilting joints, which are there, and the design problem after it."""
     c = campaign(TILT, mode, 3, poses=10, strength=2.0, plan_seed=21)
     model = baseline(c.cell, c.readings, mode)
@@ -35,7 +35,7 @@ def case(mode: Mode) -> tuple[Fit, Problem]:
     return found, problem(after(found, config), config, poses_of(8, 21))
 
 
-def columns(of: Problem, found: Fit) -> dict[str, Floats]:
+def columns(of: DesignProblem, found: Fit) -> dict[str, Floats]:
     """Whitened columns of the families in the units of the design problem."""
     each = {e.name: effect_columns(found, e) for e in of.families}
     return {n: c.white * (of.scale[of.of_effect(n)] / c.scale) for n, c in each.items()}

@@ -7,26 +7,26 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.loads import Load
-from hilcal.design.information import Problem, problem
+from hilcal.config.loads import CellLoad
+from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import nominal_model, planned_effects
 from hilcal.design.planner import Request, make
 from hilcal.design.summary import summarise
-from hilcal.design.undetermined import Undetermined, without_undetermined
+from hilcal.design.undetermined import UndeterminedParameter, without_undetermined
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from tests.support.plan_cases import config_of, poses_of
 
-WEIGHT = Load(name="5kg", mass_kg=5.0)
-PULL = Load(name="pull x", force_N=(80.0, 0.0, 0.0))
+WEIGHT = CellLoad(name="5kg", mass_kg=5.0)
+PULL = CellLoad(name="pull x", force_N=(80.0, 0.0, 0.0))
 J1 = "joint_compliance.j1"
 
 
-def cell_with(*loads: Load, **planning: object) -> CellConfig:
+def cell_with(*loads: CellLoad, **planning: object) -> CellConfig:
     return config_of(**planning).model_copy(update={"loads": loads})
 
 
-def problem_of(config: CellConfig, count: int = 12) -> Problem:
+def problem_of(config: CellConfig, count: int = 12) -> DesignProblem:
     model = nominal_model(cell_from_config(config), config)
     return problem(model, config, poses_of(count))
 
@@ -69,8 +69,8 @@ def test_a_cell_that_determines_nothing_is_refused() -> None:
 
 
 def test_other_parameters_have_plain_words() -> None:
-    assert "changes with it" in Undetermined("tracker_scale.s", "1", 0.0).remark
-    slide = Undetermined("joint_compliance.j1", "m/N", 0.0, (), "joint 1").remark
+    assert "changes with it" in UndeterminedParameter("tracker_scale.s", "1", 0.0).remark
+    slide = UndeterminedParameter("joint_compliance.j1", "m/N", 0.0, (), "joint 1").remark
     assert "joint 1 needs a pull along it" in slide
 
 

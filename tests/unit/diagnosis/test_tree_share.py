@@ -5,7 +5,7 @@ import pytest
 from sklearn.ensemble import ExtraTreesRegressor
 
 from hilcal.diagnosis import tree_share as module
-from hilcal.diagnosis.tree_share import LEAF, PRECISE, Predicted, predicted
+from hilcal.diagnosis.tree_share import LEAF, PRECISE, TreePrediction, predicted
 from hilcal.types import Floats, Ints
 
 POSES, LOADS, FEATURES, FOLDS = 40, 3, 6, 5
@@ -78,4 +78,4 @@ def test_nothing_to_learn_from(how):
         y = np.zeros_like(y)
     else:
         x, y, fold = x[:0], y[:0], fold[:0]
-    assert predicted(x, y, fold) == Predicted(0.0, 0.0, 0)
+    assert predicted(x, y, fold) == TreePrediction(0.0, 0.0, 0)

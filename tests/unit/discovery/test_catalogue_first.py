@@ -10,10 +10,10 @@ import pytest
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.document import discovery_json
 from hilcal.discovery.known_effects import Instead, instead_of_law, known_effects, tells_more
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import screen
 from hilcal.discovery.search import LEAST, Selection
-from hilcal.discovery.terms import Term
+from hilcal.discovery.terms import LawTerm
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
@@ -23,11 +23,11 @@ from tests.unit.discovery.test_discover import campaign
 
 
 @cache
-def problem() -> Problem:
-    return Problem(screen(linearise(campaign())))
+def problem() -> SearchProblem:
+    return SearchProblem(screen(linearise(campaign())))
 
 
-def term(p: Problem, power: float) -> Term:
+def term(p: SearchProblem, power: float) -> LawTerm:
     """A displacement of joint 2 by a power of its torque."""
     (f,) = (
         k
@@ -36,7 +36,7 @@ def term(p: Problem, power: float) -> Term:
         and [(x.shape.name, x.numbers[:1]) for x in a.factors] == [("odd", (power,))]
     )
     (s,) = (k for k, o in enumerate(p.screen.sites) if (o.field, o.joint) == ("dq", 1))
-    return Term(((s, f),), 10.0)
+    return LawTerm(((s, f),), 10.0)
 
 
 @pytest.mark.parametrize(("power", "size", "more"), [(3.0, 300.0, False), (0.5, 300.0, True)])
@@ -64,7 +64,7 @@ def test_a_large_effect_is_named_by_its_exact_refit(shift: float, named: tuple[s
     By algebra the law is likelier by 20 in the logarithm of the odds, in either case.
     """
     fitted = _with_load_off(shift)
-    p = Problem(screen(linearise(fitted)))
+    p = SearchProblem(screen(linearise(fitted)))
     known = known_effects(fitted)
     assert known.names[0] == "load_point"
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
@@ -78,7 +78,7 @@ def test_no_refit_fails_in_silence(monkeypatch: pytest.MonkeyPatch) -> None:
         raise CannotAnswerError("it finds no equilibrium")
 
     fitted = _with_load_off(0.2)
-    p, known = Problem(screen(linearise(fitted))), known_effects(fitted)
+    p, known = SearchProblem(screen(linearise(fitted))), known_effects(fitted)
     law = Selection((term(p, 0.5),), (known.total + 20.0,))
     module = sys.modules[instead_of_law.__module__]
     with monkeypatch.context() as m:

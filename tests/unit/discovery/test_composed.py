@@ -12,7 +12,7 @@ from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.composed import Composed, composed
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.law import Form, Part
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen
 from hilcal.discovery.shapes import Shape
@@ -77,8 +77,8 @@ def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(
     places = [p for p in sites(6) if p.takes(True)]
     form = Form(
         (
-            Part(places[1], product(bent), 0),
-            Part(places[9], product(bent, waved(known["q_4"])), 1),
+            LawPart(places[1], product(bent), 0),
+            LawPart(places[9], product(bent, waved(known["q_4"])), 1),
         )
     )
     check_effect(effect_class(source_of_form(form, "tried"), "tried"))
@@ -87,7 +87,7 @@ def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(
 def test_a_bend_with_a_fractional_power_has_its_unit_and_its_formula() -> None:
     known = named(example())
     u = composed(((1.0, product(Factor(known["τ_2"], shapes.LINEAR), waved(known["q_5"]))),))
-    form = Form((Part(sites(6)[2], product(Factor(u, shapes.ABOVE_POWER, (5.0, 1.5))), 0),))
+    form = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE_POWER, (5.0, 1.5))), 0),))
     assert form.text() == "dq_3 = a·max(τ_2·cos(q_5) - 5, 0)^1.5"
     assert form.latex() == r"\delta q_3 = a\,\max(\tau_2\,\cos(q_5) - 5, 0)^{1.5}"
     assert form.unit(0) == "rad/((N·m)^1.5)"
@@ -153,7 +153,7 @@ def test_levels_weights_and_exponents_are_refined_together() -> None:
     other = product(Factor(known["τ_3"], shapes.LINEAR))
     u = composed(((1.0, lever), (0.4, other)))
     level = float(np.quantile(u.read(s), 0.5))
-    begin = Form((Part(sites(6)[2], product(Factor(u, shapes.ABOVE, (level,))), 0),))
+    begin = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE, (level,))), 0),))
     after = refine(at, begin)
     assert left_by(at, after, s) < 0.5 * left_by(at, begin, s)
     (bent,) = after.parts[0].amplitude.factors

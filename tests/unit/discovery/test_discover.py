@@ -13,14 +13,14 @@ from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery, discover
 from hilcal.discovery.document import discovery_json, laws_json
-from hilcal.discovery.law import Form, Part
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.refit import exact
 from hilcal.discovery.screen import Screen, screen
 from hilcal.discovery.search import Selection, search, worth_their_length
 from hilcal.discovery.sites import ORDINARY
-from hilcal.discovery.terms import Term
+from hilcal.discovery.terms import LawTerm
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import effect_class, source_of_form
 from hilcal.effects.catalogue import installed
@@ -151,7 +151,7 @@ def test_a_law_takes_a_name_and_a_file_that_are_free(
 
 @cache
 def searched() -> list[Selection]:
-    return search(Problem(screen(linearise(campaign(LAW)))))
+    return search(SearchProblem(screen(linearise(campaign(LAW)))))
 
 
 @pytest.mark.parametrize("stated", [0.5, 2.0])
@@ -186,11 +186,11 @@ def screened() -> Screen:
 
 def test_screening_is_what_the_columns_themselves_give() -> None:
     s = screened()
-    problem = Problem(s)
+    problem = SearchProblem(s)
     rng = np.random.default_rng(0)
     seen = np.argwhere(s.square > 0)
     for site, amplitude in rng.choice(seen, 40, replace=False).tolist():
-        x = problem.columns(Term(((site, amplitude),), 0.0))
+        x = problem.columns(LawTerm(((site, amplitude),), 0.0))
         exact = float(s.linear.information(x)[0, 0])
         assert s.square[site, amplitude] == pytest.approx(exact, rel=2e-2)
         slope = float(x[:, 0] @ problem.residual)
@@ -203,7 +203,7 @@ def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.Mon
     thinned = screen(linearise(campaign(LAW)))
     assert len(thinned.readings) <= 27
     assert not thinned.rows.all()
-    (first, *_) = search(Problem(thinned))
+    (first, *_) = search(SearchProblem(thinned))
     (known, *_) = searched()
     assert first.terms[0].parts == known.terms[0].parts
     assert first.total == pytest.approx(known.total, rel=1e-6)
@@ -214,7 +214,7 @@ def test_columns_of_the_written_effect_are_those_of_the_search() -> None:
     situation = f.solution.prediction.situation
     rng = np.random.default_rng(2)
     for site, amplitude in rng.choice(np.argwhere(s.square > 0), 6, replace=False).tolist():
-        form = Form((Part(s.sites[site], s.grammar.amplitudes[amplitude], 0),))
+        form = Form((LawPart(s.sites[site], s.grammar.amplitudes[amplitude], 0),))
         kind = effect_class(source_of_form(form, "tried"), "tried")
         effect = kind(f.model.cell, situation.states)
         own = effect_columns(f, effect)
@@ -259,21 +259,21 @@ def test_the_curve_of_a_law_lies_where_the_readings_are() -> None:
 
 def test_a_longer_law_has_to_be_more_likely_than_every_shorter_one() -> None:
     one, two, three = (
-        Selection((Term(((0, 0),), 0.0),) * k, odds)
+        Selection((LawTerm(((0, 0),), 0.0),) * k, odds)
         for k, odds in ((1, (182.3,)), (2, (171.9, 9.0)), (3, (171.9, 9.0, 5.0)))
     )
     assert worth_their_length([one, two, three]) == [one, three]
     assert worth_their_length([one, two]) == [one]
 
 
-def with_zero(symbol: str, *more: Part) -> Form:
+def with_zero(symbol: str, *more: LawPart) -> Form:
     """A law a·cos(q_4)·τ_3, and b times a quantity at the same site."""
     s = screened().linear.fit.solution.prediction.situation
     known = {v.symbol: v for v in variables(s)}
     wave, torque = Factor(known["q_4"], shapes.COS, (1.0,)), Factor(known["τ_3"], shapes.LINEAR)
     other = Factor(known[symbol], shapes.LINEAR)
     place = next(x for x in screened().sites if x.field == "dq" and x.element == 2)
-    both = Part(place, Amplitude((other,)), 0), Part(place, Amplitude((wave, torque)), 1)
+    both = LawPart(place, Amplitude((other,)), 0), LawPart(place, Amplitude((wave, torque)), 1)
     return Form((*both, *more))
 
 

@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.drawn_law import drawn_laws
-from hilcal.discovery.law import Form, Part
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import sites
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import source_of_form
@@ -30,8 +30,8 @@ SITUATION = example_situation(example_cell(), example_states(example_cell()))
 KNOWN = {v.symbol: v for v in variables(SITUATION)}
 JOINT = sites(6)[2]
 Q5 = Factor(KNOWN["q_5"], shapes.COS, (1.0,))
-PRODUCT = Form((Part(JOINT, Amplitude((Q5, Factor(KNOWN["τ_3"], shapes.LINEAR))), 0),))
-WAVE = Form((Part(JOINT, Amplitude((Factor(KNOWN["q_3"], shapes.COS, (96.0,)),)), 0),))
+PRODUCT = Form((LawPart(JOINT, Amplitude((Q5, Factor(KNOWN["τ_3"], shapes.LINEAR))), 0),))
+WAVE = Form((LawPart(JOINT, Amplitude((Factor(KNOWN["q_3"], shapes.COS, (96.0,)),)), 0),))
 
 
 @cache

@@ -10,7 +10,7 @@ from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.curve import curves
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.law import Form, Part
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import sites
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import effect_class
@@ -87,4 +87,4 @@ def test_units_of_the_sensors_own_quantities_cancel(quantities: tuple[str, ...],
     named = {v.symbol.removeprefix("f").partition(" ")[0].strip("("): v for v in known}
     factors = tuple(Factor(named[q], shapes.LINEAR) for q in quantities)
     site = next(s for s in sites(6) if s.symbol == "sensor_fz")
-    assert Form((Part(site, Amplitude(factors), 0),)).unit(0) == unit
+    assert Form((LawPart(site, Amplitude(factors), 0),)).unit(0) == unit

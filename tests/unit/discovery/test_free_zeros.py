@@ -3,10 +3,10 @@
 import numpy as np
 
 from hilcal.discovery.amplitudes import Amplitude
-from hilcal.discovery.problem import Problem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.search import search
-from hilcal.discovery.terms import Term
+from hilcal.discovery.terms import LawTerm
 from tests.unit.discovery.test_discover import screened
 
 
@@ -41,11 +41,11 @@ def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None
     """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
     s = screened()
     place, f, less, direction = _nearly_alike(s)
-    p = Problem(s)
+    p = SearchProblem(s)
     noise = 0.3 * np.random.default_rng(5).standard_normal(len(p.residual))
     p.residual = p._thin_residual = 40.0 * direction + p.model.project_out(noise)
     p.rss = float(p.residual @ p.residual)
-    alone = p.beside(()).score([Term(((place, k),), 0.0) for k in (f, less)])
+    alone = p.beside(()).score([LawTerm(((place, k),), 0.0) for k in (f, less)])
     assert all(c.score.gain < 0.05 * p.rss for c in alone)
     best = search(p, most=1)[0].terms[0]
     x = np.hstack([p.columns(best)])

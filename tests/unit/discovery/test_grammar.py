@@ -7,7 +7,7 @@ from hilcal.discovery import grammar as products
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.grammar import grammar
-from hilcal.discovery.law import Form, Part
+from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.sites import sites
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import effect_class, source_of_form
@@ -42,7 +42,10 @@ def test_every_function_is_an_effect_with_its_derivative() -> None:
         if not site.takes(True):
             site = places[0]
         form = Form(
-            (Part(site, Amplitude((factor, other)), 0), Part(places[1], Amplitude((factor,)), 1))
+            (
+                LawPart(site, Amplitude((factor, other)), 0),
+                LawPart(places[1], Amplitude((factor,)), 1),
+            )
         )
         check_effect(effect_class(source_of_form(form, "tried"), "tried"))
 
@@ -66,7 +69,7 @@ def test_a_one_sided_law_is_an_effect_also_where_nothing_hangs(
     cell = example_cell()
     s = example_situation(cell, example_states(cell))
     (torque,) = (v for v in variables(s) if v.symbol == f"τ_{joint}")
-    form = Form((Part(sites(6)[joint - 1], Amplitude((Factor(torque, shape, numbers),)), 0),))
+    form = Form((LawPart(sites(6)[joint - 1], Amplitude((Factor(torque, shape, numbers),)), 0),))
     check_effect(effect_class(source_of_form(form, "tried"), "tried"))
 
 

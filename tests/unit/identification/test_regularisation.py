@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.identification.gauss_newton_steps import Point, linear_problem
+from hilcal.identification.gauss_newton_steps import NewtonPoint, linear_problem
 from hilcal.identification.regularisation import LinearProblem
 from hilcal.regression.normal_equations import find_basis, normal_equations
 
@@ -17,7 +17,7 @@ def test_bases_and_normal_equations_of_one_problem_are_those_of_new_ones(depende
     a[:, 3] = a[:, 2] + (1e-3 if dependent else 1.0) * a[:, 3]
     scale = rng.uniform(0.5, 2.0, size=12)
     prior = np.where(np.arange(12) < 5, np.inf, rng.uniform(0.1, 1.0, size=12))
-    point = Point(np.zeros(12), np.zeros(12), float(white @ white), 300)
+    point = NewtonPoint(np.zeros(12), np.zeros(12), float(white @ white), 300)
 
     def new() -> LinearProblem:
         return linear_problem(point, prior, a.copy(), white, 300, 1.0, whitened=True)

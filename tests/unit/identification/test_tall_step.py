@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.identification.gauss_newton_steps import Point, linear_problem
+from hilcal.identification.gauss_newton_steps import NewtonPoint, linear_problem
 from hilcal.identification.regularisation import regularise
 from hilcal.regression.normal_equations import TALL
 from hilcal.types import Floats
@@ -22,7 +22,7 @@ def solved(a: Floats, white: Floats, scale: Floats) -> Floats:
     """Step of Gauss-Newton from zero, all parameters without a prior."""
     columns = a.shape[1]
     start, prior = np.zeros(columns), np.full(columns, np.inf)
-    point = Point(start, start, float(white @ white), white.size)
+    point = NewtonPoint(start, start, float(white @ white), white.size)
     linear = linear_problem(point, prior, a, white, len(a), 1.0, whitened=True)
     assert len(linear.a) == columns + 1
     assert linear.rows is a

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilcal.config import ForceSensor, Limits, Load, Motion, Tool
+from hilcal.config import CellLoad, ForceSensor, Limits, Motion, Tool
 from hilcal.measuring.clearance import clearance_of
 from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.feasibility import BETWEEN_M
@@ -124,7 +124,10 @@ def test_a_path_between_good_poses_may_be_bad() -> None:
 def test_torque_under_load_names_pose_load_joint_and_limit() -> None:
     bench = Bench(
         limits=WIDE,
-        loads=(Load(name="light", mass_kg=1.0), Load(name="pull", force_N=(0.0, 0.0, -300.0))),
+        loads=(
+            CellLoad(name="light", mass_kg=1.0),
+            CellLoad(name="pull", force_N=(0.0, 0.0, -300.0)),
+        ),
     )
     stretched = (0.0, -0.2, 0.3, -1.5, -1.5, 0.0)
     poses = {"reference": POSES["reference"], "stretched": stretched}
@@ -146,13 +149,13 @@ def test_torque_share(share: float, wrong: bool) -> None:
 @pytest.mark.parametrize(("mass", "wrong"), [(12.5 - 0.8, False), (12.5 - 0.8 + 1e-3, True)])
 def test_payload_counts_tool_and_load(mass: float, wrong: bool) -> None:
     sensor = ForceSensor(driver="x", port="y", max_force_N=1e3, max_moment_Nm=1e3)
-    bench = Bench(loads=(Load(name="heavy", mass_kg=mass),), force_sensor=sensor)
+    bench = Bench(loads=(CellLoad(name="heavy", mass_kg=mass),), force_sensor=sensor)
     found = problems(bench, plan_of(("p1", "none", 0), ("p1", "heavy", 0)))
     assert any("payload" in line and "heavy" in line for line in found) is wrong
 
 
 def test_a_pull_is_no_payload() -> None:
-    bench = Bench(loads=(Load(name="pull", force_N=(150.0, 0.0, 0.0)),), limits=WIDE)
+    bench = Bench(loads=(CellLoad(name="pull", force_N=(150.0, 0.0, 0.0)),), limits=WIDE)
     found = problems(bench, plan_of(("p1", "none", 0), ("p1", "pull", 0)))
     assert not any("payload" in line for line in found)
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config import ForceSensor, Limits, Load
+from hilcal.config import CellLoad, ForceSensor, Limits
 from hilcal.measuring.clearance import clearance_of
 from hilcal.measuring.devices import ArmSample
 from hilcal.measuring.guard import SLACK_M, Guard
@@ -121,7 +121,7 @@ def test_workspace_of_the_actual_pose(bench: Bench, side: str, axis: int) -> Non
 
 def test_what_hangs_stops_the_arm_when_it_is_told() -> None:
     """At 0.45 m a weight that hangs 0.5 m low is through the floor, and nothing else is."""
-    load = Load(name="long", mass_kg=2.0, hang_m=0.5)
+    load = CellLoad(name="long", mass_kg=2.0, hang_m=0.5)
     bench = Bench(loads=(load,), limits=Limits(), force_sensor=None)
     guard, here = Guard(bench.cell, bench.config), sample(bench, q=np.array(POSES["reference"]))
     assert guard.check(here) is None

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.config import ForceSensor, Load, Repeatability, Tool
+from hilcal.config import CellLoad, ForceSensor, Repeatability, Tool
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.progress import LiveResidual, ReadingStored, Remark
 from hilcal.measuring.repeatability import UnloadedVisit, repeatability
@@ -52,8 +52,8 @@ def test_wrench_is_measured_for_pulls_and_told_for_weights() -> None:
     real = b.config.model_copy(
         update={
             "loads": (
-                Load(name="3kg", mass_kg=3.03),
-                Load(name="pull", force_N=(38.0, 0.0, 0.0)),
+                CellLoad(name="3kg", mass_kg=3.03),
+                CellLoad(name="pull", force_N=(38.0, 0.0, 0.0)),
             )
         }
     )
@@ -70,7 +70,7 @@ def test_wrench_is_measured_for_pulls_and_told_for_weights() -> None:
 def test_use_of_the_force_sensor(use: str, force: float) -> None:
     settings = ForceSensor(driver="fake", port="nowhere", use=use)
     b = Bench(force_sensor=settings)
-    loads = (Load(name="3kg", mass_kg=3.03),)
+    loads = (CellLoad(name="3kg", mass_kg=3.03),)
     b.world.config = b.config.model_copy(update={"loads": loads})
     readings = measure(b, plan_of(*((p, x, 0) for x in ("none", "3kg") for p in POSES)))
     loaded = readings.states.wrench[rows(readings, "3kg")]

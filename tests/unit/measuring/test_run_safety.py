@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.config import Acquire, ForceSensor, Limits, Load
+from hilcal.config import Acquire, CellLoad, ForceSensor, Limits
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.progress import ReadingStored
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
@@ -59,7 +59,7 @@ def test_loads_change_only_at_the_reference_and_motions_carry_them() -> None:
     where: list[tuple[str, Any]] = []
     hang = b.operator.hang
 
-    def noted(load: Load | None, why: str) -> None:
+    def noted(load: CellLoad | None, why: str) -> None:
         where.append(("none" if load is None else load.name, b.world.q.copy()))
         hang(load, why)
 

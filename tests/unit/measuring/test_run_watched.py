@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilcal.config import Load
+from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
 from hilcal.measuring.measure import Measurer
@@ -24,7 +24,7 @@ def jogged(b: Bench, at: str, q: Any, *, after: int = 0) -> None:
     """Move the arm by hand during the question after `after` others for a load or none."""
     hang = b.operator.hang
 
-    def moved(load: Load | None, why: str) -> None:
+    def moved(load: CellLoad | None, why: str) -> None:
         hang(load, why)
         name = "none" if load is None else load.name
         if name == at and len(b.operator.asked) > after and not moves:
@@ -362,7 +362,7 @@ def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_ag
 def test_a_light_load_that_falls_before_the_tool_is_weighed_is_noticed() -> None:
     """Two unloaded readings do not weigh the tool; the tare holds it where the arm turns little."""
     load = "2kg"
-    b = Bench(loads=(Load(name=load, mass_kg=2.0, hang_m=0.1),))
+    b = Bench(loads=(CellLoad(name=load, mass_kg=2.0, hang_m=0.1),))
     steps = (("p1", "none", 0), ("p3", "none", 0), ("p1", load, 0), ("p3", load, 0))
     take, fell = b.rig.tracker.measure, []
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilcal.model.observe import Motion, Observation, motion, observe
+from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.statics import Load
@@ -32,7 +32,7 @@ def read(d: Deviation) -> Observation:
     return observe(CELL, evaluate(CELL.arm, Q, d), d)
 
 
-def motion_of(d: Deviation, m: int = 6) -> Motion:
+def motion_of(d: Deviation, m: int = 6) -> ReadingDerivative:
     chain = evaluate(CELL.arm, Q, d)
     return motion(CELL, observe(CELL, chain, d), chain, d, m)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.effects.protocol import Columns, Field
-from hilcal.model.observe import Motion
+from hilcal.model.observe import ReadingDerivative
 from hilcal.model.reading_columns import WIDE, ReadingColumns
 from hilcal.types import Floats, Ints
 from tests.unit.model.test_observe import COUNT, FULL, NO_LOAD, motion_of
@@ -41,7 +41,7 @@ def wide(rng: np.random.Generator) -> tuple[Columns, Ints]:
     return Columns("dq", np.arange(WIDE), element, values), np.arange(WIDE) + 20
 
 
-def expected(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats) -> Floats:
+def expected(moves: ReadingDerivative, blocks: list[tuple[Columns, Ints]], scale: Floats) -> Floats:
     """Sum them one by one."""
     out = np.zeros((COUNT, moves.m, SIZE))
     fields = ("base", "station", "target", "observer")
@@ -61,7 +61,9 @@ def expected(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats) -
     return out
 
 
-def written(moves: Motion, blocks: list[tuple[Columns, Ints]], scale: Floats | None) -> Floats:
+def written(
+    moves: ReadingDerivative, blocks: list[tuple[Columns, Ints]], scale: Floats | None
+) -> Floats:
     columns, out = (
         ReadingColumns(moves, [], NO_LOAD, scale),
         np.full((COUNT, moves.m, SIZE), np.nan),

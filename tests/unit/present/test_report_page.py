@@ -29,8 +29,8 @@ from hilcal.present.html.first_screen import (
 from hilcal.present.html.sections import page as page_of
 from hilcal.present.html.sections import sections
 from hilcal.present.story import Chapter
-from hilcal.refinement import Refinement, Step
-from hilcal.store.overview import Instrument
+from hilcal.refinement import Refinement, RefinementStep
+from hilcal.store.overview import MeasuringDevice
 from tests.support.browser import DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.picture import pixels
 from tests.support.report_pages import EVIL, opened, small_content
@@ -96,7 +96,9 @@ def large(m: ReportContent) -> ReportContent:
         told, revisions=many, pose_names=named, pose=np.arange(len(told)),
         time_s=60.0 * np.arange(len(told)),
     )  # fmt: skip
-    one = Instrument("tracker", "leica", "Leica AT960-MR", "750123", {"firmware": "3.1"}, m.made)
+    one = MeasuringDevice(
+        "tracker", "leica", "Leica AT960-MR", "750123", {"firmware": "3.1"}, m.made
+    )
     overview = replace(m.overview, instruments=(one,) * 5)
     return replace(plain(m), story=story, overview=overview)
 
@@ -199,7 +201,10 @@ def test_results_show_themselves_in_a_notebook(made) -> None:
     for result, words in (
         (m.fit, numbers.length(m.fit.holdout.rms_m)),
         (m.diagnosis, m.diagnosis.suspects[0].effect),
-        (Refinement((Step(m.fit, m.diagnosis, None),)), m.diagnosis.verdict.replace("_", " ")),
+        (
+            Refinement((RefinementStep(m.fit, m.diagnosis, None),)),
+            m.diagnosis.verdict.replace("_", " "),
+        ),
     ):
         text = result._repr_html_()
         assert words in text

@@ -6,7 +6,7 @@ import pytest
 from drivers.simulated.rehearsal import planned_states
 from hilcal.cell import cell_from_config
 from hilcal.design.feasible import Space
-from hilcal.design.run_order import Block, Stop, assembled
+from hilcal.design.run_order import LoadBlock, PlannedStop, assembled
 from hilcal.procedure.validation_plan import fewer_returns
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
@@ -27,13 +27,13 @@ def test_a_loaded_reading_keeps_its_unloaded_one(space: Space, seed: int) -> Non
     each = np.array_split(np.arange(1, 13), 2)
     loads = [load.name for load in space.config.loads]
 
-    def loops(poses: np.ndarray) -> tuple[tuple[Stop, ...], ...]:
+    def loops(poses: np.ndarray) -> tuple[tuple[PlannedStop, ...], ...]:
         parts = np.array_split(poses, rng.integers(1, 5))
-        return tuple(tuple(Stop(int(p), 0) for p in part) for part in parts)
+        return tuple(tuple(PlannedStop(int(p), 0) for p in part) for part in parts)
 
-    before = Block(UNLOADED, loops(np.arange(1, 13)), 1.0)
-    blocks = [Block(load, loops(own), 1.0) for load, own in zip(loads, each, strict=True)]
-    steps = assembled(names, before, blocks, Block(UNLOADED, (), 0.0))
+    before = LoadBlock(UNLOADED, loops(np.arange(1, 13)), 1.0)
+    blocks = [LoadBlock(load, loops(own), 1.0) for load, own in zip(loads, each, strict=True)]
+    steps = assembled(names, before, blocks, LoadBlock(UNLOADED, (), 0.0))
     plan = Plan((REFERENCE, *names), rng.normal(size=(13, 6)), steps)
     kept = fewer_returns(plan, space, space.config).steps
     unloaded = {(s.pose, s.cycle) for s in kept if s.load == UNLOADED}

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.regression.evidence import NOTHING, STRENGTHS, score_family
-from hilcal.regression.forward_selection import Families, forward_selection
+from hilcal.regression.forward_selection import CandidateFamilies, forward_selection
 from hilcal.regression.spectrum import visible
 from hilcal.types import Floats
 from tests.support.regression_cases import KINDS, Problem, problem
@@ -83,7 +83,9 @@ def test_evidences_of_a_chain_add_up() -> None:
     of = with_priors(family=6)
     columns = {"a": slice(0, 2), "b": slice(2, 3), "c": slice(3, 6)}
     r = of.dense @ of.y
-    start = Families(of.projection.information(of.x), of.x.T @ r, float(of.y @ r), DOF, columns)
+    start = CandidateFamilies(
+        of.projection.information(of.x), of.x.T @ r, float(of.y @ r), DOF, columns
+    )
     variance, total, names = np.zeros(6), 0.0, []
     for step in forward_selection(start, 9):
         variance[columns[step.name]] = 1 / step.score.ridge

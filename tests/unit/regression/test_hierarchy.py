@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from hilcal.regression.hierarchy import FALSE_ALARM, Found, hierarchy
+from hilcal.regression.hierarchy import FALSE_ALARM, FleetEstimates, hierarchy
 from hilcal.types import Floats
 
 ARMS, TIMES, SIZE = 30, 2, 6
@@ -14,7 +14,7 @@ WITHIN = 0.1
 
 def fleet(
     seed: int, *, odd: tuple[int, int, float] | None = None, slope: float = 0.0
-) -> tuple[Found, Floats]:
+) -> tuple[FleetEstimates, Floats]:
     """Campaigns of 30 arms, two months each; nobody determines parameter 0 of the first five."""
     rng = np.random.default_rng(seed)
     arm, time = np.repeat(np.arange(ARMS), TIMES), np.tile(np.arange(TIMES) / 1.0, ARMS)
@@ -30,7 +30,7 @@ def fleet(
     noise = np.einsum("crk,cr->ck", rows, rng.normal(size=rows.shape[:2]))
     mean = theta + np.einsum("ckl,cl->ck", np.linalg.pinv(information, rcond=1e-12), noise)
     mean[:5, 0] = 99.0  # of no meaning
-    return Found(mean, information, arm, time), mu
+    return FleetEstimates(mean, information, arm, time), mu
 
 
 def test_spreads_and_means_are_recovered_within_their_sampling_errors() -> None:
@@ -75,7 +75,9 @@ def test_common_drift_is_found_beside_the_changes_of_single_arms() -> None:
 def test_arms_measured_once_have_one_spread() -> None:
     of, _ = fleet(6)
     once = of.time == 0
-    h, _ = hierarchy(Found(of.mean[once], of.information[once], of.arm[once], of.time[once]))
+    h, _ = hierarchy(
+        FleetEstimates(of.mean[once], of.information[once], of.arm[once], of.time[once])
+    )
     assert not h.within.any()
     assert not h.slope.any()
     assert h.between[5] > h.between[0]

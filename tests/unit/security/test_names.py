@@ -54,7 +54,7 @@ from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted
 from hilcal.present.charts import style as chart_style
 from hilcal.present.charts.style import label as in_chart
-from hilcal.present.document import Chart, Items, Section, Words, table
+from hilcal.present.document import Chart, Items, PageSection, Words, table
 from hilcal.present.html import page
 from hilcal.present.html.page import FirstScreen
 from hilcal.present.progress import SafeConsole, counting, working
@@ -317,7 +317,7 @@ def report(name: str) -> str:
         Chart(name, figure),
     )
     first = FirstScreen(name, "good", ((name, name),), (), name, True)
-    return page.render(name, name, first, (Section("a", name, parts),))
+    return page.render(name, name, first, (PageSection("a", name, parts),))
 
 
 @settings(max_examples=12, deadline=None)
@@ -533,13 +533,13 @@ CALIBRATION: list = []
 def _made(tmp_path_factory: pytest.TempPathFactory):
     from hilcal.discovery import shapes
     from hilcal.discovery.amplitudes import Factor
-    from hilcal.discovery.law import Form, Part
+    from hilcal.discovery.law import Form, LawPart
     from hilcal.discovery.sites import sites
     from tests.unit.discovery.test_composed import example, named, product
 
     FOLDER.append(tmp_path_factory.mktemp("names"))
     linear = product(Factor(named(example())["τ_2"], shapes.LINEAR))
-    FORM.append(Form((Part(sites(6)[2], linear, 0),)))
+    FORM.append(Form((LawPart(sites(6)[2], linear, 0),)))
     CALIBRATION.append(json.loads(json.dumps(storage.to_json(calibrated("encoder_offset")))))
     patched = pytest.MonkeyPatch()
     patched.setattr(page, "get_plotlyjs", lambda: "")  # 4 MB that no name is in

@@ -16,7 +16,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.se3 import rotation_vector
 from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, experiments, scaling_study
-from hilcal.study.scaling_design import TARGET, WRENCHES, Design, bound, make_design
+from hilcal.study.scaling_design import TARGET, WRENCHES, StudyDesign, bound, make_design
 from hilcal.study.scaling_table import CURVES, table
 from hilcal.types import Floats
 
@@ -30,12 +30,12 @@ def study() -> ScalingStudy:
 
 
 @pytest.fixture(scope="module")
-def design() -> Design:
+def design() -> StudyDesign:
     """What the study draws first."""
     return make_design(np.random.default_rng(SEED), load_arm("ur10e"), 30)
 
 
-def dense(design: Design, rho: float, shared: bool) -> tuple[Floats, Floats]:
+def dense(design: StudyDesign, rho: float, shared: bool) -> tuple[Floats, Floats]:
     """Observation matrix (D, n) and covariance (D, D) of all deflections, written out."""
     poses, loads = design.observation.shape[:2]
     between = np.eye(loads) + np.ones((loads, loads)) if shared else 2 * np.eye(loads)
@@ -82,7 +82,7 @@ def test_neither_is_luck(seed: int) -> None:
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.99])
 def test_monte_carlo_agrees_with_the_exact_law(
-    study: ScalingStudy, design: Design, rho: float, shared: bool
+    study: ScalingStudy, design: StudyDesign, rho: float, shared: bool
 ) -> None:
     """Cov(ĉ) = K V Kᵀ for every scaling and unit; coverage of stated normal intervals."""
     a, v = dense(design, rho, shared)
@@ -139,7 +139,7 @@ def test_shared_unloaded_reading_is_used_by_gc_alone(study: ScalingStudy) -> Non
 # --- the experiment -------------------------------------------------------------------------
 
 
-def test_poses_are_feasible_and_the_arm_repeats_as_said(design: Design) -> None:
+def test_poses_are_feasible_and_the_arm_repeats_as_said(design: StudyDesign) -> None:
     arm = design.arm
     assert np.all((design.q >= arm.q_min) & (design.q <= arm.q_max))
     chain = evaluate(arm, design.q)
@@ -152,7 +152,7 @@ def test_poses_are_feasible_and_the_arm_repeats_as_said(design: Design) -> None:
         assert np.linalg.eigvalsh(v / (design.std[:, :, None] * design.std[:, None])).min() > 0.005
 
 
-def test_observation_matrix_is_the_motion_under_load(design: Design) -> None:
+def test_observation_matrix_is_the_motion_under_load(design: StudyDesign) -> None:
     """Joints turned by c τ, with τ from virtual work, move the target by A c."""
     c = np.array([2, 3, 4, 10, 12, 15]) * 1e-9
     zero = evaluate(design.arm, design.q)
@@ -168,7 +168,7 @@ def test_observation_matrix_is_the_motion_under_load(design: Design) -> None:
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_bound_is_the_inverse_of_the_dense_information(design: Design, shared: bool) -> None:
+def test_bound_is_the_inverse_of_the_dense_information(design: StudyDesign, shared: bool) -> None:
     a, v = dense(design, 0.9, shared)
     expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
     found = bound(design, design.covariance(0.9), shared)

@@ -12,20 +12,20 @@ from nicegui.testing import User, user_simulation
 
 from hilcal.diagnosis.diagnosis import Reason
 from hilcal.present.verdict import HEADLINES
-from hilcal.workbench.page import Shared, View
-from hilcal.workbench.session import Session
+from hilcal.workbench.page import TabsShared, View
+from hilcal.workbench.session import WorkbenchSession
 from tests.support.bench_cases import few_effects, stored
 
 
 @pytest.fixture(scope="module")
-def session(tmp_path_factory: pytest.TempPathFactory) -> Session:
-    made = Session(stored(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects())
+def session(tmp_path_factory: pytest.TempPathFactory) -> WorkbenchSession:
+    made = WorkbenchSession(stored(tmp_path_factory.mktemp("page") / "run.hilcal"), few_effects())
     made.load()
     return made
 
 
 @asynccontextmanager
-async def opened(shared: Shared) -> AsyncIterator[User]:
+async def opened(shared: TabsShared) -> AsyncIterator[User]:
     def page() -> None:
         view = View(shared, "http://test/")
         view.build()
@@ -50,7 +50,7 @@ def simulated(do: Callable[[], Awaitable[None]]) -> None:
 
 @pytest.mark.parametrize("reason", get_args(Reason))
 def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
-    session: Session, reason: Reason, monkeypatch: pytest.MonkeyPatch
+    session: WorkbenchSession, reason: Reason, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where no effect is listed, whatever the verdict."""
     monkeypatch.setattr("hilcal.workbench.cards.message", lambda d: "the sentence")
@@ -58,11 +58,11 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
     assert snapshot is not None
     judged = replace(snapshot.diagnosis, reason=reason, suspects=())
     last = replace(snapshot.chapters[-1], diagnosis=judged)
-    shown = Session(session.path, few_effects())
+    shown = WorkbenchSession(session.path, few_effects())
     shown.snapshot = replace(snapshot, chapters=(*snapshot.chapters[:-1], last))
 
     async def look() -> None:
-        async with opened(Shared(shown)) as user:
+        async with opened(TabsShared(shown)) as user:
             await user.should_see("No effect passes the tests by itself")
             said = " ".join(seen(user, ui.html, "innerHTML") + seen(user, ui.label, "")).lower()
             first = {v: words.split(":")[0] for v, words in HEADLINES.items()}
@@ -74,9 +74,9 @@ def test_nothing_but_the_verdict_says_whether_an_effect_is_missing(
     simulated(look)
 
 
-def test_an_answer_appears_at_its_button_and_stays(session: Session) -> None:
+def test_an_answer_appears_at_its_button_and_stays(session: WorkbenchSession) -> None:
     async def look() -> None:
-        shared = Shared(session)
+        shared = TabsShared(session)
         before = session.path.read_bytes()
         async with opened(shared) as user:
             for label, text in (("[tool] mass_kg", "two kilos"), ("[tool] com_m", "[0, 0, 0.07]")):

@@ -16,7 +16,7 @@ from hilcal.identification.carried import carried_prior
 from hilcal.present.campaign import left_out_m, two_revisions, verdict_of
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.whole_file import replace_file
-from hilcal.workbench.session import Session
+from hilcal.workbench.session import WorkbenchSession
 from tests.support.bench_cases import BASE, few_effects, stored
 from tests.support.campaigns import campaign, configuration
 
@@ -33,7 +33,7 @@ def revisions(path: Path) -> list[tuple[str | None, str | None, int | None]]:
 
 def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
     before = run.read_bytes()
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     assert (run.read_bytes(), list(run.parent.iterdir())) == (before, [run])  # only looked at
     assert (snapshot.number, snapshot.records, snapshot.in_use) == (None, (), None)
@@ -100,7 +100,7 @@ def test_an_operator_adds_removes_and_goes_back(run: Path) -> None:
 
 def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
     """A verdict that doubts an addition doubts it in another cell, too, also when read again."""
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     mass = {("tool", "mass_kg"): "1.4"}
     with pytest.raises(InputError, match="no value differs from what is used already"):
@@ -112,11 +112,11 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
     assert (found.number, found.changes) == (3, {"tool": {"mass_kg": 1.4}})
     assert found.diagnosis.history == added.diagnosis.history
     assert found.diagnosis.verdict == added.diagnosis.verdict
-    again = Session(run, few_effects()).load()
+    again = WorkbenchSession(run, few_effects()).load()
     assert (again.number, again.diagnosis.verdict) == (3, found.diagnosis.verdict)
     assert [c.number for c in again.chapters] == [3]
     assert next(f.text for f in again.figures if f.key == "mass_kg") == "1.4"
-    before = Session(run, few_effects()).load(revision=2)
+    before = WorkbenchSession(run, few_effects()).load(revision=2)
     assert (before.changes, before.diagnosis.verdict) == ({}, added.diagnosis.verdict)
     rows = {row.what: row for row in two_revisions(*again.records[1:])}
     assert (rows["cell"].second, rows["model"].difference) == ("[tool] mass_kg = 1.4", "")
@@ -124,7 +124,7 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
 
 
 def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, tmp_path: Path) -> None:
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     name, content = session.document(session.load(), "calibration")
     assert name == "run-calibration.json"
     kept = session.snapshot
@@ -135,7 +135,7 @@ def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, tmp_path: Path) 
 
 
 def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     with Campaign.open(run, few_effects()) as o:
         o.append(snapshot.fit)
@@ -160,7 +160,7 @@ def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
         prior = carried_prior(o.posterior(), "arm", {}, o.catalogue)
     with Campaign.open(later, few_effects()) as o:
         o.append(fitted_with(prior, o, o.fit_in_use()[1]))
-    anew = Session(later, few_effects()).fit_anew(None)
+    anew = WorkbenchSession(later, few_effects()).fit_anew(None)
     kept = anew.fit.model.prior
     assert kept is not None
     assert kept.with_drift(None).to_json() == prior.to_json()  # the drift is chosen anew
@@ -169,7 +169,7 @@ def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
 
 
 def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     exists = run.with_name("there.json")
     exists.touch()
@@ -182,7 +182,7 @@ def test_a_plan_names_what_it_separates_or_why_there_is_none(run: Path) -> None:
 
 
 def test_the_readings_that_were_picked_are_told_apart(run: Path) -> None:
-    session = Session(run, few_effects())
+    session = WorkbenchSession(run, few_effects())
     snapshot = session.load()
     story = snapshot.story
     pulled = np.flatnonzero(np.array(story.load_names) == "pull y")

@@ -19,7 +19,7 @@ from hilcal.calibration.programs.branch import flags_of, resolve, unlike
 from hilcal.calibration.programs.fanuc import LS
 from hilcal.calibration.programs.inform import INFORM
 from hilcal.calibration.programs.krl import KRL
-from hilcal.calibration.programs.languages import Understood, understood
+from hilcal.calibration.programs.languages import UnderstoodProgram, understood
 from hilcal.calibration.programs.program import UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import RAPID
 from hilcal.errors import InputError
@@ -155,7 +155,9 @@ def flange(maker: str, q: tuple[float, ...]) -> Floats:
     return np.array(data.oMf[model.getFrameId("tool0")].homogeneous)
 
 
-def read(maker: str, arms: dict[str, Arm], folder: Path = EXAMPLES, **more: object) -> Understood:
+def read(
+    maker: str, arms: dict[str, Arm], folder: Path = EXAMPLES, **more: object
+) -> UnderstoodProgram:
     e = EXAMPLE[maker]
     frames = None if e.frames is None else EXAMPLES / e.frames
     return understood(folder / e.file, arms[maker], frames=frames, **more)  # type: ignore[arg-type]
