@@ -27,6 +27,7 @@ from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
 from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
 from drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
 from drivers.ur_link.survey import survey
+from drivers.ur_link.torque_reader import TORQUE, TorqueReader
 from drivers.ur_link.worker import WorkerError
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
@@ -58,8 +59,10 @@ class UrArm:
         generation: Generation,
         silent: str,
         receiver: Receiver,
+        torques: TorqueReader | None = None,
     ) -> None:
         """Use an open link; `open_arm` makes one."""
+        self._torques = torques
         self._host, self._hz, self._model = host, hz, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock
         self._controller, self._generation, self._silent = controller, generation, silent
@@ -74,7 +77,8 @@ class UrArm:
     @property
     def workers(self) -> tuple[int, ...]:
         """Numbers of the processes that receive and, under control, command."""
-        return (self._receiver.pid, *(() if self._control is None else (self._control.pid,)))
+        told = () if self._torques is None else self._torques.pids
+        return (self._receiver.pid, *(() if self._control is None else (self._control.pid,)), *told)
 
     def report(self) -> Report:
         """Say who answered, versions, state, and every problem at once; moves nothing."""
@@ -102,7 +106,10 @@ class UrArm:
 
     def sample(self) -> ArmSample:
         """Return a sample that is newer than the call; see `Arm.sample`."""
-        return self._read().sample
+        sample = self._read().sample
+        if self._torques is None or self._motion is not None:
+            return sample
+        return replace(sample, torque=self._torques.mean())
 
     def take_control(self, mass: float, com: Floats) -> None:
         """Become the one who commands the arm, and set its payload; see `Arm.take_control`."""
@@ -116,6 +123,8 @@ class UrArm:
                 self._receiver.renew(_RECEIVE_S)
             except LinkError as error:
                 raise failure(self._host, str(error), CHECK_LINK) from None
+        if self._torques is not None:
+            self._torques.renew()
         self._silent = why_silent(self._generation.supervision, _ASK_S)
         if self._silent:
             raise failure(self._host, f"cannot take control: {self._silent}")
@@ -247,6 +256,8 @@ class UrArm:
             self._end_program()
         with contextlib.suppress(Exception):
             self._receiver.close()
+        if self._torques is not None:
+            self._torques.close()
 
     def _in_control(self) -> Control:
         if self._control is None:
@@ -348,16 +359,19 @@ def open_arm(config: CellConfig) -> UrArm:
         raise InputError(_lacking(sys.version_info[:2]))
     receiver = None
     try:
-        controller = probe.controller(host, OUTPUTS, _PROBE_S)
+        controller = probe.controller(host, (*OUTPUTS, TORQUE), _PROBE_S)
+        outputs = tuple(name for name in controller.outputs if name != TORQUE)
         missing = set(OUTPUTS) - OPTIONAL - set(controller.outputs)
         if missing:
             version = states.version_word(controller.version)
             raise failure(host, f"its version {version} lacks {', '.join(sorted(missing))}")
         how = generation(host, controller.version, options.robot_api_port)
         silent = why_silent(how.supervision, _ASK_S)
-        receiver = Receiver(host, options.receive_hz, controller.outputs, _RECEIVE_S)
+        receiver = Receiver(host, options.receive_hz, outputs, _RECEIVE_S)
     except LinkError as error:
         raise failure(
             host, str(error), "check that the controller is on and [robot] host"
         ) from None
-    return UrArm(config, host, options.receive_hz, controller, how, silent, receiver)
+    told = TORQUE in controller.outputs
+    torques = TorqueReader(host, options.receive_hz) if told else None
+    return UrArm(config, host, options.receive_hz, controller, how, silent, receiver, torques)

@@ -68,6 +68,7 @@ def validate(
         fitted=int(known.sum()),
         spoilt=int(np.sum(~known & ~fresh)) if mixed else 0,
         unseen=mixed or not known.any(),
+        scalar=bool(there.scalar.any()),
     )
     if limit_m is None and judged.unseen:
         limit_m = run.config.limits.accuracy_m

@@ -21,7 +21,7 @@ class LinkError(Exception):
 
 
 class Connection:
-    """An open connection; every call ends before the deadline given at the opening."""
+    """An open connection; every call ends before the deadline, given at the opening at first."""
 
     def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
         """Connect.
@@ -49,6 +49,10 @@ class Connection:
             raise LinkError(f"the {self._where} does not answer within {seconds:g} s") from None
         except OSError as error:
             raise LinkError(f"the {self._where}: {error.strerror or error}") from None
+
+    def extend(self, seconds: float) -> None:
+        """Set a new deadline, from now."""
+        self._seconds, self._end = seconds, time.monotonic() + seconds
 
     def send(self, data: bytes) -> None:
         """Send everything.

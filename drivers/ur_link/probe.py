@@ -56,13 +56,36 @@ def check_stream(host: str, seconds: float) -> None:
     Raises:
         LinkError: nobody answers, or no data come.
     """
-    with Connection(host, PORT, "RTDE server", seconds) as line:
+    with stream(host, _STREAM_HZ, ("timestamp",), seconds) as line:
+        packet(line)
+
+
+def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Connection:
+    """Return a connection on which packets of outputs, which the controller has, come.
+
+    Raises:
+        LinkError: nobody answers, or not as a controller does.
+    """
+    line = Connection(host, PORT, "RTDE server", seconds)
+    try:
         _hello(line)
-        line.send(_frame("O", struct.pack(">d", _STREAM_HZ) + b"timestamp"))
+        line.send(_frame("O", struct.pack(">d", hz) + ",".join(outputs).encode()))
         _reply(line, "O", None)
         line.send(_frame("S"))
         _reply(line, "S", 1)
-        _reply(line, "U", None)
+    except BaseException:
+        line.close()
+        raise
+    return line
+
+
+def packet(line: Connection) -> bytes:
+    """Return the next packet of a stream: the number of the recipe (u8) and the outputs.
+
+    Raises:
+        LinkError: none comes before the connection's deadline.
+    """
+    return _reply(line, "U", None)
 
 
 def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:

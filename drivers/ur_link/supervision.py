@@ -49,7 +49,8 @@ class Generation:
         supervision: its dashboard server or Robot API.
         script_port: takes programs: the real-time port, of PolyScope X the primary one.
         upper: whether commands go by the upper half of the registers (24 to 47), which no fieldbus
-            uses. ur_rtde 1.6.5 takes them on PolyScope 5 only, and the lower half on any newer one.
+            uses. ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any
+            newer one, where the flag for the upper half would leave program and client apart.
     """
 
     supervision: Supervision
@@ -67,7 +68,7 @@ def generation(host: str, version: tuple[int, ...], api_port: int) -> Generation
     """Return how the controller of a version is supervised and commanded."""
     if version[0] >= POLYSCOPE_X:
         return Generation(RobotApi(host, api_port), PRIMARY_PORT, upper=False)
-    return Generation(Dashboard(host), REALTIME_PORT, upper=True)
+    return Generation(Dashboard(host), REALTIME_PORT, upper=version[:2] < (5, 23))
 
 
 def why_silent(supervision: Supervision, seconds: float) -> str:

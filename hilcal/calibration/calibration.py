@@ -113,6 +113,8 @@ class Calibration:
         if found.scaling != "gc":
             raise InputError(f"a calibration needs scaling gc, this fit has {found.scaling}")
         used, model = found.readings[~found.outlier], found.model
+        if not model.cell.measured_torques:  # nothing follows from them
+            used = replace(used, states=replace(used.states, torque=None))
         left_out = found.holdout.rms_sigma
         prior = found.solution.prior
         p = predictive(model, found.theta, prior, used, found.mode, left_out)

@@ -432,7 +432,7 @@ def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
         refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
     rows = rows_of(refined["revisions"], found.steps)
     t.show(revisions_table([r.shown for r in rows]))
-    t.show([key(), verdict_line(found.diagnosis), ""])
+    t.show([key(found.fit.readings), verdict_line(found.diagnosis), ""])
     t.show(prior_lines(found.fit))
 
 

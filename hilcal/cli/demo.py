@@ -303,7 +303,7 @@ def demo(
         if laws is not None:
             t.show(refined_laws(laws))
         t.show(heading("The error, revision by revision"))
-        t.show([revisions_table([r.shown for r in rows]), key()])
+        t.show([revisions_table([r.shown for r in rows]), key(rows[-1].fit.readings)])
         truth = compared(found.steps[-1].fit, r.world.truth)
         if truth:
             t.show(heading("What was found against what is true"))

@@ -189,7 +189,7 @@ def _change(
             RevisionRow(number, before, verdict, stored.added, stored.removed),
             RevisionRow(c.number, c.fit, d.verdict, c.added, c.removed),
         ]
-        t.show([revisions_table([r.shown for r in rows]), key()])
+        t.show([revisions_table([r.shown for r in rows]), key(c.fit.readings)])
         named = write_effect(effect, options or {})
         t.show(fell(before, c.fit, named) if adds else rose(before, c.fit, effect))
         t.show([] if c.expected is None else addition_lines(c.expected))
@@ -297,7 +297,7 @@ def refine(
             numbered = (*begun, *o.append_records(records, *begun))
             rows = rows_of(numbered, found.steps)
         t.show(revisions_table([r.shown for r in rows]))
-        t.show(key())
+        t.show(key(rows[-1].fit.readings))
         t.show(options_line(rows[-1].fit))
         if o.noise is not None:
             t.show(numbers.sentence(covariance_words(o.covariance_parts, o.noise)))

@@ -99,9 +99,11 @@ class Situation:
         Of a joint that slides the force along it, N. As measured where the cell says so
         (`Cell.measured_torques`) and they were.
         """
-        if self.torque_measured and self.states.torque is not None:
-            return -self.states.torque
-        return self.cell.arm.drive_torques(self.along(self.wrench))
+        measured = self.states.torque if self.torque_measured else None
+        if measured is not None and not np.isnan(measured).any():
+            return -measured
+        modelled = self.cell.arm.drive_torques(self.along(self.wrench))
+        return modelled if measured is None else np.where(np.isnan(measured), modelled, -measured)
 
     def along(self, change: Floats) -> Floats:
         """Torques or forces (..., n) along the joints, of slot wrenches (..., n + 1, 6)."""

@@ -28,6 +28,7 @@ class Judged:
         fitted: those of them that the revision was fitted to.
         spoilt: further ones whose unloaded reading was fitted.
         unseen: whether those that are judged were never fitted; False where all were.
+        scalar: whether some readings are one number, a distance or a height.
     """
 
     number: int | None
@@ -36,6 +37,7 @@ class Judged:
     fitted: int
     spoilt: int
     unseen: bool
+    scalar: bool = False
 
     @property
     def model(self) -> str:
@@ -45,7 +47,9 @@ class Judged:
     @property
     def what(self) -> str:
         """The measurements, in words."""
-        return "deflections" if self.mode == "deflection" else "positions"
+        if self.mode == "deflection":
+            return "deflections"
+        return "readings" if self.scalar else "positions"
 
 
 @dataclass(frozen=True, slots=True)

@@ -140,7 +140,7 @@ def summary(
     lines = [f"{' + '.join(names) or 'nominal arm'}, fitted to {fitted}"]
     for what, e in zip(("fitted poses", "poses left out"), errors, strict=True):
         lines.append(
-            f"  3-D error on {what}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "
+            f"  error on {what}: {1e6 * e.rms_m:.1f} µm rms, {1e6 * e.max_m:.1f} µm largest, "
             f"{e.rms_sigma:.2f} σ"
         )
     lines.append(f"  variance factor {variance_factor:.3g} [{interval[0]:.3g}, {interval[1]:.3g}]")

@@ -25,6 +25,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine
 from hilcal.identification.registration import register
 from hilcal.identification.rigid_frames import nearest_rotation, rotation_of_attitudes
+from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
@@ -298,10 +299,16 @@ def _try(table: Path, found: Proposed, settings: CellConfig, cell: Cell) -> list
     except CannotAnswerError as error:
         told.append(str(error))
     return [
-        f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, "
-        f"{'positions' if readings.m == 3 else 'positions and orientations'}",
+        f"{len(readings)} readings of {len(np.unique(readings.pose))} poses, {_kinds(readings)}",
         *told,
     ]
+
+
+def _kinds(readings: Readings) -> str:
+    if readings.m == 6:
+        return "positions and orientations"
+    words = {"station": "positions", "point": "distances", "gauge": "heights"}
+    return ", ".join(dict.fromkeys(words[o.kind] for o in readings.observers)) or "positions"
 
 
 def rank_conventions(

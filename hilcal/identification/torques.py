@@ -91,22 +91,33 @@ def require_torques(cell: Cell, readings: Readings) -> None:
     Raises:
         InputError: says so.
     """
-    if cell.measured_torques and readings.states.torque is None:
+    if not cell.measured_torques:
+        return
+    torque = readings.states.torque
+    if torque is None:
         raise InputError(
             '[robot] torques = "measured", but the readings have no columns tau1_Nm, ...; valid: '
             'readings with them, or torques = "modelled"'
         )
+    if lost := int(np.isnan(torque).any(axis=1).sum()):
+        raise InputError(
+            f'[robot] torques = "measured", but {lost} of {len(readings)} readings have none; '
+            'valid: readings with them, or torques = "modelled"'
+        )
 
 
 def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
-    """Compare measured with modelled torques; None where none were measured.
+    """Compare measured with modelled torques, of the readings that have some; None without.
 
     Args:
         cell: arm, tool and gravity as described.
         readings: N readings.
     """
+    if readings.states.torque is None:
+        return None
+    readings = readings[np.flatnonzero(~np.isnan(readings.states.torque).any(axis=1))]
     states = readings.states
-    if states.torque is None:
+    if states.torque is None or not len(readings):
         return None
     none = np.zeros_like(states.wrench)
     own: dict[str, Floats] = {}

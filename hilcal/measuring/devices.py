@@ -101,6 +101,8 @@ class ArmSample:
         payload_com: (3,) its centre of mass, flange axes, m; None where unknown.
         speed_scaling: factor that the controller applies to the speed, 0 to 1.
         safety: the safety state in the maker's words, "normal" where all is well.
+        torque: (n,) mean torques that the drives were measured to exert since the sample before,
+            N·m, positive in the direction in which the joint's value grows; None where unknown.
     """
 
     host_ns: int
@@ -119,6 +121,7 @@ class ArmSample:
     payload_com: Floats | None
     speed_scaling: float
     safety: str
+    torque: Floats | None = None
 
 
 class ArmDevice(Protocol):

@@ -320,6 +320,8 @@ class MeasuredStop:
     Attributes:
         mean: of the tracker's measurements, with its covariance, sensor axes.
         q: (n,) mean actual joint angles meanwhile, rad.
+        torque: (n,) mean torques that the drives were measured to exert meanwhile, N·m; None
+            where the arm does not tell them.
         before: sample of the arm at the start.
         after: the same at the end.
         tracker: every measurement of the tracker.
@@ -336,6 +338,7 @@ class MeasuredStop:
     force: WrenchSample | None
     settling: float
     remarks: tuple[str, ...]
+    torque: Floats | None = None
 
 
 class Measurer:
@@ -423,10 +426,10 @@ class Measurer:
         """Average over the window; None and the reason where that cannot be a reading."""
         differed, before = self._mover.differed, self._mover.look()
         tracker: list[TrackerSample] = []
-        angles = [before.q]
+        looks: list[ArmSample] = []
         for _ in range(self._config.acquire.samples):
             tracker.append(self._tracker.measure())
-            angles.append(self._mover.look().q)
+            looks.append(self._mover.look())
         if force is None and self._meter is not None:
             force = self._meter.average()
         after = self._mover.look()
@@ -449,9 +452,14 @@ class Measurer:
             return None, str(error)
         if not (np.isfinite(mean.value).all() and np.isfinite(mean.covariance).all()):
             return None, "the tracker gives what is not a number"
-        q = np.mean([*angles, after.q], axis=0)
+        looks.append(after)
+        q = np.mean([before.q, *(look.q for look in looks)], axis=0)
+        torques = [look.torque for look in looks if look.torque is not None]
+        torque = np.mean(torques, axis=0) if len(torques) == len(looks) else None
         said = (*remarks, *mean.warnings)
-        return MeasuredStop(mean, q, before, after, tuple(tracker), force, settling, said), ""
+        return MeasuredStop(
+            mean, q, before, after, tuple(tracker), force, settling, said, torque
+        ), ""
 
     def _wrong(self, force: WrenchSample | None, at: ArmSample) -> bool:
         """Whether the mean wrench is not that of what hangs either: such a reading is kept."""

@@ -55,6 +55,7 @@ def reading_of(
     load_time: float,
     side: Floats,
     joint_temperature: Floats | None,
+    torque: Floats | None = None,
     target: int | None = None,
     target_names: tuple[str, ...] = (),
 ) -> Readings:
@@ -69,6 +70,8 @@ def reading_of(
         load_time: since the load's last change, cell s.
         side: (n,) from which each joint arrived, -1 or +1.
         joint_temperature: (n,) °C; None in a campaign without.
+        torque: (n,) that the drives were measured to exert, N·m, NaN where this reading has none;
+            None in a campaign without.
         target: number of the target that was read; None where there is one.
         target_names: the cell's names of them.
     """
@@ -80,6 +83,7 @@ def reading_of(
         joint_temperature=None if joint_temperature is None else joint_temperature[None].copy(),
         approach=side[None].copy(),
         q_actual=measured.q[None].copy(),
+        torque=None if torque is None else torque[None].copy(),
         target=None if target is None else np.array([target]),
     )
     return Readings(
@@ -120,6 +124,7 @@ def detail(
         "scatter": measured.mean.scatter,
         "left_out": list(measured.mean.left_out),
         "q_actual": measured.q.tolist(),
+        "torque": None if measured.torque is None else measured.torque.tolist(),
         "settling_s": measured.settling,
         "remarks": list(measured.remarks),
         "arm_before": sample_json(measured.before),

@@ -74,6 +74,8 @@ class Session:
         )
         self._identified = 0
         self._temperatures: bool | None = None
+        self._torques: bool | None = None
+        self._torques_lost = False
         self._done = 0
         self._tared = False
         now = wall()
@@ -94,6 +96,7 @@ class Session:
         passed = (self._wall() - self._epoch) * self._clock.scale
         self._elapsed = max(last, passed)
         self._temperatures = stored.states.joint_temperature is not None
+        self._torques = stored.states.torque is not None
         self._done = len(self._store.done())
         for old, value, target in zip(details, stored.value, stored.target.tolist(), strict=True):
             step = Step(old["pose"], old["load"], old["cycle"])
@@ -367,6 +370,7 @@ class Session:
             one.ended - self._hook.since,
             self._mover.side,
             self._temperature(measured),
+            self._torque(measured),
             one.target,
             self._cell.target_names,
         )
@@ -410,6 +414,18 @@ class Session:
         if not np.isfinite(mean).all():
             raise DeviceError("arm: it no longer reports the temperatures of its joints")
         return np.asarray(mean)
+
+    def _torque(self, measured: MeasuredStop) -> Floats | None:
+        """(n,) measured torques of the drives, N·m, NaN where lost; None in a campaign without."""
+        if self._torques is None:
+            self._torques = measured.torque is not None
+        if not self._torques:
+            return None
+        if measured.torque is None and not self._torques_lost:
+            text = "arm: it no longer tells the torques of its joints; readings go on without them"
+            self._watcher.notify(Remark(text))
+        self._torques_lost = measured.torque is None
+        return np.full(self._cell.arm.n, np.nan) if measured.torque is None else measured.torque
 
     def _tell_drift(self, step: Step, shift: Shift) -> None:
         limit = self._config.acquire.drift_limit_sigma

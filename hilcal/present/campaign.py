@@ -11,7 +11,7 @@ from hilcal.config.changes import Changes, write_value
 from hilcal.identification.fit import Fit
 from hilcal.measuring.repeatability import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, heading, note, pairs, table
-from hilcal.present.fit import model_name
+from hilcal.present.fit import error_words, model_name
 from hilcal.present.registration import observed_words
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
@@ -48,8 +48,9 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
         yield "None yet: hilcal identify or refine makes one."
         return
     yield from revisions_tables(o)
+    what = "error" if o.readings is None else error_words(o.readings)
     yield note(
-        "fit, left out: rms of the 3-D position error, of the fitted poses and of poses left out, "
+        f"fit, left out: rms of the {what}, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor."
     )
     yield _used(o)

@@ -10,6 +10,7 @@ from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.parameter_differences import Differences
 from hilcal.names import quoted
 from hilcal.present.document import Block, Table, heading, table
+from hilcal.present.fit import error_words, measurements
 
 MOST_PARAMETERS = 6
 """Parameters of a change that are listed."""
@@ -47,7 +48,7 @@ def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block
 
 
 def _setup(c: Comparison, earlier: str, later: str) -> Iterator[str]:
-    what = "deflections" if c.mode == "deflection" else "positions"
+    what = measurements(c.mode, c.today.prediction.readings)
     count = len(c.today.prediction.raw)
     yield f"{count} {what} of {later}, measured later."
     if c.shared:
@@ -84,7 +85,7 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     drawing = "-" if t.drawing_m is None else numbers.length(t.drawing_m)
     sizes = (error.rms_m, error.mean_m, error.max_m, t.stated_m)
     row = (f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
-    heads = ("3-D position error", "rms", "mean", "largest", "expected", "as drawn")
+    heads = (error_words(t.prediction.readings), "rms", "mean", "largest", "expected", "as drawn")
     yield table(*heads, rows=[row])
     chance = numbers.p_equals(t.p_value)
     share = f"{numbers.digits(t.z, 2)} times what it states, all correlations counted ({chance})"

@@ -15,8 +15,9 @@ from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction
 from hilcal.present.document import Block, Table, Tone, Words, heading, note, table
-from hilcal.present.fit import CERTAIN, follows, misses, model_name, where_table
+from hilcal.present.fit import CERTAIN, error_words, follows, misses, model_name, where_table
 from hilcal.present.verdict import broken, headline, implausible, message
+from hilcal.readings.readings import Readings
 from hilcal.types import Floats
 
 SUSPECTS = 6
@@ -140,11 +141,12 @@ def revision_cells(number: int, change: str, fit: Fit, verdict: str) -> tuple[st
     )
 
 
-def key() -> Words:
+def key(readings: Readings) -> Words:
     """Return what the columns of `revisions_table` are."""
+    what = error_words(readings)
     return note(
-        "Errors: rms of the 3-D position, and of all elements in σ, one standard deviation of "
-        "the noise.\n"
+        f"Errors: rms of the {what}, and of all elements in σ, one standard deviation of the "
+        "noise.\n"
     )
 
 

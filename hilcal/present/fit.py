@@ -23,6 +23,7 @@ from hilcal.numbers import names
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.registration import fitted_lines
 from hilcal.present.verdict import correlated, sigmas
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Scaling
 from hilcal.stream.fit import StreamFit
 from hilcal.types import Ints
@@ -181,11 +182,18 @@ def errors(fit: Fit) -> Table:
         "poses fitted": fit.error,
         "poses left out": fit.holdout,
     }
-    return _errors(rows, full_prediction(fit).noise_floor)
+    return _errors(rows, full_prediction(fit).noise_floor, error_words(fit.readings))
 
 
-def _errors(of: Mapping[str, ErrorBlock], floor_m: float) -> Table:
-    out = table("3-D position error", "rms", "mean", "largest", "rms in σ")
+def error_words(readings: Readings) -> str:
+    """Return what the error of a reading is: of a distance or a height it is one number."""
+    return "error of the readings" if readings.scalar.any() else "3-D position error"
+
+
+def _errors(
+    of: Mapping[str, ErrorBlock], floor_m: float, what: str = "3-D position error"
+) -> Table:
+    out = table(what, "rms", "mean", "largest", "rms in σ")
     for name, e in of.items():
         lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
         out.add(name, *lengths, f"{e.rms_sigma:.2f}")
@@ -270,11 +278,18 @@ def scaling_remark(fit: Fit) -> str:
 def misses(fit: Fit) -> str:
     """Say in a sentence how far the model is from the measurements."""
     floor = full_prediction(fit).noise_floor
-    what = "deflections" if fit.mode == "deflection" else "positions"
+    what = measurements(fit.mode, fit.readings)
     return (
         f"On poses left out, predicted {what} are off by {numbers.length(fit.holdout.rms_m)} rms; "
         f"noise alone would leave {numbers.length(floor)}."
     )
+
+
+def measurements(mode: str, readings: Readings) -> str:
+    """Return what is predicted, in a word."""
+    if mode == "deflection":
+        return "deflections"
+    return "readings" if readings.scalar.any() else "positions"
 
 
 def follows(places: Sequence[MisfitShare]) -> str:

@@ -59,4 +59,4 @@ def _(path: Refinement) -> Iterator[Block]:
     for k, s in enumerate(path.steps, start=1):
         changed = change(s.added, s.removed, s.fit.readings.arm_scatter is not None)
         rows.append((k, changed, s.fit, s.diagnosis.verdict))
-    yield from (revisions_table(rows), key(), verdict_line(path.diagnosis))
+    yield from (revisions_table(rows), key(path.fit.readings), verdict_line(path.diagnosis))

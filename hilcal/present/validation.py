@@ -9,6 +9,7 @@ from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
 from hilcal.identification.extrapolation import Beyond, Extrapolation
 from hilcal.identification.validation import Validation
 from hilcal.present.document import Block, Table, note, table
+from hilcal.present.fit import error_words
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -43,7 +44,7 @@ def opening(judged: Judged, found: Validation) -> Iterator[str]:
 
 def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) -> Iterator[Block]:
     """Yield the errors, inside and outside of what was measured, and where outside is."""
-    out = table("3-D position error", "rms", "mean", "largest", "rms in σ", "stated", "z")
+    out = table(error_words(found.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
     everything = np.ones(len(beyond.z), dtype=np.bool_)
     rows = [("never fitted" if judged.unseen else "fitted", found.error, everything)]

@@ -31,7 +31,8 @@ class States:
         approach: (N, n) side from which each joint arrived, -1 or +1.
         q_actual: (N, n) joint angles that the encoders reported, rad.
         torque: (N, n) static torques that the drives were measured to exert, N·m: those of load
-            and weight about the drives' axes (`Situation.torque`) with the other sign.
+            and weight about the drives' axes (`Situation.torque`) with the other sign; NaN in
+            readings that lack them.
         target: (N,) number of the target that is read, in the order of `Cell.target_names`; None
             where the tool carries one target.
         observer: (N,) number of what observes, in the order of `Readings.observers`; None where one

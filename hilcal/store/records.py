@@ -10,10 +10,12 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.toml import parse_json
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
 
 Layout = tuple[tuple[str, int], ...]
 
+MAY_LACK = "torque"
+"""Quantity of a state that single readings may lack, all of its numbers NaN then."""
 _STATE = {
     "q": 2,
     "wrench": 2,
@@ -73,11 +75,25 @@ def pack(readings: Readings) -> Floats:
         if part.size != count * width or len(part) != count:
             raise InputError(f"readings: {name} has shape {part.shape} for {count} readings")
         part = part.reshape(count, width)
-        if not np.isfinite(part).all():
-            i = int(np.argmin(np.isfinite(part).all(axis=1)))
+        known = np.isfinite(part).all(axis=1)
+        if name == MAY_LACK:
+            known |= np.isnan(part).all(axis=1)
+        if not known.all():
+            i = int(np.argmin(known))
             raise InputError(f"readings: {name} of reading {i + 1} is not finite")
         parts.append(part)
     return np.ascontiguousarray(np.hstack(parts), dtype="<f8")
+
+
+def lacking(records: Floats, layout: Layout) -> Bools:
+    """(N, K) numbers that are NaN since a reading lacks the whole quantity, and may."""
+    out, at = np.zeros(records.shape, dtype=np.bool_), 0
+    for name, width in layout:
+        if name == MAY_LACK:
+            none = np.isnan(records[:, at : at + width])
+            out[:, at : at + width] = none.all(axis=1, keepdims=True)
+        at += width
+    return out
 
 
 def unpack(

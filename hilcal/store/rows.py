@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.names import check_name, check_names
 from hilcal.readings.covariance import is_covariance
 from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
-from hilcal.store.records import Layout, pack, unpack
+from hilcal.store.records import Layout, lacking, pack, unpack
 from hilcal.toml import parse_json
 from hilcal.types import Ints
 
@@ -153,7 +153,8 @@ def _fetched(
             raise InputError(f"{path}: the campaign file is damaged at reading {number}")
         records[number - 1] = np.frombuffer(record, "<f8")
         index[number - 1] = where
-    if bad := np.flatnonzero(~(np.abs(records) < LARGEST).all(axis=1))[:1].tolist():
+    sound = (np.abs(records) < LARGEST) | lacking(records, layout)
+    if bad := np.flatnonzero(~sound.all(axis=1))[:1].tolist():
         raise InputError(f"{path}: the campaign file is damaged at reading {bad[0] + 1}")
     if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names]):
         raise InputError(f"{path}: the campaign file is damaged (names are missing)")

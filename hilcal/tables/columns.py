@@ -27,6 +27,7 @@ AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
 which tables round. A choice."""
 _JOINT = re.compile(r"qa?[0-9]+_(rad|m)")
+_TORQUE = re.compile(r"tau[0-9]+_Nm?")
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 
 
@@ -72,11 +73,15 @@ def required_columns(units: Units) -> tuple[str, ...]:
 
 
 def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
-    """Columns of numbers that rows may leave empty: readings, where a table has several kinds."""
+    """Columns of numbers that rows may leave empty.
+
+    Joint torques, and readings where a table has several kinds.
+    """
+    torques = tuple(c for c in header if _TORQUE.fullmatch(c))
     one = [c for kind in ONE.values() for c in (kind[0], kind[2])]
     if not any(kind[0] in header for kind in ONE.values()):
-        return ()
-    return (*POSITION, *ROTATION, *covariance_columns(6), *one)
+        return torques
+    return (*POSITION, *ROTATION, *covariance_columns(6), *one, *torques)
 
 
 def groups(units: Units) -> tuple[tuple[str, ...], ...]:
@@ -130,7 +135,7 @@ def check_header(
     needed = required_columns(units)
     if any(name in header for kind in ONE.values() for name in kind):
         _check_one(path, header)
-    if sparse_columns(header):
+    if POSITION[0] in sparse_columns(header):
         needed = needed if POSITION[0] in header else needed[:-3]
     missing = [c for c in needed if c not in header and c not in spare]
     for name in header:

@@ -53,8 +53,8 @@ def import_readings(
     if mapping is None:
         result = import_table(path, arm, noise, station, targets, _std(config))
     else:
-        gravity = config.robot.gravity_m_s2
-        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets)
+        gravity, std = config.robot.gravity_m_s2, _std(config)
+        result = import_mapped(path, mapping, arm, noise, station, gravity, second, targets, std)
     limits.check_fitted(len(result.readings), result.readings.m, f"{path}: ")
     where = "" if tracker.frame == "tracker" or station else ", as if it stood at the arm's base"
     notes = tuple(note + where * (note == FROM_TRACKER) for note in result.notes)

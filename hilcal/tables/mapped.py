@@ -1,6 +1,7 @@
 """Readings from a table of any kind, by a mapping that says what its columns hold."""
 
 from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Mapping as Mapped
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
-from hilcal.readings.readings import SAME_POSE, Readings
+from hilcal.readings.readings import SAME_POSE, ObserverName, Readings
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
@@ -111,7 +112,7 @@ def mapped_table(
             "last side, the first row counts as +1"
         )
     nowhere = _nowhere(grid, mapping.position, raw)
-    keep, left_out = _complete(grid, raw)
+    keep, left_out = _complete(grid, raw, _sparse(grid, mapping))
     notes += left_out + nowhere
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
@@ -119,6 +120,7 @@ def mapped_table(
     for names, named, convert in _quantities(mapping, arm):
         for name, column in zip(names, named, strict=True):
             _put(table, grid, name, column, convert(raw[grid.name(column)]))
+    _observers(table, grid, mapping, raw)
     if side is not None:
         table.number.update(zip(columns.approach_columns(arm.n), side[keep].T, strict=True))
     angles = _rotations(grid, mapping.orientation, raw, table)
@@ -147,6 +149,7 @@ def import_mapped(
     gravity: Sequence[float] = GRAVITY,
     second: Path | None = None,
     targets: Sequence[str] = (),
+    std: Mapped[ObserverName, float] | None = None,
 ) -> ImportResult:
     """Read a table, or two tables, by a mapping.
 
@@ -159,6 +162,7 @@ def import_mapped(
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
         second: the second file, where the mapping does not name it.
         targets: names of the cell's targets.
+        std: as of `readings_of`.
 
     Returns:
         The readings in the table's order, and what was decided on the way. Rows without a value
@@ -170,12 +174,23 @@ def import_mapped(
     of = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
     q = _joint_units(mapping.joints, arm) * _block(of.raw, grid, mapping.joints.columns)
-    position = table.matrix(columns.POSITION)
     noise = noise if mapping.instrument is None else mapping.instrument.noise()
-    covariance, told = mapped_covariance(table, grid, mapping, position, of.angles, noise, station)
-    unit = units.LENGTHS[mapping.position.unit]
-    rounding = rounding_variance(_block(of.raw, grid, mapping.position.columns), unit)
-    result = readings_of(table, arm, noise, station, covariance, targets, rounding)
+    covariance, rounding, told, position = None, None, tuple[str, ...](), np.zeros((len(q), 0))
+    if mapping.position is not None:
+        position = table.matrix(columns.POSITION)
+        whole = np.asarray(np.isfinite(position).all(axis=1))
+        covariance, told = mapped_covariance(
+            table.taken(whole),
+            grid.rows_with(whole),
+            mapping,
+            position[whole],
+            of.angles,
+            noise,
+            station,
+        )
+        figures = _block(of.raw, grid, mapping.position.columns)[whole]
+        rounding = rounding_variance(figures, units.LENGTHS[mapping.position.unit])
+    result = readings_of(table, arm, noise, station, covariance, targets, rounding, std)
     readings = result.readings
     if mapping.rows is not None and mapping.rows.plausible_only:
         scatter = readings.covariance
@@ -192,6 +207,36 @@ def import_mapped(
     q = q[:, [k for k, column in enumerate(names) if column.endswith("_rad")]]
     notes += check_joint_rounding(q / unit, unit, name, result.readings.covariance, arm.reach)
     return ImportResult(readings, tuple(notes))
+
+
+def _sparse(grid: Grid, mapping: PointMapping) -> list[str]:
+    """Columns of readings, of which a row has one kind, where the table has several."""
+    if not mapping.one:
+        return []
+    position = () if mapping.position is None else mapping.position.columns
+    return [grid.name(c) for c in (*position, *(s.column for s in mapping.one.values()))]
+
+
+def _observers(
+    table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
+) -> None:
+    """Add distances and heights in m, their variances, and who observed the rows."""
+    for kind, section in mapping.one.items():
+        value, of, variance = columns.ONE[kind]
+        _put(table, grid, value, section.column, raw[grid.name(section.column)])
+        table.number[value] = units.LENGTHS[section.unit] * table.number[value]
+        if section.name_column is None:
+            table.text[of] = [str(section.name)] * len(grid.rows)
+        else:
+            table.text[of] = grid.text(section.name_column)
+            table.alias[of] = grid.name(section.name_column)
+        if section.std_column is not None:
+            std = units.LENGTHS[section.std_unit or section.unit] * grid.numbers(section.std_column)
+            table.refuse(std[:, None] < 0, (value,), lambda v: "its standard deviation is below 0")
+            _put(table, grid, variance, section.std_column, std**2)
+    if mapping.station is not None:
+        table.text[columns.STATION] = grid.text(mapping.station.column)
+        table.alias[columns.STATION] = grid.name(mapping.station.column)
 
 
 def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
@@ -256,6 +301,12 @@ def _quantities(
         yield ("air_degC",), (m.air.column,), _celsius(m.air.unit)
     if (w := m.joint_temperatures) is not None:
         yield columns.temperature_columns(arm.n), w.columns, _celsius(w.unit)
+    if (t := m.torques) is not None:
+        sign = -1.0 if t.of == "load" else 1.0
+        sizes = np.where(arm.slides, units.FORCES[t.slide_unit], units.MOMENTS[t.unit]).tolist()
+        names = columns.torque_columns(arm.units)
+        for name, column, size in zip(names, t.columns, sizes, strict=True):
+            yield (name,), (column,), times(sign * size)
 
 
 def _joint_units(section: Joints, arm: Arm) -> Floats:
@@ -275,7 +326,7 @@ def _celsius(unit: str) -> Callable[[Floats], Floats]:
 def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
     """Number columns that a reading cannot do without, by the file's names, in its units."""
     needed: list[Column] = []
-    per_joint = ("joints", "actual_joints", "approach", "joint_temperatures")
+    per_joint = ("joints", "actual_joints", "approach", "joint_temperatures", "torques")
     for name in (*per_joint, "position", "orientation"):
         section = getattr(mapping, name)
         if section is None or not section.columns:
@@ -288,6 +339,7 @@ def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
             )
         needed += section.columns
     needed += [s.column for s in (mapping.air, mapping.cycle) if s is not None]
+    needed += [s.column for s in mapping.one.values()]
     return {grid.name(column): grid.numbers(column) for column in needed}
 
 
@@ -323,9 +375,14 @@ def nines(position: Floats) -> list[float]:
     return sorted(found)
 
 
-def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
-    """Rows that have a value in every column that is used, and a note on the others."""
+def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
+    """Rows that have a value in every column that is used, and a note on the others.
+
+    Of the `sparse` columns a row needs one value.
+    """
     missing = np.stack([np.isnan(values) for values in raw.values()], axis=1)
+    some = [k for k, name in enumerate(raw) if name in sparse]
+    missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
     bad: Bools = np.asarray(missing.any(axis=1))
     count = int(bad.sum())
     if not count:
@@ -346,7 +403,7 @@ def _complete(grid: Grid, raw: dict[str, Floats]) -> tuple[Bools, list[str]]:
 
 def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
     """Note rows that read the same position as the row before, though the joints moved on."""
-    same = (np.diff(position, axis=0) == 0).all(axis=1)
+    same = (np.diff(position, axis=0) == 0).all(axis=1) & (position.shape[1] > 0)
     moved = np.abs(np.diff(q, axis=0)).max(axis=1, initial=0.0) > MOVED
     rows = grid.rows[1:][same & moved]
     if not len(rows):

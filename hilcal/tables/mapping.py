@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, Strict, model_validator
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.readings import ObserverKind
 from hilcal.robot.catalogue import configs_dir
 from hilcal.tables.orientation import CONVENTIONS, NUMBERS
 from hilcal.tables.units import SECONDS, Angle, Length, Temperature
@@ -163,7 +164,7 @@ class CommandedJoints(Joints):
 
 
 class Name(Section):
-    """[cycle], [target]: a column of names or numbers."""
+    """[cycle], [target], [station]: a column of names or numbers."""
 
     column: Column = Field(description=_COLUMN)
 
@@ -224,6 +225,46 @@ class JointTemperatures(Section):
         description="one column per joint"
     )
     unit: Temperature = Field("degC", description=_UNIT_T)
+
+
+class Torques(Section):
+    """[torques]: static torques that the drives were measured to exert; of slides forces."""
+
+    columns: Annotated[tuple[Column, ...], Field(min_length=1)] = Field(
+        description="one column per joint"
+    )
+    unit: Literal["Nm", "Nmm", "kNm"] = Field("Nm", description='"Nm", "Nmm" or "kNm"')
+    slide_unit: Literal["N", "kN", "kgf", "lbf"] = Field(
+        "N", description='"N", "kN", "kgf" or "lbf", of joints that slide'
+    )
+    of: Literal["drive", "load"] = Field(
+        "drive",
+        description='"drive": positive in the direction in which the joint\'s value grows, so that '
+        'it holds against the load; "load": the opposite, what the drive is loaded with',
+    )
+
+
+class OneNumber(Section):
+    """[distance] from a point, [gauge]: height over a plane; rows without it leave it empty."""
+
+    column: Column = Field(description=_COLUMN)
+    unit: Length = Field(description=_LENGTH)
+    name_column: Column | None = Field(
+        None, description="the column that names the row's point or gauge"
+    )
+    name: str | None = Field(None, min_length=1, description="the name of the only point or gauge")
+    std_column: Column | None = Field(
+        None, description="the column of its standard deviation; else std_m of the cell counts"
+    )
+    std_unit: Length | None = Field(None, description=_LENGTH + "; as unit where left out")
+
+    @model_validator(mode="after")
+    def _one(self) -> "OneNumber":
+        if (self.name_column is None) == (self.name is None):
+            raise ValueError("name_column or name: give one of them")
+        if self.std_unit is not None and self.std_column is None:
+            raise ValueError("std_unit needs std_column")
+        return self
 
 
 class Wrench(Section):
@@ -372,6 +413,10 @@ class PointMapping(Section):
     load: LoadName | None = Field(None, description="a section [load] with column")
     cycle: Name | None = Field(None, description="a section [cycle] with column")
     target: Name | None = Field(None, description="a section [target] with column")
+    station: Name | None = Field(None, description="a section [station] with column")
+    distance: OneNumber | None = Field(None, description="a section [distance]")
+    gauge: OneNumber | None = Field(None, description="a section [gauge]")
+    torques: Torques | None = Field(None, description="a section [torques]")
     time: Time | None = Field(None, description="a section [time]")
     load_time: Time | None = Field(None, description="a section [load_time]")
     air: Air | None = Field(None, description="a section [air]")
@@ -410,6 +455,11 @@ class PointMapping(Section):
         reported = self.joints is not None and self.joints.reported
         if reported and (self.pose is None or self.actual_joints is not None):
             raise ValueError("[joints] reported = true needs [pose], and no [actual_joints]")
+        if self.one and (self.orientation or targets or self.rows):
+            raise ValueError(
+                "[distance] or [gauge] together with [orientation], [rows] or targets in "
+                "[position]; give those in a table of their own"
+            )
         if targets and self.target:
             raise ValueError("[target] together with targets in [position]; give one of them")
         if self.std and len(self.std.columns or self.std.values) > 6 and not targets:
@@ -418,12 +468,25 @@ class PointMapping(Section):
             raise ValueError('[load_time] unit must be "s", "ms", "min" or "h"')
         return self
 
+    @property
+    def one(self) -> dict[ObserverKind, OneNumber]:
+        """Sections of readings that are one number, by kind of observer."""
+        given: dict[ObserverKind, OneNumber | None] = {"point": self.distance, "gauge": self.gauge}
+        return {kind: section for kind, section in given.items() if section is not None}
+
 
 class Mapping(PointMapping):
     """The whole of a mapping file for readings."""
 
-    position: Position = Field(description=_POSITION)
     joints: CommandedJoints = Field(description=_JOINTS)
+
+    @model_validator(mode="after")
+    def _read(self) -> Self:
+        if self.position is None and not self.one:
+            raise ValueError(f"no reading: it must be {_POSITION}, or [distance] or [gauge]")
+        if self.position is None and (self.std or self.covariance or self.station):
+            raise ValueError("[std], [covariance] and [station] need [position]")
+        return self
 
 
 M = TypeVar("M", bound=PointMapping)

@@ -111,7 +111,8 @@ def readings_of(
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where there are none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        covariance: (N, m, m) in place of the table's columns, checked like them.
+        covariance: (K, m, m) of the K rows with a position, in place of the table's columns,
+            checked like them.
         targets: names of the cell's targets, see `Cell.target_names`.
         rounding: (3,) variance of the positions' rounding, m²; found from the positions where
             None. It is added where it counts beside the covariance.
@@ -136,7 +137,7 @@ def readings_of(
         cov, notes, covers = _covariance(table, value, noise, station, covariance, rounding)
     elif whole.any():
         some = table.taken(whole), value[whole]
-        cov[whole], notes, covers = _covariance(*some, noise, station, None, rounding)
+        cov[whole], notes, covers = _covariance(*some, noise, station, covariance, rounding)
     if observed is not None:
         value, cov = observed.put(table, value, cov, std or {})
     readings = Readings(
@@ -328,6 +329,10 @@ def _states(table: ColumnTable, arm: Arm) -> States:
     if temperature is not None:
         _in_range(table, columns.temperature_columns(n), -50, 150, "°C")
     if torque is not None:
+        lost = np.isnan(torque)
+        some = lost & ~lost.all(axis=1, keepdims=True)
+        names = columns.torque_columns(arm.units)
+        table.refuse(some, names, lambda _: "no value; give all torques of a row, or none")
         _in_range(table, columns.torque_columns(arm.units), -LARGEST_NM, LARGEST_NM, "N·m or N")
     if "air_degC" in number:
         _in_range(table, ("air_degC",), -50, 80, "°C")

@@ -18,6 +18,8 @@ from hilcal.types import Floats
 from tests.support.fake_world import World
 
 STD = 1e-5  # m, of one measurement
+TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])
+"""N·m, of every pose."""
 
 
 @dataclass
@@ -36,6 +38,7 @@ class FakeArm:
         speed = (w.goal - w.start) / w.lasts / w.hurried if w.is_moving else np.zeros(6)
         if not w.is_moving:
             q = q + w.jitter * w.rng.standard_normal(6)
+        w.torques -= not w.is_moving
         return ArmSample(
             host_ns=int(w.time * 1e9),
             timestamp=w.time,
@@ -53,6 +56,7 @@ class FakeArm:
             payload_com=None if w.payload is None else w.payload[1],
             speed_scaling=1.0,
             safety=w.safety,
+            torque=TORQUE + 0.1 * w.rng.standard_normal(6) if w.torques >= 0 else None,
         )
 
     def take_control(self, mass: float, com: Floats) -> None:

@@ -53,6 +53,7 @@ class World:
     hurry: float = 20.0  # how much faster than commanded the arm moves, from the next motion on
     hurried: float = 1.0  # the same of the motion under way
     jitter: float = 0.0  # rad, of the joints from sample to sample at rest
+    torques: float = 0  # the next so many samples at rest tell the torques of the joints
     lost: int = 0  # the next so many measurements see no target
     not_found: int = 0  # the next so many searches find none
     wrong: list[str] = field(default_factory=list)  # loads that are hung instead, in order

@@ -19,6 +19,7 @@ from hilcal.measuring.devices import TRACKERS
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.mapping import Mapping
 from hilcal.tables.table import write_table
 from hilcal.toml import check_section
 from studies.random_campaigns import rehearse
@@ -142,16 +143,24 @@ def test_the_guide_to_imports_is_what_the_commands_do(
     guide = ROOT / "docs" / "how-to" / "import-a-table.md"
     monkeypatch.chdir(tmp_path)
     Path("CELL.toml").write_bytes((configs_dir() / "cells" / "demo_ur10e.toml").read_bytes())
-    for name, text in zip(("tracker.csv", "robot.csv"), blocks(guide, "csv"), strict=True):
+    tracker, robot, bar = blocks(guide, "csv")
+    for name, text in (("tracker.csv", tracker), ("robot.csv", robot)):
         Path(name).write_text(text, encoding="utf-8")
     commands = [text.split()[1:] for text in blocks(guide, "console")]
     for command in commands:
         ok(capsys, *command)
-    (proposed,) = blocks(guide, "toml")
+    proposed, more = blocks(guide, "toml")
     assert tomllib.loads(Path("mapping.toml").read_text()) == tomllib.loads(proposed)
     cell = hc.Cell.load("CELL.toml")
     readings = hc.read_table("tracker.csv", cell, "mapping.toml")
     assert (len(readings), readings.m, readings.load_names) == (8, 6, ("none", "5 kg"))
+    joints = {"columns": [f"A{k} [°]" for k in range(1, 7)], "unit": "deg"}
+    bars = check_section({"joints": joints, **tomllib.loads(more)}, Mapping, "block")
+    assert bars.distance is not None
+    assert bars.torques is not None
+    used = {*bars.joints.columns, *bars.torques.columns, bars.distance.column}
+    used |= {bars.distance.name_column, bars.distance.std_column}
+    assert used <= set(bar.strip().split(";"))
 
 
 def test_the_first_example_of_the_library_is_short() -> None:

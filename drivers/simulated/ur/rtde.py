@@ -56,7 +56,7 @@ _OUTPUTS = {
         "target_q target_qd target_qdd target_current target_moment actual_q actual_qd "
         "actual_current joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force "
         "target_TCP_pose target_TCP_speed joint_temperatures actual_joint_voltage "
-        "ft_raw_wrench tcp_offset payload_inertia"
+        "ft_raw_wrench tcp_offset payload_inertia actual_current_as_torque"
     ),
     "VECTOR3D": "actual_tool_accelerometer payload_cog",
     "VECTOR6INT32": "joint_mode",
@@ -103,6 +103,8 @@ def outputs_since(version: tuple[int, int, int, int]) -> dict[str, str]:
         del table["ft_raw_wrench"]
     if version < (5, 5, 1, 0):
         del table["payload_cog"]
+    if version < (5, 23, 0, 0) or (10, 0, 0, 0) <= version < (10, 11, 0, 0):
+        del table["actual_current_as_torque"]
     return table
 
 
@@ -155,6 +157,7 @@ _SPEED_STD = 2e-4  # rad/s
 _TORQUE_PER_AMPERE = np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
 _DEVIATION_STOP = 0.1  # rad at which a controller stops the arm (C153), a guess
 _CURRENT_STD = 0.02  # A
+_FRICTION = np.array([6.0, 6.0, 4.0, 1.2, 1.2, 1.2])  # N·m that a gear holds at rest, a guess
 _TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, a guess
 _FORCE_OFFSET = np.array([3.1, -2.4, 4.2, 0.12, -0.21, 0.08])  # N and N·m, flange axes
 _FORCE_STD = np.array([0.4, 0.4, 0.5, 0.02, 0.02, 0.01])
@@ -225,6 +228,7 @@ class Sensors:
             "target_moment": self._torque,
             "target_current": self._target_current,
             "actual_current": self._current,
+            "actual_current_as_torque": self._measured_torque,
             "joint_control_output": self._target_current,
             "joint_temperatures": self._temperatures,
             "joint_mode": lambda: powered[arm.robot_mode is not RobotMode.RUNNING],
@@ -296,6 +300,14 @@ class Sensors:
 
     def _current(self) -> Floats:
         return np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
+
+    def _measured_torque(self) -> Floats:
+        """What the drives exert: against load and weight, and against the friction of the arrival.
+
+        A gear that has stopped on its way in direction s keeps on being pushed in it.
+        """
+        held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
+        return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
     def _temperatures(self) -> Floats:
         return np.asarray(self._truth["joint_temperature"]) if self._is_told else _TEMPERATURES

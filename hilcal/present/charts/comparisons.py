@@ -44,7 +44,7 @@ def error_per_revision(story: Story) -> go.Figure:
     floor = 1e6 * story.noise_floor_m
     out = style.figure(
         _words(story, first, later),
-        x="3-D error, rms [µm]",
+        x="error, rms [µm]",
         traces=traces,
         height=130 + 26 * len(names),
     )
@@ -107,7 +107,8 @@ def error_by_pose(c: Comparison) -> go.Figure:
         f"{numbers.length(found.error.rms_m)} rms, where the calibration states "
         f"{numbers.length(c.today.stated_m)}."
     )
-    return style.figure(says, x="pose", y="3-D error [µm]", traces=traces)
+    kind = "error" if r.scalar.any() else "3-D error"
+    return style.figure(says, x="pose", y=f"{kind} [µm]", traces=traces)
 
 
 def changes_chart(c: Comparison) -> go.Figure:

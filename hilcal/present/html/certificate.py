@@ -139,13 +139,15 @@ def _uncertainty(fit: Fit) -> Iterator[Block]:
         yield "No uncertainty is stated: the fit is not weighted by the full covariance."
         return
     b = budget(fit)
-    error = left_out_errors(fit)
+    whole = ~fit.readings[~fit.outlier].scalar[fit.whitening.reading]
+    error = left_out_errors(fit)[whole]
     inside = int(np.sum(error <= b.expanded))
     what = "deflection" if fit.mode == "deflection" else "position"
     yield Words(
         f"Expected accuracy of a predicted {what} at a pose that was not fitted: expanded "
-        f"uncertainty U = {numbers.length(b.expanded)} (3-D, k = {COVERAGE:.0f}); {inside} of "
-        f"{len(error)} {what}s of poses left out are within it.",
+        f"uncertainty U = {numbers.length(b.expanded)} (3-D, k = {COVERAGE:.0f})"
+        + f"; {inside} of {len(error)} {what}s of poses left out are within it" * bool(len(error))
+        + ".",
         "strong",
     )
     yield table(

@@ -53,6 +53,13 @@ NO_ANGLE = {
     "speed", "velocity", "vel", "qd", "qdd", "acc", "acceleration", "voltage", "error", "offset",
     "approach", "richtung", "direction", "degc",
 }  # fmt: skip
+TORQUE = {"tau", "torque", "drehmoment", "moment", "gelenkmoment", "achsmoment", "couple"}
+"""Words of measured joint torques; with a number each."""
+DISTANCE = {"distance", "dist", "abstand", "entfernung", "length", "lange", "range", "ballbar"}
+GAUGE = {"gauge", "messuhr", "taster", "dial", "indicator", "height", "hohe", "hauteur"}
+FROM = {"from", "von", "point", "punkt", "ball", "kugel", "anchor", "bar", "plane", "ebene"}
+"""Words of what a distance or a height is of, beside those of the quantity itself."""
+STATION = {"station", "standpunkt", "stationierung", "aufstellung"}
 TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
 APPROACH = {"approach", "richtung", "direction", "anfahrt"}
 POSE = {

@@ -220,7 +220,11 @@ def _forces(g: Guesser, whole: Group) -> None:
 def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str) -> None:
     axes = _like(whole.get("std", {}), stem)
     one = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
-    single = [c.name for c in one if g.number(c.name) and not c.numbers]
+    single = [
+        c.name
+        for c in one
+        if g.number(c.name) and not c.numbers and not c.has(words.DISTANCE | words.GAUGE)
+    ]
     if axes is None and not single:
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]

@@ -112,7 +112,7 @@ def guess_by_values(g: Guesser) -> None:
         return [p for p in parts if index[p[-1]] - index[p[0]] == width - 1]
 
     has_joints = "joints" in g.proposal.sections
-    has_position = "position" in g.proposal.sections
+    has_position = bool({"position", "distance", "gauge"} & set(g.proposal.sections))
     ranked: list[tuple[float, list[str], list[str]]] = []
     for joints in [[]] if has_joints else runs(count):
         for position in [[]] if has_position else runs(3):

@@ -26,10 +26,11 @@ from hilcal.tables.guessing.proposal import (
     Guesser,
     Proposal,
     angle_unit,
+    length_unit,
 )
 from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapping import UNLOADED
-from hilcal.tables.units import ANGLES
+from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +125,9 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     g = Guesser(grid, joints)
     _joints(g)
     guess_axes(g)
-    if any(what not in g.proposal.sections for what in ("joints", "position")):
+    _one_number(g)
+    read = {"position", "distance", "gauge"} & set(g.proposal.sections)
+    if not read or "joints" not in g.proposal.sections:
         guess_by_values(g)
     guess_names(g)
     guess_scalars(g)
@@ -141,7 +144,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
             "no joint angles: where they are in a file of their own, give it with --second",
         ),
     ):
-        if what not in g.proposal.sections:
+        if what not in g.proposal.sections and not (what == "position" and read):
             g.proposal.lacking.append(sentence)
     if "pose" not in g.proposal.sections and "joints" in g.proposal.sections:
         g.unsure("pose", "no column names the pose: rows of the same joints count as one pose")
@@ -167,7 +170,9 @@ def _joints(g: Guesser) -> None:
     """Joint angles: columns of a joint's word and a number each, or with an arm's joint names."""
     groups: dict[tuple[str, ...], dict[int, str]] = {}
     for c in g.columns:
-        if not c.numbers or c.axis or not c.has(words.JOINT) or not g.number(c.name):
+        torque = c.has(words.TORQUE) or c.unit in MOMENTS
+        joint = c.has(words.JOINT) or torque
+        if not c.numbers or c.axis or not joint or not g.number(c.name):
             continue
         if not c.has(words.STD):
             groups.setdefault(c.words, {}).setdefault(c.numbers[-1], c.name)
@@ -179,7 +184,7 @@ def _joints(g: Guesser) -> None:
             continue
         if sorted(by_number)[0] > 1 or not FEWEST_JOINTS <= len(names) <= MOST_JOINTS:
             continue
-        if first.has(words.NO_ANGLE):
+        if first.has(words.NO_ANGLE | words.TORQUE) or first.unit in MOMENTS:
             _per_joint(g, first, names)
         else:
             found.append((first, names))
@@ -213,8 +218,16 @@ def _with_words(g: Guesser, wanted: tuple[str, ...]) -> str | None:
 
 
 def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
-    """Temperatures and sides of approach of the joints."""
+    """Torques, temperatures and sides of approach of the joints."""
     values = g.block(names)
+    if (first.has(words.TORQUE) or first.unit in MOMENTS) and not first.has(words.NOMINAL):
+        unit = g.unit(names)
+        if unit not in MOMENTS:
+            g.unsure("torques", "no unit stated; read as Nm")
+            unit = "Nm"
+        g.take("torques", names, str(unit), unit=unit)
+        g.unsure("torques", 'do they hold against the load? Where they are its: of = "load"')
+        return
     if first.has(words.TEMPERATURE) or first.unit == "degC" or first.has({"degc"}):
         unit = first.unit if first.unit in ("degC", "degF", "K") else "degC"
         g.take("joint_temperatures", names, unit, unit=unit)
@@ -222,8 +235,39 @@ def _per_joint(g: Guesser, first: ColumnName, names: list[str]) -> None:
         g.take("approach", names, "-1 or +1")
 
 
+def _one_number(g: Guesser) -> None:
+    """Distances from points and heights over planes, in rows that have no position."""
+    position = g.proposal.sections.get("position", {}).get("columns", [])
+    whole = np.isfinite(g.block(position)).any(axis=1) if position else np.zeros(1, dtype=bool)
+    for what, known in (("distance", words.DISTANCE), ("gauge", words.GAUGE)):
+        named = [c for c in g.free.values() if c.has(known) and not c.axis]
+        plain = [c.name for c in named if g.number(c.name) and not c.has(words.STD | words.NOMINAL)]
+        plain = [n for n in plain if not np.any(whole & np.isfinite(g.block([n])[:, 0]))]
+        if not plain:
+            continue
+        filled = np.isfinite(g.block(plain[:1])[:, 0])
+        unit = length_unit(g, what, plain[:1])
+        section: dict[str, Any] = {"unit": unit}
+        for c in named:
+            if g.number(c.name) and c.has(words.STD) and "std_column" not in section:
+                section["std_column"] = c.name
+                if c.unit in LENGTHS and c.unit != unit:
+                    section["std_unit"] = c.unit
+        for c in g.free.values():
+            texts = np.array(g.grid.text(c.name)) != ""
+            if not g.number(c.name) and c.has(words.FROM | known) and np.array_equal(texts, filled):
+                section["name_column"] = c.name
+                break
+        else:
+            section["name"] = "A" if what == "distance" else "G"
+            g.unsure(what, f"no column names what it is of: all count as of {section['name']}")
+        g.take(what, plain[:1], unit, column=plain[0], **section)
+        for key in ("std_column", "name_column"):
+            g.free.pop(section.get(key, ""), None)
+
+
 def guess_names(g: Guesser) -> None:
-    """Poses, loads, cycles and reflectors."""
+    """Poses, loads, stations, cycles and reflectors."""
     q = g.proposal.sections.get("joints")
     _pick(g, "pose", words.POSE, lambda n: q is None or _one_pose_each(g, n, q))
     for c in list(g.free.values()):
@@ -249,6 +293,7 @@ def guess_names(g: Guesser) -> None:
         if not values & {*UNLOADED, ""}:
             shown = ", ".join(sorted(values)[:SHOWN])
             g.unsure("load", f"which of its values means no load? Set none = [...] ({shown})")
+    _pick(g, "station", words.STATION, lambda n: not g.number(n) and _few(g, n))
     _pick(g, "cycle", words.CYCLE, lambda n: g.number(n) and _whole(g, n))
     _pick(g, "target", words.REFLECTOR, lambda n: not g.number(n) and _few(g, n))
 

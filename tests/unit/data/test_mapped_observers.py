@@ -1,0 +1,179 @@
+"""Foreign tables of distances, heights, stations and torques, by a mapping and by its proposal."""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.config import load_config
+from hilcal.errors import InputError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.identification.table_preview import preview_table
+from hilcal.identification.torques import check_torques
+from hilcal.readings.readings import Readings
+from hilcal.tables.importing import import_readings
+from hilcal.tables.mapping import Mapping
+from hilcal.toml import check_section
+from tests.support.campaigns import cell_of, configuration, true_parameters
+from tests.support.cli_cases import CELL, Capsys, ok
+from tests.support.fit_cases import named
+from tests.support.observer_cases import Observed, observed
+
+JOINTS = [f"Achse {k} [°]" for k in range(1, 7)]
+MOMENTS = [f"Drehmoment A{k} [Nmm]" for k in range(1, 7)]
+POSITION = ["X [mm]", "Y [mm]", "Z [mm]"]
+TORQUES = {"columns": MOMENTS, "unit": "Nmm", "of": "load"}
+BAR: dict[str, Any] = {
+    "file": {"separator": ";", "decimal": ","},
+    "joints": {"columns": JOINTS, "unit": "deg"},
+    "pose": {"column": "Messpunkt"},
+    "load": {"column": "Last"},
+    "distance": {
+        "column": "Abstand [mm]",
+        "unit": "mm",
+        "name_column": "Kugel",
+        "std_column": "Unsicherheit Abstand [µm]",
+        "std_unit": "um",
+    },
+}
+
+
+def measured(who: list[str], seed: int) -> Observed:
+    """Readings with the torques that hold the arm, N·m."""
+    c = observed(who, seed, base=who[0] in "ABCD")
+    torque = -c.world.drive_torque(c.readings.states)
+    return replace(
+        c, readings=replace(c.readings, states=replace(c.readings.states, torque=torque))
+    )
+
+
+def german(r: Readings) -> str:
+    """The table as a German program writes it: torques are those of the load, in N·mm."""
+    kinds = [o.kind for o in r.observers]
+    head = ["Messpunkt", "Last", *JOINTS, *MOMENTS]
+    head += ["Standpunkt", *POSITION] * ("station" in kinds)
+    head += ["Abstand [mm]", "Kugel", "Unsicherheit Abstand [µm]"] * ("point" in kinds)
+    head += ["Messuhr [mm]", "Ebene"] * ("gauge" in kinds)
+    assert r.states.torque is not None
+    lines = [";".join(head)]
+    for i in range(len(r)):
+        of, load = r.observers[r.observer[i]], r.load_names[r.load[i]]
+        row = [r.pose_names[r.pose[i]], "ohne" if load == "none" else load]
+        row += [f"{v:.7f}" for v in np.rad2deg(r.states.q[i])]
+        row += [f"{-1e3 * v:.4f}" for v in r.states.torque[i]]
+        number, blank = [f"{1e3 * v:.6f}" for v in r.value[i]], [""] * 3
+        if "station" in kinds:
+            row += [of.name, *number] if of.kind == "station" else ["", *blank]
+        std = f"{1e6 * np.sqrt(r.covariance[i, 0, 0]):.3f}"
+        if "point" in kinds:
+            row += [number[0], of.name, std] if of.kind == "point" else blank
+        if "gauge" in kinds:
+            row += [number[0], of.name] if of.kind == "gauge" else blank[:2]
+        lines.append(";".join(row).replace(".", ","))
+    return "\n".join(lines) + "\n"
+
+
+def imported(path: Path, sections: dict[str, Any], cell: Path = CELL) -> Readings:
+    mapping = check_section(sections, Mapping, "mapping")
+    return import_readings(path, mapping, load_config(cell), cell_of().arm).readings
+
+
+def same(found: Readings, true: Readings) -> None:
+    by = [found.observers[k].name for k in found.observer]
+    assert by == [true.observers[k].name for k in true.observer]
+    np.testing.assert_allclose(found.value, true.value, atol=1e-9)
+    np.testing.assert_allclose(found.states.q, true.states.q, atol=2e-9)
+    np.testing.assert_allclose(found.states.torque, true.states.torque, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_ball_bars_table_gives_the_true_compliances(seed: int, tmp_path: Path) -> None:
+    c = measured(["A", "B", "C"], seed)
+    (tmp_path / "t.csv").write_text(german(c.readings))
+    found = imported(tmp_path / "t.csv", BAR | {"torques": TORQUES})
+    same(found, c.readings)
+    np.testing.assert_allclose(found.covariance, c.readings.covariance, rtol=1e-6)
+    wrench = replace(found.states, wrench=c.readings.states.wrench)  # of a load named alone
+    joint_std = configuration().repeatability.per_joint(6)
+    readings = with_joint_scatter(c.cell, replace(found, states=wrench), joint_std)
+    fitted = fit(baseline(c.cell, readings, "absolute"), readings, "absolute")
+    truth = true_parameters(c.world, "joint_compliance")
+    told = [v for k, v in named(fitted).items() if k.startswith("joint_compliance")]
+    z = np.array([(value - t) / std for (value, std), t in zip(told, truth, strict=True)])
+    assert np.sqrt(np.mean(z**2)) < 2.5
+    assert 0.75 < fitted.variance_factor < 1.3
+    torques = check_torques(c.cell, readings)
+    assert torques is not None
+    assert not any(f.differs for f in torques.factors)
+
+
+def test_stations_and_heights_beside_distances(tmp_path: Path) -> None:
+    c = measured(["S1", "S2", "A", "G"], 1)
+    (tmp_path / "t.csv").write_text(german(c.readings))
+    (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
+    more = {
+        "torques": TORQUES,
+        "position": {"columns": POSITION, "unit": "mm"},
+        "station": {"column": "Standpunkt"},
+        "std": {"values": [0.03], "unit": "mm"},
+        "gauge": {"column": "Messuhr [mm]", "unit": "mm", "name": "G"},
+    }
+    found = imported(tmp_path / "t.csv", BAR | more, tmp_path / "c.toml")
+    same(found, c.readings)
+    np.testing.assert_allclose(found.covariance[found.scalar, 0, 0], 1e-10, rtol=1e-6)
+    np.testing.assert_allclose(found.covariance[~found.scalar][:, 1, 1], 9e-10, rtol=1e-6)
+    with pytest.raises(InputError, match=r"nothing states the noise of gauge G"):
+        imported(tmp_path / "t.csv", BAR | more)
+
+
+@pytest.mark.parametrize("who", [["A", "B", "C"], ["S1", "S2", "A", "G"]])
+def test_a_preview_proposes_the_mapping(who: list[str], tmp_path: Path, capsys: Capsys) -> None:
+    c = measured(who, 2)
+    (tmp_path / "t.csv").write_text(german(c.readings))
+    (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
+    found = preview_table(tmp_path / "t.csv", cell_of())
+    assert not found.proposal.lacking
+    assert any('of = "load"' in words for _, words in found.proposal.unsure)
+    sections = found.proposal.sections
+    sections["torques"]["of"] = "load"
+    same(imported(tmp_path / "t.csv", sections, tmp_path / "c.toml"), c.readings)
+    (tmp_path / "m.toml").write_text(found.proposal.to_toml("t.csv"))
+    given = [tmp_path / "t.csv", "--config", tmp_path / "c.toml", "--format", tmp_path / "m.toml"]
+    assert "distances from A" in " ".join(
+        ok(capsys, "import", *given, "-o", tmp_path / "r.hilcal").out.split()
+    )
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
+        ({"distance": None}, r"no reading: it must be a section \[position\]"),
+        ({"std": {"values": [0.1]}}, r"\[std\], .* need \[position\]"),
+        ({"rows": {"plausible_only": True}}, "give those in a table of their own"),
+        ({"torques": TORQUES | {"columns": MOMENTS[:4]}}, "4 columns of torques; .* has 6 joints"),
+    ],
+)
+def test_mappings_that_cannot_be(sections: dict[str, Any], message: str, tmp_path: Path) -> None:
+    (tmp_path / "t.csv").write_text(german(measured(["A", "B", "C"], 0).readings))
+    with pytest.raises(InputError, match=message):
+        imported(tmp_path / "t.csv", {k: v for k, v in (BAR | sections).items() if v is not None})
+
+
+def test_rows_without_a_reading_are_left_out_and_a_negative_deviation_is_named(
+    tmp_path: Path,
+) -> None:
+    c = measured(["A", "B", "C"], 0)
+    lines = german(c.readings).splitlines()
+    cells = lines[5].split(";")
+    lines[5] = ";".join([*cells[:-3], "", "", ""])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    assert len(imported(tmp_path / "t.csv", BAR)) == len(c.readings) - 1
+    lines[5] = ";".join([*cells[:-1], "-3"])
+    (tmp_path / "t.csv").write_text("\n".join(lines))
+    with pytest.raises(InputError, match=r"row 6, column 'Abstand .*deviation is below 0"):
+        imported(tmp_path / "t.csv", BAR)
