@@ -82,7 +82,9 @@ def test_every_command_in_order(
         if words[0] == "run":
             draw(config, words)
             continue
-        if words[0] == "compensate":
+        if words[0] == "compensate" and words[2].endswith(".src"):
+            program(Path(words[2]), Path(words[4]))
+        elif words[0] == "compensate":
             points(Path(words[1]), Path(words[2]))
         quick = ["--quick"] if words[0] in ("plan", "next") else []
         if "--plan" in words and words[words.index("--plan") + 1] == "next.json":
@@ -133,6 +135,17 @@ def draw(config: CellConfig, words: list[str], noise: int = 1) -> None:
         return
     with create_run(path, config, path.absolute().parent, made) as c:
         c.append_readings(readings(config, made, noise))
+
+
+def program(weld: Path, frames: Path) -> None:
+    """Write a KRL program of one point, and what the controller keeps of its tool and base."""
+    Path("corrected").mkdir()
+    q = np.degrees(load_plan(Path("plan.json")).q[0])
+    way = f"PTP {{{', '.join(f'A{k} {v:.4f}' for k, v in enumerate(q, 1))}}}"
+    weld.write_text(f"DEF weld( )\n$TOOL = TOOL_DATA[1]\n$BASE = BASE_DATA[1]\n{way}\nEND\n")
+    tool = "TOOL_DATA[1]={X 60.0,Y 20.0,Z 120.0,A 0.0,B 0.0,C 0.0}"
+    base = "BASE_DATA[1]={X 0.0,Y 0.0,Z 0.0,A 0.0,B 0.0,C 0.0}"
+    frames.write_text(f"DEFDAT $CONFIG PUBLIC\n{tool}\n{base}\nENDDAT\n")
 
 
 def readings(config: CellConfig, plan: Plan, noise: int) -> Readings:
