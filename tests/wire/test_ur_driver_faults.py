@@ -219,7 +219,7 @@ def test_stop_without_control_process_and_dashboard(arm, sim):
 def test_close_in_motion_stops_and_leaves_no_process(sim):
     arm = cases.controlled(sim)
     pids = [p.pid for p in cases.children()]
-    assert len(pids) == 2
+    assert len(pids) == 2 + sim.is_x  # the torques
     cases.under_way(arm, sim)
     called = time.monotonic_ns()
     arm.close()
@@ -264,7 +264,7 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
         for _ in range(30):
             assert parent.stdout.readline() == b"moves\n"
         pids = [p.pid for p in psutil.Process(parent.pid).children(recursive=True)]
-        assert len(pids) == 2 + sim.is_x  # the relay
+        assert len(pids) == 2 + 2 * sim.is_x  # the relay and the torques
         killed = time.monotonic_ns()
         parent.kill()
         state = sim.wait("moving", False)
