@@ -200,7 +200,7 @@ class Cameras:
         self.clients = {
             who: (v, heard) for who, (v, heard) in self.clients.items() if now - heard < FORGOTTEN_S
         }
-        for who, (version, _) in self.clients.items():
+        for who, (version, _) in list(self.clients.items()):
             self._answer(who, message(FRAME, self.frame(version)))
 
 

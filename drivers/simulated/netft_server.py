@@ -1,7 +1,7 @@
 """A simulated ATI Net F/T: RDT on UDP, its page on HTTP; admin `force.sock`.
 
     python -m drivers.simulated.netft_server --directory DIR --host 127.A.B.C [--port 49152]
-        [--web-port 8080] --seed N [--rate HZ] [--on S]
+        [--web-port 8081] --seed N [--rate HZ] [--on S]
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
 reading, `stall {on}` sends nothing while the measurements go on, `restart` as after a power cut: it
@@ -211,7 +211,7 @@ def main() -> None:
     parser = admin.device_parser(__doc__)
     parser.add_argument("--host", required=True)
     parser.add_argument("--port", type=int, default=49152)
-    parser.add_argument("--web-port", type=int, default=8080)
+    parser.add_argument("--web-port", type=int, default=8081)
     parser.add_argument("--rate", type=float, default=1000.0, help="records per second")
     parser.add_argument("--on", type=float, default=1200.0, help="s that it has been on")
     options = parser.parse_args()

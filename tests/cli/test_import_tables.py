@@ -109,7 +109,7 @@ BAD: dict[str, tuple[Callable[[str], str], Callable[[str], str], tuple[str, ...]
     "unknown key": (same, swap('column = "T"', 'colum = "T"'), ("[air]", "colum", "column")),
     "no position": (
         same, lambda t: t.replace('[position]\ncolumns = ["X", "Y", "Z"]\nunit = "mm"\n', ""),
-        ("lacks", "position"),
+        ("no reading", "[position]", "[distance]"),
     ),
     "five joints": (same, swap(', "A6"]', "]"), ("5 columns of joints", "has 6 joints")),
     "negative standard deviation": (

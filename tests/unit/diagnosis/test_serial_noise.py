@@ -66,7 +66,7 @@ def test_no_likelihood_is_climbed_for_white_noise_or_a_plain_effect(
         raise AssertionError
 
     white = fitted(*campaign(0.0, mode, 0, hidden, poses=20), mode)
-    monkeypatch.setattr(sys.modules[serial_noise.__module__]._Problem, "climbed", climbed)
+    monkeypatch.setattr(sys.modules[serial_noise.__module__]._SerialProblem, "climbed", climbed)
     assert serial_noise(white) is None
 
 
