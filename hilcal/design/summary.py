@@ -279,17 +279,23 @@ def remarks(planned: Planned) -> tuple[str, ...]:
         f"{100 * gain:.0f} % more efficient"
         for name, gain in planned.costly
     )
-    if planned.asked_poses is not None and planned.design.efficiency < WORTH:
-        readings = int(planned.design.cost)
-        omitted += (
-            f"as many readings, spread over as many poses and loads as tell most (--readings "
-            f"{readings}), are up to {100 / planned.design.efficiency - 100:.0f} % more efficient",
-        )
+    readings, efficiency = int(planned.design.cost), planned.design.efficiency
+    worth = planned.asked_poses is not None and efficiency < WORTH
     if planned.criterion == "I":
         std = 1e6 / np.sqrt(planned.design.value)
+        what = planned.work.what.split(" ")[0]
+        best = (
+            f"; as many readings, spread over as many poses and loads as tell most (--readings "
+            f"{readings}), to no less than {std * np.sqrt(efficiency):.3g} um"
+        )
         omitted += (
-            f"with every effect of the catalogue as large as arms have it, the "
-            f"{planned.work.what.split(' ')[0]} is predicted to {std:.3g} um (rms)",
+            f"with every effect of the catalogue as large as arms have it, the {what} is predicted "
+            f"to {std:.3g} um (rms){best if worth else ''}",
+        )
+    elif worth:
+        omitted += (
+            f"as many readings, spread over as many poses and loads as tell most (--readings "
+            f"{readings}), are up to {100 / efficiency - 100:.0f} % more efficient",
         )
     without = tuple(u.remark for u in planned.undetermined)
     notes = (*without, *omitted, *planned.drawn.remarks, *planned.problem.notes)
