@@ -12,7 +12,7 @@ from hilcal.design.criterion import Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.information import DesignProblem
-from hilcal.design.mixed_design import mixed_design
+from hilcal.design.mixed_design import balanced, mixed_design
 from hilcal.design.optimum import Design, best
 from hilcal.design.prediction_poses import PredictionPoses
 from hilcal.design.t_optimality import Separate, condensed
@@ -83,7 +83,7 @@ def objective_of(
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
-        mixed = mixed_design(problem, config, work)
+        mixed = balanced(mixed_design(problem, config, work))
         return Objective(MeanVariance(mixed.c), mixed.units, mixed.prior, mixed.names)
     if name == "separate":
         apart = discriminated_pairs(problem)

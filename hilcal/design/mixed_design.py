@@ -25,6 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
+from hilcal.design.bound import total_information
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.candidates import (
     Candidates,
@@ -32,6 +33,7 @@ from hilcal.design.candidates import (
     deflection_rows,
     reading_derivatives,
 )
+from hilcal.design.criterion import inverse
 from hilcal.design.information import DesignProblem
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
@@ -59,7 +61,7 @@ class MixedDesign:
         units: the units of the problem.
         prior: (P, P) what is known before.
         c: (P, P) C, m².
-        names: of b, then of Qᵀ v by number.
+        names: of b, then of Qᵀ v by number; by number alone of `balanced`.
     """
 
     units: CandidateSet
@@ -96,6 +98,27 @@ def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -
     names += [f"direction {k}" for k in range(1, coordinates.random.shape[1] + 1)]
     c = v.T @ v / len(work.q)
     return MixedDesign(CandidateSet(rows, of.units.cost), prior, c, tuple(names))
+
+
+def balanced(of: MixedDesign) -> MixedDesign:
+    """Return the problem in coordinates in which all units together tell as much of each.
+
+    tr(C M⁻¹) is the same in any; after a fit some directions are known 10⁶ times as well as others,
+    and rounding would decide. Where they determine nothing of one it stays as it is, by its name.
+    """
+    units = of.units
+    every = of.prior + total_information(units, np.full(len(units), 1.0 / len(units)))
+    size = np.sqrt(np.diag(every))
+    if not np.all(size > 0):
+        return of
+    found = inverse(every / np.outer(size, size))
+    if found is None:
+        return of
+    turn = np.linalg.cholesky(found[0]) / size[:, None]
+    rows = units.rows @ turn
+    names = tuple(f"direction {k}" for k in range(1, len(size) + 1))
+    prior, c = (0.5 * (m + m.T) for m in (turn.T @ m @ turn for m in (of.prior, of.c)))
+    return MixedDesign(CandidateSet(rows, units.cost), prior, c, names)
 
 
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 import hilcal as hc
 from drivers.simulated.mechanics import displacement
@@ -323,7 +324,11 @@ def test_the_table_of_a_colleague_tells_the_same(day: Day) -> None:
     one, mean = (measurement_noise(config, n).range_std[0] for n in (1, config.acquire.samples))
     assert "the noise is not what was stated" in refined.text
     factor = refined.number(r"scale the covariance by ([\d.]+);")
-    assert 0.7 < factor / (mean / one) ** 2 < 1.4
+    with hc.Campaign.open(day.home / "theirs.hilcal", read_only=True) as run:
+        repeats = hc.diagnose(run.fit()).pure_error
+    assert repeats is not None
+    low, high = chi2.ppf([0.001, 0.999], repeats.dof) / repeats.dof  # they tell the factor
+    assert low < factor / (mean / one) ** 2 < high
     day.at("validate", RUN, "theirs.hilcal", "--limit", "0.1 mm")
     compared = day.at("compare", RUN, "theirs.hilcal")
     assert "Nothing has changed beyond the uncertainty." in compared.text

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.config import load_config
-from tests.cli.test_readme import ELSEWHERE, FEW, others, points
+from tests.cli.test_readme import ELSEWHERE, FEW, others, points, program
 from tests.support import readme
 from tests.support.cli_cases import Outcome, run, start
 
@@ -60,7 +60,9 @@ def test_every_command_on_devices(
             if words[0] in ELSEWHERE or ("--append" in words and not separated):
                 continue
             given = [str(there) if w == "CELL.toml" else w for w in words]
-            if words[0] == "compensate":
+            if words[0] == "compensate" and words[2].endswith(".src"):
+                program(Path(words[2]), Path(words[4]))
+            elif words[0] == "compensate":
                 points(Path(words[1]), Path(words[2]))
             if words == ["compare", "run.hilcal", "later.hilcal"]:
                 later = ["--plan", "plan.json", "-o", "later.hilcal"]

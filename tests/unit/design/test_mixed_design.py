@@ -7,10 +7,12 @@ import pytest
 
 from hilcal.config import CellConfig
 from hilcal.design import mixed_design as condensing
+from hilcal.design.approximate_design import relax
 from hilcal.design.candidates import absolute_rows, deflection_rows, reading_derivatives
 from hilcal.design.choice import choose, objective_of
+from hilcal.design.criteria import MeanVariance
 from hilcal.design.information import DesignProblem, problem
-from hilcal.design.mixed_design import MixedDesign, mixed_design, other_effects
+from hilcal.design.mixed_design import MixedDesign, balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.prediction_poses import (
     PredictionPoses,
@@ -109,6 +111,30 @@ def test_directions_that_are_left_out_are_noise_and_nothing_is_learnt_of_them(
         of_all = np.linalg.inv(whole.prior + whole.units.information(counts))
         of_few = np.linalg.inv(few.prior + few.units.information(counts))
         assert of_few == pytest.approx(of_all[np.ix_(kept, kept)], rel=1e-6, abs=1e-9)
+
+
+def test_what_is_known_very_well_does_not_hide_what_a_reading_tells() -> None:
+    """After many readings: the same mean variance in balanced coordinates, and a plan is found."""
+    of, work = scene("absolute", fitted=True)
+    plain = mixed_design(of, config("absolute"), work)
+    size = np.logspace(-6, 6, len(plain.prior))  # coordinates that rounding would decide in
+    uneven = replace(
+        plain,
+        units=replace(plain.units, rows=plain.units.rows * size),
+        prior=plain.prior * np.outer(size, size),
+        c=plain.c * np.outer(size, size),
+    )
+    counts = np.ones(len(of.units))
+    told = [
+        float(np.trace(d.c @ np.linalg.inv(d.prior + d.units.information(counts))))
+        for d in (plain, balanced(uneven))
+    ]
+    assert told[1] == pytest.approx(told[0], rel=1e-6)
+    best = [
+        relax(d.units, MeanVariance(d.c), 20.0, d.prior, names=d.names).value
+        for d in (balanced(plain), balanced(uneven))
+    ]
+    assert best[1] == pytest.approx(best[0], rel=1e-4)
 
 
 def test_a_plan_for_predictions_is_better_than_random_poses_and_certified() -> None:
