@@ -103,7 +103,7 @@ def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys) ->
     found = check_torques(made, readings)
     assert found is not None
     (weight,) = (f for f in found.factors if f.of == "10kg")
-    # the interval holds neither friction that is not averaged out nor the sag of the arm: a per cent
+    # the interval holds neither friction that is left nor the sag of the arm: a per cent
     assert weight.factor == pytest.approx(0.5, rel=0.01)
     assert weight.differs
     words = " ".join(ok(capsys, "info", run).out.split())
