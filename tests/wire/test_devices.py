@@ -23,26 +23,11 @@ from hilcal.measuring.devices import Clock, ForceSensorDevice
 from hilcal.measuring.measure import average
 from hilcal.robot.catalogue import configs_dir
 from tests.support.spread_plan import spread_plan
+from tests.unit.robot.test_rails import TRACK
 
 SMALL = 0.05  # rad
 SLOW = 0.2  # rad/s
 PATIENCE = 60.0  # s
-
-
-TRACK = """title = "UR10e on a track"
-base_m_rad = [0.0, 0.0, 0.3, 0.0, 1.5707963267948966, 0.0]
-[[joints]]
-name = "track"
-type = "prismatic"
-a_m = 0.0
-d_m = 0.0
-alpha_deg = -90.0
-offset_deg = 90.0
-mass_kg = 40.0
-q_min_m = 0.0
-q_max_m = 1.5
-force_max_N = 2000.0
-"""
 
 
 @pytest.fixture(scope="module", params=["ur10e", "track.toml"])
