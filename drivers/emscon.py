@@ -21,7 +21,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from drivers import emscon_packets as es
-from drivers.network import address, network_failures
+from drivers.network import network_failures, own_axes
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.errors import DeviceError, InputError
@@ -535,12 +535,7 @@ def open_tracker(config: CellConfig) -> EmsconTracker:
         DeviceError: nobody answers there.
     """
     tracker = config.tracker
-    host, port = address("[tracker]", "emscon", tracker.host, es.PORT)
-    if tracker.frame != "tracker":
-        raise InputError(
-            f'[tracker] frame = "{tracker.frame}": a laser tracker gives positions in its own axes;'
-            ' it must be "tracker"'
-        )
+    host, port = own_axes(tracker, "emscon", es.PORT)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")
     clock = Clock(config.simulation.clock)
     return EmsconTracker(lambda: EmsconConnection(host, port), tracker, options, clock)

@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from drivers import natnet_frames as nn
-from drivers.network import address, network_failures
+from drivers.network import network_failures, own_axes
 from hilcal.config import CellConfig
 from hilcal.config.rig import Whole
 from hilcal.errors import DeviceError, InputError
@@ -308,12 +308,7 @@ def open_tracker(config: CellConfig) -> NatNetTracker:
         DeviceError: nobody answers there.
     """
     tracker = config.tracker
-    host, port = address("[tracker]", "natnet", tracker.host, nn.PORT)
-    if tracker.frame != "tracker":
-        raise InputError(
-            f'[tracker] frame = "{tracker.frame}": cameras give poses in their own axes; it must '
-            'be "tracker"'
-        )
+    host, port = own_axes(tracker, "natnet", nn.PORT)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")
     if options.frames < 2:
         raise InputError("[tracker] options: frames = 1; valid: 2 or more, which show the scatter")

@@ -4,6 +4,7 @@ import contextlib
 import re
 from collections.abc import Iterator
 
+from hilcal.config.cell import Tracker
 from hilcal.errors import DeviceError, InputError
 
 _ADDRESS = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
@@ -55,3 +56,23 @@ def network_failures(device: str, where: str) -> Iterator[None]:
     except OSError as error:
         said = error.strerror or str(error)
         raise DeviceError(f"{device} at {where}: the connection failed ({said})") from None
+
+
+def own_axes(tracker: Tracker, driver: str, port: int) -> tuple[str, int]:
+    """Return host and port of a tracker that measures in its own axes.
+
+    Args:
+        tracker: its section.
+        driver: name of the driver, for messages.
+        port: where none is given.
+
+    Raises:
+        InputError: [tracker] lacks the host, or states another frame.
+    """
+    found = address("[tracker]", driver, tracker.host, port)
+    if tracker.frame != "tracker":
+        raise InputError(
+            f'[tracker] frame = "{tracker.frame}": this instrument measures in its own axes; it '
+            'must be "tracker"'
+        )
+    return found
