@@ -275,8 +275,8 @@ EARLY = (
 SERIAL_NUMBER = "20235500001"
 
 
-class DashboardServer:
-    """Answers the lines of every client."""
+class ClientServer:
+    """What the servers of a controller share: their open connections."""
 
     def __init__(self, controller: Controller, faults: Faults, model: str) -> None:
         """Serve a controller; `model` is the arm's name in the catalogue."""
@@ -292,6 +292,10 @@ class DashboardServer:
         """Cut every connection."""
         for writer in list(self._writers):
             writer.transport.abort()
+
+
+class DashboardServer(ClientServer):
+    """Answers the lines of every client."""
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a client until it goes."""

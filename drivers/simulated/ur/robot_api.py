@@ -11,8 +11,7 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from drivers.simulated.ur.controller import SERIAL_NUMBER, Controller, OrderResult
-from drivers.simulated.ur.rtde import Faults
+from drivers.simulated.ur.controller import SERIAL_NUMBER, ClientServer, OrderResult
 from drivers.simulated.ur.state import RobotMode, Runtime
 
 BASE = "/universal-robots/robot-api"
@@ -21,23 +20,8 @@ _BODY = 1 << 16  # bytes of the longest body that is read
 Answer = tuple[int, dict[str, Any]]
 
 
-class RobotApiServer:
+class RobotApiServer(ClientServer):
     """Answers the requests of every client."""
-
-    def __init__(self, controller: Controller, faults: Faults, model: str) -> None:
-        """Serve a controller; `model` is the arm's name in the catalogue."""
-        self._controller, self._faults, self._model = controller, faults, model
-        self._writers: set[asyncio.StreamWriter] = set()
-
-    @property
-    def clients(self) -> int:
-        """Number of open connections."""
-        return len(self._writers)
-
-    def drop(self) -> None:
-        """Cut every connection."""
-        for writer in list(self._writers):
-            writer.transport.abort()
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a client until it goes, one request after the other."""
