@@ -1,0 +1,1 @@
+"""The benchmark of hidden effects: tasks, their truth, and how results are scored."""

@@ -1,0 +1,154 @@
+"""A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from hilcal.calibration.handover import urdf
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import load_config
+from hilcal.effects.catalogue import BUILT_IN
+from hilcal.readings.readings import States
+from hilcal.robot.catalogue import configs_dir
+from hilcal.types import Floats
+from studies.random_campaigns import spread_poses
+from studies.study_cases import with_study_loads
+
+ARMS = ("ur10e", "ur5e", "xarm6", "irb120")
+SIGMA = 2e-5
+"""Standard deviation of the noise of one reading, each axis, m."""
+FRESH = 200
+"""Poses that are predicted."""
+TARGET_SCATTER = 2e-3
+"""How far a target sits from its nominal place, standard deviation per axis, m."""
+CANDIDATES = (
+    "joint_stiffening", "joint_tilt_compliance", "base_compliance", "link_compliance",
+    "tool_compliance", "periodic_joint_compliance", "backlash", "load_point", "tracker_drift",
+    "wrench_bias", "wrench_gain", "sensor_misalignment", "encoder_offset", "joint_coupling",
+    "transmission_error", "link_geometry", "link_mass", "tracker_scale",
+)  # fmt: skip
+"""Effects that may be hidden in a task whose effects are to be named."""
+CONTAINED = {"link_geometry": ("encoder_offset", "tracker_scale")}
+"""Effects that a hidden one contains, so that nobody can say whether they are there as well."""
+_PASSING = 30.0  # s from one reading to the next
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Campaign:
+    """States of a task, first those that are trained on, in the numbers that its files hold.
+
+    Attributes:
+        cell: the arm with its tool, target and load point.
+        states: joints, wrenches and times.
+        pose: name of each row's pose.
+        load: name of each row's load.
+        n_train: rows that are trained on; the others are predicted.
+    """
+
+    cell: Cell
+    states: States
+    pose: tuple[str, ...]
+    load: tuple[str, ...]
+    n_train: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Made:
+    """A task that is complete but for its noise.
+
+    Attributes:
+        about: the content of task.json but for what all tasks have.
+        urdf: the nominal arm.
+        columns: (N,) further columns by name, trained rows first.
+        campaign: its states.
+        position: (N, 3) what the instrument would read without noise, m.
+        truth: the content of truth.json.
+    """
+
+    about: dict[str, Any]
+    urdf: str
+    columns: dict[str, Floats]
+    campaign: Campaign
+    position: Floats
+    truth: dict[str, Any]
+
+
+def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
+    """Plan a campaign: each pose unloaded and under one load, fresh ones in one of both.
+
+    Poses are feasible and spread over the joint space. The fresh ones are visited in between, in
+    random order, so that what drifts in time is not extrapolated.
+    """
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    own, pulls = with_study_loads(config, robot)
+    cell = cell_from_config(own)
+    every = np.array([np.zeros(6), *(np.round(wrench, 2) for _, wrench in pulls)])
+    names = ("none", *(name.replace(" ", "_") for name, _ in pulls))
+    loads = len(pulls)
+    q = np.vstack([spread_poses(cell, poses, every, rng), spread_poses(cell, FRESH, every, rng)])
+    pose = np.concatenate([np.repeat(np.arange(poses), 2), np.arange(poses, poses + FRESH)])
+    load = np.where(np.arange(2 * poses) % 2, 1 + np.arange(2 * poses) // 2 % loads, 0)
+    load = np.concatenate([load, np.arange(FRESH) % (loads + 1)])
+    turn = np.argsort(rng.permutation(poses + FRESH)[pose], kind="stable")
+    time = np.empty(len(pose))
+    time[turn] = _PASSING * np.arange(1, len(pose) + 1)
+    states = States(q=np.round(q, 4)[pose], wrench=every[load], time=time)
+    return Campaign(
+        cell,
+        states,
+        tuple(f"p{k + 1}" for k in pose),
+        tuple(names[k] for k in load),
+        2 * poses,
+    )
+
+
+def made(
+    c: Campaign,
+    position: Floats,
+    truth: dict[str, Any],
+    columns: dict[str, Floats] | None = None,
+    sigma: float = SIGMA,
+) -> Made:
+    """Return a task of a campaign; `sigma` is the noise of one reading that it states, m."""
+    cell = c.cell
+    about = {
+        "arm": {
+            "name": cell.arm.name,
+            "target_m": np.round(cell.target[:3, 3], 6).tolist(),
+            "tool": {"mass_kg": cell.tool_mass, "com_m": np.asarray(cell.tool_com).tolist()},
+            "load_point_m": np.asarray(cell.load_point).tolist(),
+            "gravity_m_s2": np.asarray(cell.gravity).tolist(),
+        },
+        "noise": {"sigma_m": sigma},
+        "frame": "tracker",
+    }
+    return Made(about, urdf(cell.arm), columns or {}, c, position, truth)
+
+
+def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dict[str, Any]:
+    """Return the truth of a task whose effects are to be named, and the kind that it is of."""
+    either = {name for effect in hidden for name in CONTAINED.get(effect, ())}
+    return {
+        "kind": ("none", "one")[len(hidden)] if len(hidden) < 2 else "several",
+        "strength_sigma": strength,
+        "effects": [name for name in hidden if name not in either],
+        "either": sorted(either),
+        "parameters": parameters,
+    }
+
+
+def candidates() -> list[dict[str, str]]:
+    """Return the candidates with their laws, as task.json has them."""
+    laws = {effect.name: effect.summary for effect in BUILT_IN}
+    return [{"effect": name, "law": laws[name]} for name in CANDIDATES]
+
+
+def first_rows(states: States, rows: int) -> States:
+    """Return the first states: those that are trained on."""
+    return replace(
+        states,
+        q=states.q[:rows],
+        wrench=states.wrench[:rows],
+        time=None if states.time is None else states.time[:rows],
+    )

@@ -1,0 +1,213 @@
+"""`python -m studies.benchmark.generate`: make tasks from a key, the same bytes for the same key.
+
+Everything random in a task comes from HMAC-SHA256(key, id of the task). The public tasks are
+those of the key "public"; those of another key cannot be known before it is. Which effects a task
+hides, and how strongly, is drawn as well: an id tells its track alone.
+
+Needs hilcal; track mujoco also `mujoco`; the real tracks the folder HILCAL_DATA.
+"""
+
+import hmac
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import product
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+
+from hilcal.cli import application, execute
+from hilcal.errors import InputError
+from hilcal.types import Floats
+from hilcal.whole_file import replace_file
+from studies.benchmark import real
+from studies.benchmark.campaign import ARMS, CANDIDATES, SIGMA, Made, campaign, candidates
+from studies.benchmark.laws import LAWS, law
+from studies.benchmark.mujoco_tasks import SHOWN, mujoco_task
+from studies.benchmark.task import JOINTS, POSITION, WRENCH
+from studies.benchmark.world_elastic import elastic
+
+PUBLIC = "public"
+POSES = (30, 100, 300)
+STRENGTHS = (0.5, 1.0, 3.0)
+LAW_STRENGTHS = (1.0, 3.0)
+_DECIMALS = {**dict.fromkeys(JOINTS, 7), **dict.fromkeys(POSITION, 6)}
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A task that is to be made.
+
+    Attributes:
+        id: its name.
+        track: "elastic", "mujoco", "law", "ur10" or "ur5".
+        number: of the task among those of its track, from 0, in the order of cells.
+        poses: how many are trained on.
+        strength: of each effect; 0 for none.
+        count: effects that are hidden.
+    """
+
+    id: str
+    track: str
+    number: int
+    poses: int
+    strength: float = 0.0
+    count: int = 0
+
+
+def specs(part: str, key: str, tracks: Sequence[str], rounds: int) -> Iterator[Spec]:
+    """Yield all tasks of a part, each cell of N, strength and kind `rounds` times.
+
+    Ids are given out in an order that the key decides.
+    """
+    for track in tracks:
+        cells: list[tuple[int, float, int]]
+        if track in real.SERIES:
+            cells = [(n, 0.0, 0) for n, _ in product(real.POSES, real.SERIES[track])]
+        elif track == "law":
+            cells = [(n, s, 0) for n, s in product(POSES, LAW_STRENGTHS)] * 2
+        else:
+            cells = [(n, s, k) for n, s, k in product(POSES, STRENGTHS, (1, 2))]
+            cells += [(n, 0.0, 0) for n in POSES]
+        cells = cells * rounds
+        order = seeded(key, f"{part} {track}").permutation(len(cells))
+        prefix = "" if part == PUBLIC else f"{part}-"
+        for number, (at, (n, strength, count)) in enumerate(zip(order, cells, strict=True)):
+            yield Spec(f"{prefix}{track}-{at + 1:03d}", track, number, n, strength, count)
+
+
+def seeded(key: str, what: str) -> np.random.Generator:
+    """Return the generator of one thing under a key."""
+    digest = hmac.new(key.encode(), what.encode(), "sha256").digest()
+    return np.random.default_rng(int.from_bytes(digest, "big"))
+
+
+def make(spec: Spec, part: str, key: str) -> dict[str, str]:
+    """Return the files of a task by name.
+
+    Raises:
+        InputError: the data of a real track that are missing or damaged.
+    """
+    rng = seeded(key, spec.id)
+    if spec.track in real.SERIES:
+        task, noise = real.real_task(spec.track, spec.number, spec.poses, rng), 0.0
+    else:
+        task, noise = _simulated(spec, part, key, rng), SIGMA
+    c = task.campaign
+    read = task.position + noise * rng.standard_normal(task.position.shape)
+    about = {
+        "id": spec.id,
+        "track": spec.track,
+        "part": part,
+        "n_poses": spec.poses,
+        "n_train": c.n_train,
+        "n_test": len(c.states) - c.n_train,
+        **task.about,
+        "candidates": candidates() if spec.track in ("elastic", "mujoco") else [],
+    }
+    q, wrench = c.states.q, c.states.wrench
+    states = {name: q[:, j] for j, name in enumerate(JOINTS)}
+    further = {name: wrench[:, j] for j, name in enumerate(WRENCH)}
+    if c.states.time is not None:
+        further["time_s"] = c.states.time
+    further |= task.columns
+    seen = {name: read[:, j] for j, name in enumerate(POSITION)}
+    true = {name: task.position[:, j] for j, name in enumerate(POSITION)}
+    first, last = slice(0, c.n_train), slice(c.n_train, None)
+    labels = {"pose": c.pose, "load": c.load}
+    return {
+        "task.json": json.dumps(about, indent=1) + "\n",
+        "robot.urdf": task.urdf,
+        "train.csv": _csv(labels, {**states, **seen, **further}, first),
+        "test.csv": _csv(labels, {**states, **further}, last),
+        "truth.json": json.dumps(task.truth, indent=1) + "\n",
+        "truth.csv": _csv({}, true, last, decimals=7),
+    }
+
+
+def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Made:
+    """Make a simulated task; over the tasks of a track, effects and arms come in turn."""
+    turn = seeded(key, f"{part} {spec.track} effects")
+    c = campaign(ARMS[(spec.number + int(turn.integers(len(ARMS)))) % len(ARMS)], spec.poses, rng)
+    if spec.track == "law":
+        number = int(turn.permutation(len(LAWS))[spec.number % len(LAWS)])
+        return law(c, number, spec.strength, rng)
+    names = CANDIDATES if spec.track == "elastic" else SHOWN
+    order = turn.permutation(len(names))
+    choice = [names[k] for k in np.roll(order, -(3 * spec.number // 2))]
+    count = spec.count if spec.count < 2 else int(rng.integers(2, 4))
+    hide: Callable[..., Made] = elastic if spec.track == "elastic" else mujoco_task
+    return hide(c, choice, count, spec.strength, rng)
+
+
+def _csv(
+    labels: dict[str, tuple[str, ...]],
+    columns: dict[str, Floats],
+    rows: slice,
+    decimals: int | None = None,
+) -> str:
+    texts = [values[rows] for values in labels.values()]
+    for name, values in columns.items():
+        places = _DECIMALS.get(name, 3) if decimals is None else decimals
+        texts.append(tuple(_short(float(v), places) for v in values[rows]))
+    lines = [",".join((*labels, *columns)), *map(",".join, zip(*texts, strict=True))]
+    return "\n".join(lines) + "\n"
+
+
+def _short(value: float, places: int) -> str:
+    text = f"{value:.{places}f}".rstrip("0").rstrip(".")
+    return "0" if text in ("-0", "") else text
+
+
+def generate(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder that tasks are put into.")],
+    part: Annotated[str, typer.Option("--part", help="public or private.")] = PUBLIC,
+    key: Annotated[str, typer.Option("--key", help="Of the private part; keep it secret.")] = "",
+    tracks: Annotated[str, typer.Option("--tracks", help="By name, commas between.")] = "",
+    rounds: Annotated[int, typer.Option("--rounds", min=1, help="Tasks of each cell.")] = 1,
+) -> None:
+    """Make the tasks of a part; tracks that cannot be made here are named and left out."""
+    if part not in (PUBLIC, "private"):
+        raise InputError(f"part {part!r}; valid: public, private")
+    if (part == PUBLIC) == bool(key):
+        raise InputError(f"key: part {part} takes {'none' if part == PUBLIC else 'one: --key KEY'}")
+    every = ("elastic", "mujoco", "law", *real.SERIES)
+    wanted = tuple(tracks.split(",")) if tracks else every
+    for track in wanted:
+        if track not in every:
+            raise InputError(f"track {track!r}; valid: {', '.join(every)}")
+        lacks = _lacking(track)
+        if lacks:
+            print(f"track {track} is left out: {lacks}", file=sys.stderr)
+            continue
+        for spec in specs(part, key or PUBLIC, (track,), rounds):
+            folder = out / spec.id
+            folder.mkdir(parents=True, exist_ok=True)
+            for name, text in make(spec, part, key or PUBLIC).items():
+                replace_file(folder / name, text)
+            print(folder)
+
+
+def _lacking(track: str) -> str:
+    """Return what a track needs and is not there, in words; empty where all is."""
+    if track == "mujoco" and find_spec("mujoco") is None:
+        return "it needs `pip install mujoco`"
+    if track in real.SERIES and not os.environ.get("HILCAL_DATA"):
+        return "HILCAL_DATA names no folder with its data"
+    return ""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; exit codes and messages as those of `hilcal`."""
+    app: typer.Typer = application("Make tasks of the benchmark of hidden effects.")
+    app.command("generate")(generate)
+    execute(lambda: app, "generate", sys.argv[1:] if arguments is None else arguments)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,63 @@
+"""Track elastic: effects hidden in the world of `drivers.simulated` (Pinocchio, nonlinear)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.simulated.injected_effects import hide, nothing_hidden, softened
+from drivers.simulated.world import SimulatedNoise, World
+from hilcal.cell import Cell
+from hilcal.errors import InputError
+from studies.benchmark.campaign import (
+    SIGMA,
+    TARGET_SCATTER,
+    Campaign,
+    Made,
+    first_rows,
+    made,
+    named,
+)
+
+
+def bare(cell: Cell, rng: np.random.Generator) -> World:
+    """Return a world of compliant joints, an unknown registration and an unknown target alone.
+
+    Its noise is the same in all directions, and the arm repeats exactly.
+    """
+    noise = SimulatedNoise((SIGMA, 0.0), (SIGMA, 0.0))
+    world = nothing_hidden(cell, rng, noise=noise, joint_std=0.0)
+    physics = world.physics.with_effect("target_offset", TARGET_SCATTER * rng.standard_normal(3))
+    return World(cell, physics, world.registration, world.station, noise, world.joint_std)
+
+
+def elastic(
+    c: Campaign, choice: Sequence[str], count: int, strength: float, rng: np.random.Generator
+) -> Made:
+    """Hide effects, each of the strength that `hide` defines: rms motion over the noise.
+
+    Args:
+        c: the campaign.
+        choice: effects in the order in which they are tried.
+        count: how many are hidden.
+        strength: rms of what each moves the trained readings by, over the noise.
+        rng: generator.
+
+    Raises:
+        InputError: fewer of them can be hidden so.
+    """
+    world, hidden = bare(c.cell, rng), list[str]()
+    if "joint_stiffening" in choice[:count]:
+        world = softened(world, "joint_stiffening")
+    train = first_rows(c.states, c.n_train)
+    for name in choice:
+        if len(hidden) == count:
+            break
+        try:
+            world = hide(name, c.cell, train, strength, "absolute", rng, world=world)
+        except InputError:  # e.g. a gear that would have to stiffen to nothing
+            continue
+        hidden.append(name)
+    if len(hidden) < count:
+        raise InputError(f"only {hidden} of {list(choice)} can be hidden; valid: {count} of them")
+    truth = named(hidden, strength, {k: float(f"{v:.6g}") for k, v in world.truth.items()})
+    return made(c, world.sight(c.states).position, truth)
