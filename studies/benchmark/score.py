@@ -113,6 +113,7 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
         task, truth = read_task(folder), read_truth(folder)
         about = {
             "task": task.about["id"],
+            "part": truth.about["part"],
             "track": task.about["track"],
             "poses": task.about["n_poses"],
             "strength": truth.about["strength_sigma"],
@@ -134,7 +135,8 @@ def groups(rows: Sequence[Row]) -> list[Row]:
     """Return what the scores come to: per track, N and strength, and per track as a whole.
 
     `error_m` and `relative` are geometric means over the tasks that an entrant did; `relative` is
-    to the best entrant's error in each task. Errors under a nanometre count as one. Intervals are of 95 %, by bootstrap over tasks.
+    to the best entrant's error in each task. Errors under a nanometre count as one. Intervals are
+    of 95 %, by bootstrap over tasks.
     `log_score_of_the_rate` is that of saying how often candidates are present, of each the same.
     """
     out = []
