@@ -174,8 +174,8 @@ def generate(
     if part not in (PUBLIC, "private"):
         raise InputError(f"part {part!r}; valid: public, private")
     if (part == PUBLIC) == bool(key) or key == PUBLIC:
-        valid = "no key" if part == PUBLIC else "--key KEY, another than that of the public part"
-        raise InputError(f"key {key!r}: part {part} takes {valid}")
+        valid = "none" if part == PUBLIC else "--key KEY, another than that of the public part"
+        raise InputError(f"key {key!r} for the {part} part; valid: {valid}")
     every = ("elastic", "mujoco", "law", *real.SERIES)
     wanted = tuple(tracks.split(",")) if tracks else every
     for track in wanted:

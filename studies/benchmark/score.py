@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from .formula import Floats, Formula, FormulaError, equivalent, law_error
+from .formula import Comparison, Floats, Formula, FormulaError
 from .task import BenchmarkError, Result, Task, Truth, folders, read_result, read_task, read_truth
 
 REAL = ("ur10", "ur5")
@@ -71,7 +71,7 @@ def score(task: Task, truth: Truth, result: Result) -> Row:
     if result.effects is not None:
         out |= _naming(result.effects, truth)
     if truth.about.get("law") is not None and result.law is not None:
-        out |= _law(result.law, truth.about["law"]["formula"], task.quantities)
+        out |= _law(result.law, truth.about["law"], task.quantities)
     return out
 
 
@@ -87,14 +87,13 @@ def _naming(p: Mapping[str, float], truth: Truth) -> Row:
     }
 
 
-def _law(said: object, true: str, columns: Mapping[str, Floats]) -> Row:
-    law = Formula.parse(true, columns)
+def _law(said: object, true: Mapping[str, str], columns: Mapping[str, Floats]) -> Row:
+    law = Formula.parse(true["formula"], columns)
     try:
-        formula = Formula.parse(said, columns)
+        found = Comparison(Formula.parse(said, columns), law, columns, true["acts_on"])
     except FormulaError as error:
         raise BenchmarkError(f"law: {error}") from error
-    same = equivalent(formula, law, columns)
-    return {"law_error": law_error(formula, law, columns), "law_equivalent": float(same)}
+    return {"law_error": found.error(), "law_equivalent": float(found.equivalent())}
 
 
 def score_all(tasks: Path, results: Path) -> dict[str, Any]:

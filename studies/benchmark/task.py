@@ -222,7 +222,7 @@ def _table(path: Path) -> Table:
     try:
         numbers = {name: np.array(column, dtype=float) for name, column in words.items()}
     except ValueError as error:
-        raise BenchmarkError(f"{path}: {error}") from error
+        raise BenchmarkError(f"{path}: {error}; valid: numbers") from error
     bad = [name for name, column in numbers.items() if not np.all(np.isfinite(column))]
     if bad:
         raise BenchmarkError(f"{path}: column {bad[0]} has numbers that are not finite")
