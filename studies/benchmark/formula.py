@@ -200,7 +200,8 @@ class Comparison:
             return False
 
         def off(theta: Floats) -> Floats:
-            return theta[0] * self._own(self.found.value(self.columns, theta[1:])) - true
+            found = self.found.value(self.columns, theta[1:])
+            return np.asarray(theta[0] * self._own(found) - true)
 
         own = self._own(self.found.value(self.columns))
         size = float(own @ own)

@@ -213,8 +213,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BenchmarkError as error:
         print(f"score: {error}", file=sys.stderr)
         return 2
-    json.dump(document, sys.stdout, indent=1)
-    print()
+    print(json.dumps(document, indent=1))
     return 0
 
 
