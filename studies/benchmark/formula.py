@@ -66,7 +66,7 @@ class Formula:
         try:
             tree = ast.parse(text.strip(), mode="eval").body
             constants = tuple(_checked(tree, {*names, "pi"}))
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
             what = " ".join(str(error).split())
             raise FormulaError(f"formula {text[:80]!r}: {what}") from error
         return cls(text, constants, tree)

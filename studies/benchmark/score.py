@@ -88,11 +88,11 @@ def _naming(p: Mapping[str, float], truth: Truth) -> Row:
 
 
 def _law(said: object, true: Mapping[str, str], columns: Mapping[str, Floats]) -> Row:
-    law = Formula.parse(true["formula"], columns)
     try:
-        found = Comparison(Formula.parse(said, columns), law, columns, true["acts_on"])
+        formula, law = (Formula.parse(text, columns) for text in (said, true["formula"]))
     except FormulaError as error:
         raise BenchmarkError(f"law: {error}") from error
+    found = Comparison(formula, law, columns, true["acts_on"])
     return {"law_error": found.error(), "law_equivalent": float(found.equivalent())}
 
 
@@ -110,6 +110,8 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
     rows: list[Row] = []
     for folder in folders(tasks):
         task, truth = read_task(folder), read_truth(folder)
+        if len(truth.position) != len(task.test.pose):
+            raise BenchmarkError(f"{folder}: truth.csv and test.csv have other numbers of rows")
         about = {
             "task": task.about["id"],
             "part": truth.about["part"],

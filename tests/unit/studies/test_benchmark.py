@@ -142,6 +142,8 @@ NAN = float("nan")
         ({"prediction_m": [[NAN] * 3] * 200}, "not finite"),
         ({"prediction_m": [["x"] * 3] * 200}, "no table of numbers"),
         ({"prediction_m": None}, "prediction_m"),
+        ({"prediction_m": [[10**400] * 3] * 200}, "no table of numbers"),
+        ({"law": "sin(q1)"}, "law; valid"),
         ({"std_m": [[-1.0] * 3] * 200}, "negative"),
         ({"std_m": [[1.0] * 3, [1.0]]}, "no table of numbers"),
         ({"effects": {"backlash": 1.0}}, "valid: each of"),
@@ -182,6 +184,17 @@ def test_a_damaged_task_is_refused_in_a_line(
         out, said = capsys.readouterr()
         assert (out, said.count("\n")) == ("", 1)
         assert word in said
+    (folder / "train.csv").write_text(whole, encoding="utf-8")
+    for name, text, word in (
+        ("truth.csv", "x_m,y_m,z_m\n0,0,0\n", "other numbers of rows"),
+        ("truth.json", "{}", "part is missing"),
+        ("task.json", "[]", "id is missing"),
+        ("task.json", "{", "not JSON"),
+    ):
+        (folder / name).write_text(text, encoding="utf-8")
+        assert score_main([str(tmp_path / "tasks"), str(tmp_path / "results")]) == 2
+        said = capsys.readouterr().err
+        assert (word in said, said.count("\n")) == (True, 1)
     assert score_main([str(tmp_path), str(tmp_path / "results")]) == 2
     assert "no task here" in capsys.readouterr().err
 
@@ -218,7 +231,8 @@ def test_a_formula_is_arithmetic_alone() -> None:
     np.testing.assert_allclose(value, by_hand - np.abs(at["tau2"]) ** 1.5, rtol=1e-14)
     for text in (
         "__import__('os').system('true')", "q1.real", "q7", "sin(q1, q2)", "q1 if q2 else 1",
-        "lambda: 1", "'a'*9", "[q1]", "", "(" * 500 + "q1" + ")" * 500, "-" * 100 + "q1", 3,
+        "lambda: 1", "'a'*9", "[q1]", "", "9" * 400,
+        "(" * 500 + "q1" + ")" * 500, "-" * 100 + "q1", 3,
     ):  # fmt: skip
         with pytest.raises(FormulaError) as refused:
             Formula.parse(text, at)
