@@ -1,5 +1,6 @@
 """A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,6 +10,7 @@ from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.effects.catalogue import BUILT_IN
+from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
@@ -136,6 +138,26 @@ def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dic
         "either": sorted(either),
         "parameters": parameters,
     }
+
+
+def hide_each(choice: Sequence[str], count: int, hide: Callable[[str], None]) -> list[str]:
+    """Hide the first `count` effects of a choice that can be hidden, and return their names.
+
+    Raises:
+        InputError: fewer can, e.g. since a gear would have to stiffen to nothing.
+    """
+    hidden: list[str] = []
+    for name in choice:
+        if len(hidden) == count:
+            break
+        try:
+            hide(name)
+        except InputError:
+            continue
+        hidden.append(name)
+    if len(hidden) < count:
+        raise InputError(f"only {hidden} of {list(choice)} can be hidden; valid: {count} of them")
+    return hidden
 
 
 def candidates() -> list[dict[str, str]]:

@@ -130,9 +130,9 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
 
 
 def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Made:
-    """Make a simulated task; over the tasks of a track, effects and arms come in turn."""
+    """Make a simulated task; over the tasks of a track effects come in turn, arms at random."""
     turn = seeded(key, f"{part} {spec.track} effects")
-    c = campaign(ARMS[(spec.number + int(turn.integers(len(ARMS)))) % len(ARMS)], spec.poses, rng)
+    c = campaign(str(rng.choice(ARMS)), spec.poses, rng)
     if spec.track == "law":
         number = int(turn.permutation(len(LAWS))[spec.number % len(LAWS)])
         return law(c, number, spec.strength, rng)
