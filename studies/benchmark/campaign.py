@@ -1,12 +1,11 @@
 """A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.effects.catalogue import BUILT_IN
@@ -60,20 +59,20 @@ class Made:
     """A task that is complete but for its noise.
 
     Attributes:
-        about: the content of task.json but for what all tasks have.
-        urdf: the nominal arm.
-        columns: (N,) further columns by name, trained rows first.
         campaign: its states.
         position: (N, 3) what the instrument would read without noise, m.
         truth: the content of truth.json.
+        columns: (N,) further columns by name.
+        about: what task.json has beyond what all tasks have.
+        sigma: noise of one reading and axis, m.
     """
 
-    about: dict[str, Any]
-    urdf: str
-    columns: dict[str, Floats]
     campaign: Campaign
     position: Floats
     truth: dict[str, Any]
+    columns: dict[str, Floats] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    sigma: float = SIGMA
 
 
 def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
@@ -103,29 +102,6 @@ def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
         tuple(names[k] for k in load),
         2 * poses,
     )
-
-
-def made(
-    c: Campaign,
-    position: Floats,
-    truth: dict[str, Any],
-    columns: dict[str, Floats] | None = None,
-    sigma: float = SIGMA,
-) -> Made:
-    """Return a task of a campaign; `sigma` is the noise of one reading that it states, m."""
-    cell = c.cell
-    about = {
-        "arm": {
-            "name": cell.arm.name,
-            "target_m": np.round(cell.target[:3, 3], 6).tolist(),
-            "tool": {"mass_kg": cell.tool_mass, "com_m": np.asarray(cell.tool_com).tolist()},
-            "load_point_m": np.asarray(cell.load_point).tolist(),
-            "gravity_m_s2": np.asarray(cell.gravity).tolist(),
-        },
-        "noise": {"sigma_m": sigma},
-        "frame": "tracker",
-    }
-    return Made(about, urdf(cell.arm), columns or {}, c, position, truth)
 
 
 def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from studies.benchmark.campaign import (
     Campaign,
     Made,
     hide_each,
-    made,
     named,
 )
 from studies.benchmark.world_mujoco import Hidden, Springs
@@ -82,4 +81,4 @@ def mujoco_task(
 
     names = hide_each(choice, count, hide)
     parameters = {name: np.array(v).tolist() for name, v in hidden.items()}
-    return made(c, seen({}, c.states), named(names, strength, parameters))
+    return Made(c, seen({}, c.states), named(names, strength, parameters))

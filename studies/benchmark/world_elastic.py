@@ -13,7 +13,6 @@ from studies.benchmark.campaign import (
     Campaign,
     Made,
     hide_each,
-    made,
     named,
 )
 
@@ -55,4 +54,4 @@ def elastic(
 
     names = hide_each(choice, count, hidden)
     truth = named(names, strength, {k: float(f"{v:.6g}") for k, v in world.truth.items()})
-    return made(c, world.sight(c.states).position, truth)
+    return Made(c, world.sight(c.states).position, truth)
