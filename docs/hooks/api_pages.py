@@ -12,8 +12,8 @@ def pages() -> dict[str, str]:
     return {name: _page(name) for name in NAMES}
 
 
-def overview(where: str) -> str:
-    """Return tables of functions, values and errors; their pages are in the folder `where`."""
+def overview() -> str:
+    """Return tables of functions, values and errors."""
     kinds: dict[str, list[str]] = {"Functions": [], "Values": [], "Errors": []}
     for name in NAMES:
         found = getattr(hilcal, name)
@@ -22,7 +22,7 @@ def overview(where: str) -> str:
     parts = []
     for title, names in kinds.items():
         rows = [f"## {title}\n", "| name | |", "|---|---|"]
-        rows += [f"| [`hc.{n}`]({where}/{n}.md) | {_first_line(n)} |" for n in names]
+        rows += [f"| [`hc.{n}`]({n}.md) | {_first_line(n)} |" for n in names]
         parts.append("\n".join(rows))
     return "\n\n".join(parts)
 

@@ -16,12 +16,12 @@ def pages(docs: Path) -> dict[str, str]:
     return {name: _page(name, guides) for name in COMMANDS}
 
 
-def overview(where: str) -> str:
-    """Return tables of all commands; their pages are in the folder `where`."""
+def overview() -> str:
+    """Return tables of all commands."""
     parts = []
     for title, names in SECTIONS.items():
         rows = [f"## {title}\n", "| command | |", "|---|---|"]
-        rows += [f"| [`{n}`]({where}/{n}.md) | {COMMANDS[n].summary} |" for n in names]
+        rows += [f"| [`{n}`]({n}.md) | {COMMANDS[n].summary} |" for n in names]
         parts.append("\n".join(rows))
     return "\n\n".join(parts)
 

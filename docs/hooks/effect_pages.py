@@ -57,10 +57,10 @@ def pages() -> dict[str, str]:
     }
 
 
-def overview(where: str) -> str:
-    """Return the table of all effects; their pages are in the folder `where`."""
+def overview() -> str:
+    """Return the table of all effects."""
     rows = ["| effect | law |", "|---|---|"]
-    rows += [f"| [`{k.name}`]({where}/{k.name}.md) | {_cell(law.inline(k.summary))} |" for k in BUILT_IN]
+    rows += [f"| [`{k.name}`]({k.name}.md) | {_cell(law.inline(k.summary))} |" for k in BUILT_IN]
     return "\n".join(rows)
 
 
@@ -76,7 +76,7 @@ def _page(kind: type[Effect], told: dict[str, Any], picture: Picture, svg: str) 
         more.append("It belongs to how a campaign is set up: each campaign learns it anew.")
     parts = [
         f"# {kind.name}",
-        law.inline(kind.summary[0].upper() + kind.summary[1:] + "."),
+        _sentence(law.inline(kind.summary)),
         drawn if svg else "",
         "## Law",
         _described(kind),
@@ -89,6 +89,10 @@ def _page(kind: type[Effect], told: dict[str, Any], picture: Picture, svg: str) 
         f"Class `{kind.__name__}` of `{kind.__module__}`.",
     ]
     return "\n\n".join(p for p in parts if p) + "\n"
+
+
+def _sentence(text: str) -> str:
+    return (text if text.startswith("<") else text[0].upper() + text[1:]) + "."
 
 
 def _described(kind: type[Effect]) -> str:

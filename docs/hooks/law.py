@@ -20,7 +20,7 @@ _TOKEN = re.compile(
     r"|(?P<operator>\.\.|[=+−±×·/()\[\]|<>≤≥∂]|,(?=[^()]*\)))"
 )
 _RUN = re.compile(rf"(?:{re.sub(r'[?]P<[a-z]+>', '?:', _TOKEN.pattern)}|\s)+")
-_APART = re.compile(r"(`[^`]*`|(?:(?<=\s)|^)\[[^\]]*\]|e\.g\.|i\.e\.|[a-z]+/\(N·m\))")
+_APART = re.compile(r"(`[^`]*`|(?:(?<=\s)|^)\[[^\]]*\]|e\.g\.|i\.e\.|(?:[a-z]+|1)/\(N·m²?\))")
 """Code, units in brackets, and what else looks like a formula."""
 _WORD = re.compile(r"(?!EI|GJ|dq|cos|sin)[A-Za-z]{2,}(?![_A-Za-z])")
 _PROSE = frozenset("aAImN")
@@ -64,7 +64,7 @@ def _formula(found: re.Match[str]) -> str:
     apart = not before or before.isspace() or before in "(|"
     if not any(t["name"] for t in tokens) or core in _PROSE or not apart:
         return _plain(text)
-    return f"{_plain(text[:at])}<math>{_elements(core)}</math>{_plain(text[at + len(core) :])}"
+    return f"{_plain(text[:at])}{_math(core)}{_plain(text[at + len(core) :])}"
 
 
 def _plain(text: str) -> str:
@@ -72,7 +72,8 @@ def _plain(text: str) -> str:
 
 
 def _math(text: str) -> str:
-    return f"<math>{_elements(text)}</math>"
+    """Return a formula; in a span, since to Markdown a line that begins with math is a block."""
+    return f"<span><math>{_elements(text)}</math></span>"
 
 
 def _elements(text: str) -> str:
@@ -102,7 +103,8 @@ def _element(found: re.Match[str], out: list[str]) -> str:
         return f"<mn>{found['number']}</mn>"
     if found["operator"]:
         sign = {"..": "…"}.get(found["operator"], found["operator"])
-        return f'<mo stretchy="false">{html.escape(sign)}</mo>'
+        near = ' lspace="0" rspace="0"' if sign in "/()[]|" else ""
+        return f'<mo stretchy="false"{near}>{html.escape(sign)}</mo>'
     if found["after"]:  # of a bracket or a number before it
         kind = "msub" if found["after"] in "⊥×" else "msup"
         return f"<{kind}>{out.pop()}<mn>{found['after'].translate(_SCRIPT)}</mn></{kind}>"

@@ -74,7 +74,9 @@ def _resolved(nav: Any, pages: list[str], listed: set[str]) -> Any:
 
 def on_page_markdown(text: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill in overviews; let links to files beside docs/ lead to their page, or name the file."""
-    text = _MADE.sub(lambda found: OVERVIEWS[found[1]](found[1]), text)
+    text = _MADE.sub(lambda found: OVERVIEWS[found[1]](), text)
+    if page.is_homepage:
+        page.meta["hide"] = ["navigation", "toc"]
     docs, here = Path(config.docs_dir), Path(page.file.src_uri).parent
 
     def mended(link: re.Match[str]) -> str:
