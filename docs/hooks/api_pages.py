@@ -1,6 +1,9 @@
 """A page for each name of `import hilcal as hc`, which mkdocstrings fills from the docstring."""
 
 import inspect
+from importlib import import_module
+
+import griffe
 
 import hilcal
 
@@ -35,3 +38,15 @@ def _page(name: str) -> str:
 
 def _first_line(name: str) -> str:
     return (inspect.getdoc(getattr(hilcal, name)) or "").split("\n\n")[0].replace("\n", " ")
+
+
+def attributes(place: str) -> str:
+    """Return the table of what the docstring of a class says of its attributes."""
+    module, name = place.rsplit(".", 1)
+    docstring = griffe.Docstring(inspect.getdoc(getattr(import_module(module), name)) or "")
+    sections = docstring.parse("google", warnings=False)
+    found = [s for s in sections if s.kind is griffe.DocstringSectionKind.attributes]
+    rows = ["| key | meaning |", "|---|---|"]
+    for a in found[0].value:
+        rows.append(f"| `{a.name}` | {' '.join(a.description.split())} |")
+    return "\n".join(rows)

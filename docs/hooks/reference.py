@@ -1,14 +1,20 @@
-"""Hook of mkdocs: pages that are made from the code, links that leave docs/, patterns in `nav`."""
+"""Hook of mkdocs: pages that are made from the code, links that leave docs/, patterns in `nav`.
 
+Links to other sites are listed in external-links.txt of the site; no network is asked for them.
+"""
+
+import html
 import re
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import api_pages
 import command_pages
 import effect_pages
 from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.exceptions import PluginError
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
@@ -21,7 +27,9 @@ OVERVIEWS = {
 """What stands in place of `<!-- made by the build: NAME -->`."""
 OF_THE_TREE = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "SECURITY.md": "security.md"}
 """Documents beside docs/ by their page in the site."""
+_ATTRIBUTES = re.compile(r"<!-- attributes of ([A-Za-z_.]+) -->")
 _MADE = re.compile(r"<!-- made by the build: ([a-z]+) -->")
+_EXTERNAL = re.compile(r'<a [^>]*href="([a-z]+:[^"]*)"')
 _LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s:]+)(#[^)\s]*)?\)")
 
 
@@ -75,6 +83,7 @@ def _resolved(nav: Any, pages: list[str], listed: set[str]) -> Any:
 def on_page_markdown(text: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
     """Fill in overviews; let links to files beside docs/ lead to their page, or name the file."""
     text = _MADE.sub(lambda found: OVERVIEWS[found[1]](), text)
+    text = _ATTRIBUTES.sub(lambda found: api_pages.attributes(found[1]), text)
     if page.is_homepage:
         page.meta["hide"] = ["navigation", "toc"]
     docs, here = Path(config.docs_dir), Path(page.file.src_uri).parent
@@ -93,3 +102,24 @@ def on_page_markdown(text: str, *, page: Page, config: MkDocsConfig, files: File
         return f"{words} (`{inside}` of the source)" if f"`{inside}`" != words else words
 
     return _LINK.sub(mended, text)
+
+
+def on_post_build(*, config: MkDocsConfig) -> None:
+    """List the links to other sites.
+
+    Raises:
+        PluginError: one is no address of a page that others can reach.
+    """
+    site = Path(config.site_dir)
+    found: dict[str, set[str]] = {}
+    for path in sorted(site.rglob("*.html")):
+        for link in _EXTERNAL.findall(path.read_text(encoding="utf-8")):
+            found.setdefault(html.unescape(link), set()).add(path.relative_to(site).as_posix())
+    for link, pages in found.items():
+        address = urlsplit(link)
+        if address.scheme not in ("https", "mailto") or (
+            address.scheme == "https" and "." not in (address.hostname or "")
+        ):
+            raise PluginError(f"{', '.join(sorted(pages))}: {link}; valid: https://host/...")
+    text = "".join(f"{link}\t{', '.join(sorted(found[link]))}\n" for link in sorted(found))
+    (site / "external-links.txt").write_text(text, encoding="utf-8")
