@@ -44,7 +44,7 @@ def _page(name: str, guides: dict[Path, str]) -> str:
         parts.append(f"Used in: {', '.join(used)}.")
     parts.append(EXIT_CODES_OF_RUN if name == "run" else EXIT_CODES)
     if any("--json" in p.opts for c in (command, *under.values()) for p in c.params):
-        parts.append("What `--json` prints: [JSON of the commands](../json.md).")
+        parts.append(f"What `--json` prints: [its keys](../json.md#{name}).")
     return "\n\n".join(parts) + "\n"
 
 
@@ -65,18 +65,18 @@ def _described(path: str, command: Any) -> str:
 
 def _row(names: str, words: str) -> str:
     """Return the row of an argument or an option; its default is the last thing of its help."""
-    found = re.fullmatch(r"(.*?)(?:  \[(?:default: )?(.*)\])?", words, re.DOTALL)
-    assert found is not None
-    default = {None: "–", "required": "required"}.get(found[2], f"`{found[2]}`")
-    return f"| `{names}` | {_cell(found[1])} | {default} |"
+    said, _, end = words.removesuffix("]").partition("  [")
+    default = {"": "–", "required": end}.get(end, f"`{end.removeprefix('default: ')}`")
+    return f"| `{names}` | {_cell(said)} | {default} |"
 
 
 def _words(text: str | None) -> str:
     """Return help as Markdown: paragraphs; lines that are indented are commands."""
     paragraphs = (text or "").strip().split("\n\n")
+    marked = (re.sub(r"(?<![`\w/])(--?[a-z][a-z-]*)", r"`\1`", p) for p in paragraphs)
     return "\n\n".join(
-        p if p.startswith("    ") else re.sub(r"(?<![`\w/])(--?[a-z][a-z-]*)", r"`\1`", " ".join(p.split()))
-        for p in paragraphs
+        plain if plain.startswith("    ") else p
+        for plain, p in zip(paragraphs, marked, strict=True)
     )
 
 

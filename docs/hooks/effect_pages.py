@@ -1,11 +1,11 @@
 """A page for each effect: law, parameters with ordinary sizes, options, picture."""
 
-import contextlib
 import inspect
 import io
 import json
 import os
 import re
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from itertools import groupby
 from typing import Any
 
@@ -20,12 +20,12 @@ from hilcal.present.charts.style import template
 from studies.picture import svgs
 
 PICTURE = (
-    "How it moves the target of {arm} in base axes, at one pose with 5 kg on the tool: x (solid), y "
-    "(dashed) and z (dotted), by {which} at its ordinary size of {size}."
+    "How it moves the target of {arm} in base axes, at one pose with 5 kg on the tool: x (solid), "
+    "y (dashed) and z (dotted), by {which} at its ordinary size of {size}."
 )
 ALL_PARAMETERS = (
-    " On the right: how far each parameter of ordinary size moves the target, root mean square over "
-    "poses{most}."
+    " On the right: how far each parameter of ordinary size moves the target, root mean square "
+    "over poses{most}."
 )
 ROLES = {
     "registration": "It is in every model while the registration of the tracker is unknown.",
@@ -39,9 +39,8 @@ ROLES = {
 def documents() -> dict[str, dict[str, Any]]:
     """Return what `hilcal effects --json` says of each effect."""
     out, words = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(words):
-        with contextlib.suppress(SystemExit):
-            main(["effects", "--json"])
+    with redirect_stdout(out), redirect_stderr(words), suppress(SystemExit):
+        main(["effects", "--json"])
     return {e["name"]: e for e in json.loads(out.getvalue())["effects"]}
 
 
@@ -141,7 +140,8 @@ def _measured(unit: str, value: float) -> str:
 def _sizes(told: dict[str, Any]) -> str:
     out = []
     if told["expected"]:
-        expected = ", ".join(dict.fromkeys(_measured(e["unit"], e["std"]) for e in told["expected"]))
+        sizes = (_measured(e["unit"], e["std"]) for e in told["expected"])
+        expected = ", ".join(dict.fromkeys(sizes))
         out.append(
             "Before anything is measured their standard deviation is expected to be "
             f"{expected}, known to a factor of 7."

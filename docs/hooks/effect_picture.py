@@ -82,8 +82,11 @@ COLUMNS: dict[str, tuple[str, Callable[[int], Floats], str]] = {
     "load_time": ("time under the load, s", lambda n: np.geomspace(1, 3600, n), "log"),
     "air_temperature": ("air, °C", lambda n: np.linspace(10, 35, n), "linear"),
     "joint_temperature": ("joints, °C", lambda n: np.linspace(20, 50, n), "linear"),
-    "approach": ("side of the approach", lambda n: np.repeat([-1.0, 1.0], [n // 2, n - n // 2]),
-                 "linear"),
+    "approach": (
+        "side of the approach",
+        lambda n: np.repeat([-1.0, 1.0], [n // 2, n - n // 2]),
+        "linear",
+    ),
 }
 """Columns that an effect may need: title of the axis, values, scale."""
 

@@ -25,7 +25,11 @@ OVERVIEWS = {
     "api": api_pages.overview,
 }
 """What stands in place of `<!-- made by the build: NAME -->`."""
-OF_THE_TREE = {"README.md": "index.md", "CHANGELOG.md": "changelog.md", "SECURITY.md": "security.md"}
+OF_THE_TREE = {
+    "README.md": "index.md",
+    "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "security.md",
+}
 """Documents beside docs/ by their page in the site."""
 _ATTRIBUTES = re.compile(r"<!-- attributes of ([A-Za-z_.]+) -->")
 _MADE = re.compile(r"<!-- made by the build: ([a-z]+) -->")
@@ -48,9 +52,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
             made[page] = path.read_text(encoding="utf-8").replace("](docs/", "](")
     for uri, text in made.items():
         files.append(File.generated(config, uri, content=text))
-    assert config.nav is not None
     pages = [f.src_uri for f in files.documentation_pages()]
-    config.nav = _resolved(config.nav, pages, set(_listed(config.nav)))
+    config.nav = _resolved(config.nav or [], pages, set(_listed(config.nav or [])))
     return files
 
 

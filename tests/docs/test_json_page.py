@@ -13,7 +13,7 @@ from hilcal.config import load_config
 from hilcal.config.write import to_toml
 from hilcal.store.campaign_file import CampaignFile
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned, run
+from tests.support.cli_cases import CELL, Capsys, quickly_planned, run
 from tests.support.paths import ROOT
 
 PAGE = (ROOT / "docs" / "reference" / "json.md").read_text(encoding="utf-8")
