@@ -6,7 +6,6 @@ import json
 import os
 import re
 from contextlib import redirect_stderr, redirect_stdout, suppress
-from itertools import groupby
 from typing import Any
 
 import law
@@ -114,16 +113,19 @@ def _linked(text: str, but: str) -> str:
 
 def _parameters(parameters: tuple[Parameter, ...]) -> str:
     """Return the table of parameters; those that differ by a number alone share a row."""
-    rows = ["| parameter | meaning | ordinary size |", "|---|---|---|"]
-    for _, some in groupby(parameters, key=lambda p: (_bare(p.name), p.unit)):
-        group = list(some)
+    alike: dict[tuple[str, str], list[Parameter]] = {}
+    for p in parameters:
+        alike.setdefault((_bare(p.name), p.unit), []).append(p)
+    said = any(p.meaning for p in parameters)
+    rows = ["| parameter | ordinary size |" + " meaning |" * said, "|---|---|" + "---|" * said]
+    for group in alike.values():
         first, last = group[0], group[-1]
         names = f"`{first.name}`" if first is last else f"`{first.name}` … `{last.name}`"
-        meaning = first.meaning if first is last else _bare(first.meaning, "*n*")
         sizes = [p.scale for p in group]
         least, most = _measured(first.unit, min(sizes)), _measured(first.unit, max(sizes))
         size = least if least == most else f"{least} to {most}"
-        rows.append(f"| {names} | {_cell(meaning)} | {size} |")
+        meaning = first.meaning if first is last else _bare(first.meaning, "*n*")
+        rows.append(f"| {names} | {size} |" + f" {_cell(meaning)} |" * said)
     return "\n".join(rows)
 
 
@@ -134,7 +136,7 @@ def _bare(text: str, number: str = "#") -> str:
 def _measured(unit: str, value: float) -> str:
     """Write a value in a unit for people."""
     name, factor = unit_for(unit, [value])
-    return f"{factor * value:.2g} {name}".removesuffix(" 1")
+    return f"{float(f'{factor * value:.2g}'):g} {name}".removesuffix(" 1")
 
 
 def _sizes(told: dict[str, Any]) -> str:

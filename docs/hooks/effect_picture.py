@@ -6,6 +6,7 @@ right how far each parameter moves the target, over poses. One function draws al
 numbers are those of `Model.predict` with the effect and without.
 """
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -166,11 +167,19 @@ def picture_of(kind: type[Effect]) -> Picture:
     over = [(s, moved.along(s.states, strongest)) for s in sweeps]
     joints = [pair for pair in over if pair[0].title.startswith(("joint ", "slide "))]
     others = [pair for pair in over[: len(over) - 6] if _variation(pair[1]) > SMALL]
-    turned = max(joints, key=lambda pair: float(np.ptp(np.linalg.norm(pair[1], axis=1))))
-    chosen = [*others[:2], turned]
+    chosen = [*others[:2], _turned(joints, moved.effect.parameters[strongest].name)]
     arm = f"a {ROBOT.upper().replace('E', 'e')}" + ", whose first joint slides here," * slides
     parameters = moved.effect.parameters
     return Picture(_drawn(parameters, sizes, strongest, chosen), parameters, strongest, arm)
+
+
+def _turned(joints: list[tuple[Sweep, Floats]], parameter: str) -> tuple[Sweep, Floats]:
+    """Return the joint whose angle changes how far the target moves: a parameter's own, if any."""
+    changes = [np.ptp(np.linalg.norm(moved, axis=1)) for _, moved in joints]
+    own = re.match(r"j([1-6])", parameter)
+    if own and changes[int(own[1]) - 1] > SMALL * max(changes):
+        return joints[int(own[1]) - 1]
+    return joints[int(np.argmax(changes))]
 
 
 def _observed(states: States, by: int | None) -> States:
