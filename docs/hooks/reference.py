@@ -49,12 +49,19 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     for source, page in OF_THE_TREE.items():
         path = docs.parent / source
         if page not in {f.src_uri for f in files} and path.is_file():
-            made[page] = path.read_text(encoding="utf-8").replace("](docs/", "](")
+            made[page] = _LINK.sub(_from_docs, path.read_text(encoding="utf-8"))
     for uri, text in made.items():
         files.append(File.generated(config, uri, content=text))
     pages = [f.src_uri for f in files.documentation_pages()]
     config.nav = _resolved(config.nav or [], pages, set(_listed(config.nav or [])))
     return files
+
+
+def _from_docs(link: re.Match[str]) -> str:
+    """Let a link of a document beside docs/ begin in docs/."""
+    words, path, anchor = link.groups()
+    inside = path.removeprefix("docs/") if path.startswith("docs/") else f"../{path}"
+    return f"[{words}]({inside}{anchor or ''})"
 
 
 def _listed(nav: Any) -> list[str]:
