@@ -4,6 +4,7 @@ Links to other sites are listed in external-links.txt of the site; no network is
 """
 
 import html
+import os
 import re
 from fnmatch import fnmatch
 from pathlib import Path
@@ -29,6 +30,7 @@ OF_THE_TREE = {
     "README.md": "index.md",
     "CHANGELOG.md": "changelog.md",
     "SECURITY.md": "security.md",
+    "studies/benchmark/README.md": "benchmark.md",
 }
 """Documents beside docs/ by their page in the site."""
 _ATTRIBUTES = re.compile(r"<!-- attributes of ([A-Za-z_.]+) -->")
@@ -49,7 +51,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     for source, page in OF_THE_TREE.items():
         path = docs.parent / source
         if page not in {f.src_uri for f in files} and path.is_file():
-            made[page] = _LINK.sub(_from_docs, path.read_text(encoding="utf-8"))
+            made[page] = _from_docs(path.read_text(encoding="utf-8"), Path(source).parent)
     for uri, text in made.items():
         files.append(File.generated(config, uri, content=text))
     pages = [f.src_uri for f in files.documentation_pages()]
@@ -57,11 +59,14 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     return files
 
 
-def _from_docs(link: re.Match[str]) -> str:
-    """Let a link of a document beside docs/ begin in docs/."""
-    words, path, anchor = link.groups()
-    inside = path.removeprefix("docs/") if path.startswith("docs/") else f"../{path}"
-    return f"[{words}]({inside}{anchor or ''})"
+def _from_docs(text: str, folder: Path) -> str:
+    """Let the links of a document of another folder begin in docs/."""
+
+    def moved(link: re.Match[str]) -> str:
+        words, path, anchor = link.groups()
+        return f"[{words}]({os.path.relpath(folder / path, 'docs')}{anchor or ''})"
+
+    return _LINK.sub(moved, text)
 
 
 def _listed(nav: Any) -> list[str]:
@@ -131,5 +136,9 @@ def on_post_build(*, config: MkDocsConfig) -> None:
             address.scheme == "https" and "." not in (address.hostname or "")
         ):
             raise PluginError(f"{', '.join(sorted(pages))}: {link}; valid: https://host/...")
-    text = "".join(f"{link}\t{', '.join(sorted(found[link]))}\n" for link in sorted(found))
+    text = "".join(f"{link}\t{_some(sorted(found[link]))}\n" for link in sorted(found))
     (site / "external-links.txt").write_text(text, encoding="utf-8")
+
+
+def _some(pages: list[str]) -> str:
+    return ", ".join(pages[:3]) + f" and {len(pages) - 3} more" * (len(pages) > 3)
