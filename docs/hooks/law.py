@@ -53,8 +53,11 @@ def _formula(found: re.Match[str]) -> str:
             core, at = core[1:], at + 1
         elif core[-1] in "()":
             core = core[:-1]
-        else:
-            return _plain(text)
+        else:  # one that opens within: it belongs to the sentence, too
+            k = text.rfind("(")
+            if k < 1:
+                return _plain(text)
+            return _RUN.sub(_formula, text[:k]) + _RUN.sub(_formula, text[k:])
     if core.startswith("(") and core.endswith(")") and core.find(")") == len(core) - 1:
         core, at = core[1:-1], at + 1
     at += len(core) - len(core.lstrip())
