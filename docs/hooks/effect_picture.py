@@ -92,7 +92,7 @@ COLUMNS: dict[str, tuple[str, Callable[[int], Floats], str]] = {
 """Columns that an effect may need: title of the axis, values, scale."""
 
 
-def _sweeps(kind: type[Effect], slides: bool) -> list[Sweep]:
+def _sweeps(kind: type[Effect], cell: Cell) -> list[Sweep]:
     """Return the variables that an effect may depend on; angles of joints at the end."""
     base = _states(POINTS)
     masses = np.linspace(0.0, MOST, POINTS)
@@ -106,12 +106,13 @@ def _sweeps(kind: type[Effect], slides: bool) -> list[Sweep]:
         shown = x / 60 if column == "time" else x
         out.append(Sweep(title, shown, _with(base, column, x), scale))
     for k in range(6):
-        angle = np.linspace(-np.pi, np.pi, POINTS)
+        along, arm = cell.arm.slides[k], cell.arm
+        ends = (arm.q_min[k], arm.q_max[k]) if along else (-np.pi, np.pi)
         q = np.tile(POSE, (POINTS, 1))
-        along = slides and k == 0
-        q[:, k] = angle / np.pi if along else angle
+        q[:, k] = np.linspace(*ends, POINTS)
         title = f"slide {k + 1}, m" if along else f"joint {k + 1}, °"
-        out.append(Sweep(title, q[:, k] if along else np.degrees(angle), _with(base, "q", q)))
+        shown = q[:, k] if along else np.degrees(q[:, k])
+        out.append(Sweep(title, shown, _with(base, "q", q)))
     return out
 
 
@@ -154,7 +155,7 @@ def picture_of(kind: type[Effect]) -> Picture:
     """Return the picture of an effect."""
     cell, slides = _cell(kind)
     options = {"reference_degC": 20.0} if "reference_degC" in kind.option_help else {}
-    sweeps = _sweeps(kind, slides)
+    sweeps = _sweeps(kind, cell)
     rng = np.random.default_rng(0)
     poses = _with(_states(POSES), "q", rng.uniform(-np.pi, np.pi, (POSES, 6)))
     if cell.observers:
@@ -264,7 +265,9 @@ def _drawn(
                 row=1,
                 col=column,
             )
-        out.update_xaxes(title_text=sweep.title, type=sweep.scale, row=1, col=column)
+        ends = np.unique(sweep.values)
+        ticks = {"tickvals": ends} if len(ends) == 2 else {}
+        out.update_xaxes(title_text=sweep.title, type=sweep.scale, **ticks, row=1, col=column)
     out.update_yaxes(title_text=f"target moves, {unit}", row=1, col=1)
     if several:
         order = np.argsort(sizes)[::-1][:SHOWN][::-1]
