@@ -1,0 +1,56 @@
+"""Charts as SVG: plotly draws them in one headless chromium; no network is needed."""
+
+import json
+import shutil
+from collections.abc import Sequence
+from urllib.parse import unquote
+
+import plotly.graph_objects as go
+from plotly.offline import get_plotlyjs
+
+from hilcal.errors import InputError
+from hilcal.present.charts.style import LIGHT
+
+WIDTH, HEIGHT = 720, 400
+"""CSS pixels, where a figure says nothing else."""
+_DRAW = """async figures => {
+  const out = [];
+  for (const f of figures) {
+    const size = {format: 'svg', width: f.layout.width, height: f.layout.height};
+    const div = document.createElement('div');
+    document.body.appendChild(div);
+    out.push(await Plotly.toImage(await Plotly.newPlot(div, f.data, f.layout), size));
+    div.remove();
+  }
+  return out;
+}"""
+
+
+def svgs(figures: Sequence[go.Figure]) -> list[str]:
+    """Draw figures as SVG texts, on white paper unless they have their own.
+
+    Args:
+        figures: each of the size of its layout, else `WIDTH` × `HEIGHT`.
+
+    Raises:
+        InputError: no chromium, or no playwright.
+    """
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        raise InputError("no chromium found, which draws charts: on Debian install chromium")
+    try:
+        from playwright.sync_api import sync_playwright  # a package of the tests
+    except ImportError:
+        raise InputError("no playwright found, which draws charts: pip install playwright") from None
+    told = []
+    for f in figures:
+        size = {"width": f.layout.width or WIDTH, "height": f.layout.height or HEIGHT}
+        made = go.Figure(f).update_layout(paper_bgcolor=f.layout.paper_bgcolor or LIGHT, **size)
+        told.append(json.loads(made.to_json()))
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
+        page = browser.new_page()
+        page.add_script_tag(content=get_plotlyjs())
+        drawn: list[str] = page.evaluate(_DRAW, told)
+        browser.close()
+    return [unquote(text.partition(",")[2]) + "\n" for text in drawn]
