@@ -15,7 +15,7 @@ from hilcal.design.planner import Request, make
 from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.proposal import LawSearch
-from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
@@ -367,7 +367,8 @@ def simulate(
         cell: the cell, whose `[simulation]` has the strength of what is hidden; or what an earlier
             call returned, for a further campaign of the same arm.
         plan: what is measured.
-        hide: an effect of `hilcal effects`, "random" or "nothing"; of the first campaign.
+        hide: of the first campaign: an effect of `hilcal effects`, "random", "nothing", or
+            "invented", a law that the catalogue lacks.
         seed: of everything random; of a further campaign of its noise.
         catalogue: has effects of your own, which can be hidden, too.
 
@@ -378,13 +379,16 @@ def simulate(
     Raises:
         InputError: an effect that cannot be hidden; lists the valid ones.
     """
-    from drivers.simulated.rehearsal import case_of_plan, read_plan  # the simulated world alone
+    from drivers.simulated import rehearsal  # the simulated world is of no use but here
 
     what = plan.plan if isinstance(plan, CheckedPlan) else plan
     if not isinstance(cell, Cell):
-        return read_plan(cell, what, [seed])
-    case = case_of_plan(cell.configured(), what, hide, seed, catalogue, cell.base_dir)
-    return read_plan(case, what, [seed, 1])
+        return rehearsal.read_plan(cell, what, [seed])
+    if hide == rehearsal.INVENTED:
+        catalogue = rehearsal.invented_law(catalogue or installed())
+    config = cell.configured()
+    case = rehearsal.case_of_plan(config, what, hide, seed, catalogue, cell.base_dir)
+    return rehearsal.read_plan(case, what, [seed, 1])
 
 
 @contextmanager

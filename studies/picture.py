@@ -41,7 +41,9 @@ def svgs(figures: Sequence[go.Figure]) -> list[str]:
     try:
         from playwright.sync_api import sync_playwright  # a package of the tests
     except ImportError:
-        raise InputError("no playwright found, which draws charts: pip install playwright") from None
+        raise InputError(
+            "no playwright found, which draws charts: pip install playwright"
+        ) from None
     told = []
     for f in figures:
         size = {"width": f.layout.width or WIDTH, "height": f.layout.height or HEIGHT}

@@ -75,8 +75,8 @@ plan = hc.plan(cell, poses=15, seed=1)
 plan
 
 # %% [markdown]
-# The efficiency is a certified lower bound: no plan of as many readings, chosen from the same candidates, determines the parameters
-# much better.
+# The efficiency is a certified lower bound: even the best choice among the same candidates needs at least that share of the readings
+# for the same precision.
 #
 # ## Measure
 #
@@ -106,7 +106,7 @@ fit
 # ## See where it fails
 #
 # The *variance factor* is the mean square of the residuals in units of the stated noise. It should be 1, and here it is far above:
-# the tracker and the arm's repeatability do not explain what is left. The residuals follow the load:
+# the tracker and the arm's repeatability do not explain what is left, under none of the loads.
 
 # %%
 residual = 1e6 * np.linalg.norm(fit.residuals(frame="base"), axis=1)
@@ -116,9 +116,9 @@ names = np.array(run.readings.load_names)[loaded]
 
 def by_load(values, title):
     """Draw the residual of each deflection, one box for each load."""
-    boxes = [go.Box(y=values[names == n], name=str(n), boxpoints="all") for n in dict.fromkeys(names)]
-    layout = {"title": title, "yaxis_title": "residual, µm", "showlegend": False, "height": 350}
-    return go.Figure(boxes, layout)
+    boxes = [go.Box(y=values[names == n], name=str(n), boxpoints="all") for n in sorted(set(names))]
+    chart = go.Figure(boxes, {"title": title, "showlegend": False, "template": "plotly_white"})
+    return chart.update_yaxes(title="residual, µm", range=[0, 120])
 
 
 by_load(residual, "Joint compliance alone: what the model leaves")
@@ -171,11 +171,7 @@ assert path.fit.error.rms_m < 0.75 * fit.error.rms_m
 
 # %%
 truth = simulated.world.truth
-rows = [
-    (p.name, 1e6 * p.value, 1e6 * p.std, 1e6 * truth[p.name])
-    for p in path.fit.parameters
-    if p.name in truth and p.identifiable
-]
+rows = [(p.name, 1e6 * p.value, 1e6 * p.std, 1e6 * truth[p.name]) for p in path.fit.parameters if p.name in truth and p.identifiable]
 print(f"{'µrad/(N·m)':30s}{'found':>8s}{'± std':>8s}{'true':>8s}")
 for name, value, std, true in rows:
     print(f"{name:30s}{value:8.2f}{std:8.2f}{true:8.2f}")
