@@ -36,6 +36,12 @@ LONGEST = 300
 log = logging.getLogger("mkdocs.hooks.tutorials")
 
 
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Tell outputs from the text of the page."""
+    config.extra_css.append("tutorials/output.css")
+    return config
+
+
 def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     """Add the pages and notebooks; leave out the scripts that they are made of."""
     folder = Path(config.docs_dir) / "tutorials"
@@ -116,7 +122,8 @@ def page(made: NotebookNode, name: str) -> str:
                 parts.append(f'<div class="tutorial-output">\n{data[HTML]}\n</div>')
             else:
                 text = data.get(TEXT) or output.get("text", "")
-                parts.append(f'<pre class="tutorial-output">{escape(text.strip())}</pre>')
+                inner = f"<code>{escape(text.strip())}</code>"
+                parts.append(f'<pre class="tutorial-output">{inner}</pre>')
     title, _, rest = "\n\n".join(parts).partition("\n")
     note = f"[Download this page as a notebook]({name}.ipynb){{ download }}"
     return f"{title}\n\n{note}\n{rest}\n"

@@ -117,7 +117,7 @@ class Wrong(CablePull):
 try:
     hc.check_effect(Wrong)
 except hc.InputError as error:
-    print(error)
+    print(str(error).partition(": ")[2])  # what comes before is the file
 
 # %% [markdown]
 # A *catalogue* holds the effects that a diagnosis may name. With the new one in it, hide the effect in a simulated arm, and see whether
