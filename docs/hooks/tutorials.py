@@ -31,6 +31,8 @@ PLOTLY, SVG, HTML, TEXT = (
     "text/html",
     "text/plain",
 )
+SOURCES = (".py", ".toml")
+"""Of files that are of no use to a reader: the scripts, and how they are formatted."""
 LONGEST = 300
 """s that a cell may take."""
 log = logging.getLogger("mkdocs.hooks.tutorials")
@@ -56,7 +58,7 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         ):
             files.append(File.generated(config, f"tutorials/{name}", content=content))
     for file in list(files):
-        if file.src_uri.startswith("tutorials/") and file.src_uri.endswith((".py", ".toml")):
+        if Path(file.src_uri).parent == Path("tutorials") and Path(file.src_uri).suffix in SOURCES:
             files.remove(file)
     return files
 
