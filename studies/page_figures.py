@@ -153,7 +153,7 @@ def noise_terms(cell: Cell, readings: Readings) -> go.Figure:
     distance = np.linalg.norm(value, axis=1)
     _, first = np.unique(readings.pose, return_index=True)
     order = first[np.argsort(distance[first])]
-    at = [f"{d:.2f}" for d in distance[order]]
+    at = [f"{d:.3f}" for d in distance[order]]
     traces = [
         go.Bar(x=at, y=1e12 * variance[order], name=name, marker={"color": color, "pattern": mark})
         for name, variance, color, mark in (

@@ -22,6 +22,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 from nbclient import NotebookClient
 from nbformat import NotebookNode
+from traitlets.config import Config
 
 from studies.picture import svgs
 
@@ -63,6 +64,12 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_markdown(text: str, *, config: MkDocsConfig, **_: object) -> str:
+    """Let links to a script, which lead somewhere in the source, lead to its page."""
+    names = "|".join(path.stem for path in (Path(config.docs_dir) / "tutorials").glob("*.py"))
+    return re.sub(rf"(\]\([^)]*\b(?:{names}))\.py\)", r"\1.md)", text)
+
+
 def notebook(script: Path, *, run: bool) -> NotebookNode:
     """Return a script as a notebook, with outputs where it is run."""
     made = jupytext.read(script)
@@ -81,7 +88,11 @@ def notebook(script: Path, *, run: bool) -> NotebookNode:
             "COLUMNS": "100",
         }
         client = NotebookClient(
-            made, timeout=LONGEST, kernel_name="python3", resources={"metadata": {"path": place}}
+            made,
+            timeout=LONGEST,
+            kernel_name="python3",
+            resources={"metadata": {"path": place}},
+            config=Config(KernelManager={"transport": "ipc", "ip": f"{place}/kernel"}),
         )
         client.execute(env=environment)
     for cell in made.cells:

@@ -14,7 +14,7 @@
 # 1. you know the law: write it as an effect, and fit, diagnose and predict with it as with any other;
 # 2. you do not: let hilcal search the law in the readings, read what it found, and keep it as an effect.
 #
-# You need hilcal and nothing else; it takes about a minute. [A simulated campaign](simulated-campaign.md) explains the steps that are
+# You need hilcal and nothing else; it takes about a minute. [A simulated campaign](simulated-campaign.py) explains the steps that are
 # only used here.
 
 # %%
@@ -87,7 +87,9 @@ class CablePull(Effect):
 
     @property
     def parameters(self):
-        return tuple(Parameter(f"j{j + 1}", "rad/(N·m)", 3e-6) for j in range(self.cell.arm.n))
+        return tuple(
+            Parameter(f"j{j + 1}", "rad/(N·m)", 3e-6) for j in range(self.cell.arm.n)
+        )
 
     def columns(self, s):
         """The derivative of the deviation by the parameters: here of the joint angles, dq."""
@@ -95,7 +97,7 @@ class CablePull(Effect):
         return (Columns("dq", joints, joints, np.sin(s.angle) * s.torque),)
 
     def response(self, theta, s, change):
-        """The change of the deviation by a change of the torques, the last element of each wrench."""
+        """The change of the deviation by a change of the torques (last of each wrench)."""
         return Response(dq=(theta * np.sin(s.angle))[:, None, :] * change[:, :, :-1, 5])
 
 
@@ -133,8 +135,11 @@ diagnosis
 # %%
 assert diagnosis.suspects[0].effect == "cable_pull"
 fit = hc.fit(model + CablePull, run.readings)
-print(f"error on poses left out: {1e6 * diagnosis.fit.holdout.rms_m:.0f} µm without, {1e6 * fit.holdout.rms_m:.0f} µm with the effect")
-assert fit.holdout.rms_m < 0.8 * diagnosis.fit.holdout.rms_m
+without, within = diagnosis.fit.holdout.rms_m, fit.holdout.rms_m
+print(
+    f"error on poses left out: {1e6 * without:.0f} µm, with the effect {1e6 * within:.0f} µm"
+)
+assert within < 0.8 * without
 
 # %% [markdown]
 # An effect of your own is the one case in which the simulated arm moves by the same law as the model: this shows whether the campaign
@@ -177,7 +182,8 @@ curve = discovery.curves[0]
 x, y, std, _ = curve.binned
 readings = go.Scatter(x=x, y=y, error_y={"array": std}, mode="markers", name="readings")
 line = go.Scatter(x=curve.line[0], y=curve.line[1], mode="lines", name=law.formula)
-chart = go.Figure([readings, line], {"title": f"{curve.of} over {curve.quantity}", "template": "plotly_white"})
+layout = {"title": f"{curve.of} over {curve.quantity}", "template": "plotly_white"}
+chart = go.Figure([readings, line], layout)
 chart.update_xaxes(title=f"{curve.quantity}, {curve.quantity_unit}")
 chart.update_yaxes(title=f"{curve.of}, {curve.unit}")
 
@@ -206,7 +212,8 @@ print(source)
 
 # %%
 catalogue = hc.installed().with_file(Path("forearm_hose.py"))
-path = hc.refine(hc.baseline(campaign.cell, campaign.readings, catalogue=catalogue), campaign.readings)
+model = hc.baseline(campaign.cell, campaign.readings, catalogue=catalogue)
+path = hc.refine(model, campaign.readings)
 path
 
 # %%

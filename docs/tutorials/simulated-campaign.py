@@ -116,8 +116,13 @@ names = np.array(run.readings.load_names)[loaded]
 
 def by_load(values, title):
     """Draw the residual of each deflection, one box for each load."""
-    boxes = [go.Box(y=values[names == n], name=str(n), boxpoints="all") for n in sorted(set(names))]
-    chart = go.Figure(boxes, {"title": title, "showlegend": False, "template": "plotly_white"})
+    boxes = [
+        go.Box(y=values[names == n], name=str(n), boxpoints="all")
+        for n in sorted(set(names))
+    ]
+    chart = go.Figure(
+        boxes, {"title": title, "showlegend": False, "template": "plotly_white"}
+    )
     return chart.update_yaxes(title="residual, µm", range=[0, 120])
 
 
@@ -171,7 +176,11 @@ assert path.fit.error.rms_m < 0.75 * fit.error.rms_m
 
 # %%
 truth = simulated.world.truth
-rows = [(p.name, 1e6 * p.value, 1e6 * p.std, 1e6 * truth[p.name]) for p in path.fit.parameters if p.name in truth and p.identifiable]
+rows = [
+    (p.name, 1e6 * p.value, 1e6 * p.std, 1e6 * truth[p.name])
+    for p in path.fit.parameters
+    if p.name in truth and p.identifiable
+]
 print(f"{'µrad/(N·m)':30s}{'found':>8s}{'± std':>8s}{'true':>8s}")
 for name, value, std, true in rows:
     print(f"{name:30s}{value:8.2f}{std:8.2f}{true:8.2f}")
@@ -190,7 +199,9 @@ with hc.Campaign.open("fresh.hilcal") as other:
 after
 
 # %%
-rms = [1e6 * np.sqrt(np.mean([s.rms_m**2 for s in v.shares.loads])) for v in (before, after)]
+rms = [
+    1e6 * np.sqrt(np.mean([s.rms_m**2 for s in v.shares.loads])) for v in (before, after)
+]
 print(f"error at fresh poses: {rms[0]:.0f} µm before, {rms[1]:.0f} µm with the effect")
 assert rms[1] < 0.75 * rms[0]
 
@@ -241,6 +252,6 @@ run.close()
 # %% [markdown]
 # `report.html` is the whole story as one page. Where to go on:
 #
-# - [somebody's table of another arm](table-of-another-arm.md): the same without hilcal having measured;
+# - [somebody's table of another arm](table-of-another-arm.py): the same without hilcal having measured;
 # - [plan and measure a real campaign](../how-to/plan-a-campaign.md), [read a verdict](../how-to/read-a-verdict.md);
 # - `hilcal demo` rehearses all of it through the real drivers on simulated devices.

@@ -62,7 +62,8 @@ print(mapping)
 readings = hc.read_table("data/irb120.csv", cell, "mapping.toml")
 aside = readings.pose % 5 == 4
 fitted, others = readings[~aside], readings[aside]
-print(len(fitted), "readings are fitted,", len(others), "kept aside;", "loads:", *readings.load_names)
+print(len(fitted), "readings are fitted,", len(others), "kept aside")
+print("loads:", *readings.load_names)
 
 # %% [markdown]
 # ## The nominal arm, and what it lacks
@@ -103,7 +104,8 @@ path.fit
 
 # %%
 errors = {
-    name: 1e6 * np.linalg.norm(others.value - found.predict(others.states).position, axis=1)
+    name: 1e6
+    * np.linalg.norm(others.value - found.predict(others.states).position, axis=1)
     for name, found in (("nominal arm", nominal), ("refined", path.fit))
 }
 for name, error in errors.items():
@@ -112,7 +114,8 @@ assert errors["refined"].mean() < 0.2 * errors["nominal arm"].mean()
 
 # %%
 boxes = [go.Box(y=error, name=name, boxpoints="all") for name, error in errors.items()]
-chart = go.Figure(boxes, {"title": "Error at poses that were not fitted", "showlegend": False, "template": "plotly_white"})
+layout = {"title": "Error at poses that were not fitted", "template": "plotly_white"}
+chart = go.Figure(boxes, {**layout, "showlegend": False})
 chart.update_yaxes(title="error, µm", type="log")
 
 # %% [markdown]
@@ -125,13 +128,12 @@ chart.update_yaxes(title="error, µm", type="log")
 calibration = hc.Calibration.of(path.fit)
 asked = others.states.q[others.load == 0][:4]
 corrected = calibration.compensate(asked, calibration.loads["2.5 kg"])
-for k in range(len(asked)):
-    change = np.degrees(corrected.q[k] - asked[k])
+before, band = 1e3 * corrected.before.error_m, 1e3 * corrected.after.band_m
+for k, change in enumerate(np.degrees(corrected.q - asked)):
     print(
-        f"error {1e3 * corrected.before.error_m[k]:.2f} mm -> 95 % within {1e3 * corrected.after.band_m[k]:.2f} mm; add",
-        np.round(change, 3),
-        "deg",
+        f"error {before[k]:.2f} mm, corrected 95 % within {band[k]:.2f} mm; add", end=" "
     )
+    print(*np.round(change, 3), "deg")
 assert corrected.after.band_m.max() < 0.3 * corrected.before.error_m.min()
 
 # %% [markdown]
@@ -161,7 +163,9 @@ assert corrected.after.band_m.max() < 0.3 * corrected.before.error_m.min()
 truth = {2: -0.9, 3: 1.4, 4: 0.6, 5: -0.8}
 for joint, true in truth.items():
     p = path.fit.parameters[f"encoder_offset.j{joint}"]
-    print(f"zero of joint {joint}: {1e3 * p.value:6.3f} ± {1e3 * p.std:.3f} mrad; true {true}")
+    print(
+        f"zero of joint {joint}: {1e3 * p.value:6.3f} ± {1e3 * p.std:.3f} mrad; true {true}"
+    )
     assert abs(1e3 * p.value - true) < 4e3 * p.std
 
 # %% [markdown]
@@ -170,4 +174,4 @@ for joint, true in truth.items():
 # - [import a table](../how-to/import-a-table.md) has every key of a mapping;
 # - [add a robot](../how-to/add-a-robot.md), where yours is not among the arms that hilcal knows: a URDF will do;
 # - [correct a program](../how-to/correct-a-program.md): RAPID, KRL and others, in place of joint values;
-# - [an effect of one's own](an-effect-of-ones-own.md), where the catalogue has not what your arm has.
+# - [an effect of one's own](an-effect-of-ones-own.py), where the catalogue has not what your arm has.

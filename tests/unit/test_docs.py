@@ -43,7 +43,6 @@ def blocks(path: Path, language: str = "python") -> list[str]:
 def test_links_lead_to_files_of_the_tree(path: Path) -> None:
     links = re.findall(r"\]\(([^)#:]+)\)", path.read_text())
     drawn = {ROOT / "docs" / name for name in NAMES}  # in the build of the site
-    drawn |= {script.with_suffix(".md") for script in TUTORIALS}
     places = [(path.parent / link).resolve() for link in links]
     assert [place for place in places if not place.exists() and place not in drawn] == []
 
