@@ -156,8 +156,8 @@ def baseline(
 
     >>> cell = hc.Cell.load(CELL)
     >>> model = hc.baseline(cell, hc.read_table(TABLE, cell))
-    >>> (model + hc.effect("base_compliance")).names
-    ('base_frame', 'joint_compliance', 'base_compliance')
+    >>> (model + "base_compliance" + hc.effect("creep", joints="each")).names
+    ('base_frame', 'joint_compliance', 'base_compliance', 'creep')
 
     Args:
         cell: the cell.
