@@ -53,6 +53,7 @@ _PLACES = {
     "read_table": "hilcal.library",
     "refine": "hilcal.library",
     "report": "hilcal.write_report",
+    "simulate": "hilcal.library",
     "validate": "hilcal.validation",
     "view": "hilcal.library",
 }
@@ -84,6 +85,7 @@ if TYPE_CHECKING:
         plan,
         read_table,
         refine,
+        simulate,
         view,
     )
     from hilcal.model.model import Model

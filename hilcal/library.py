@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from hilcal.design.planner import Request, make
 from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.proposal import LawSearch
-from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import Options
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
@@ -35,12 +36,16 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
+from hilcal.store.plan import Plan
 from hilcal.store.schema import HEADER
 from hilcal.stream import fit as streams
 from hilcal.stream.fit import StreamFit
 from hilcal.tables.importing import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
+
+if TYPE_CHECKING:
+    from drivers.simulated.rehearsal import Rehearsal, SimulationCase
 
 
 def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) -> Readings:
@@ -151,8 +156,8 @@ def baseline(
 
     >>> cell = hc.Cell.load(CELL)
     >>> model = hc.baseline(cell, hc.read_table(TABLE, cell))
-    >>> (model + hc.effect("base_compliance")).names
-    ('base_frame', 'joint_compliance', 'base_compliance')
+    >>> (model + "base_compliance" + hc.effect("creep", joints="each")).names
+    ('base_frame', 'joint_compliance', 'base_compliance', 'creep')
 
     Args:
         cell: the cell.
@@ -337,6 +342,53 @@ def plan(
     planned = make(cell, config, request, rng, given, prior=_carried(prior, None))
     file = replace(planned.ordered.plan, about=about(planned))
     return checked(cell, config, file, summarise(planned, config, rng, compare=False))
+
+
+def simulate(
+    cell: "Cell | SimulationCase",
+    plan: CheckedPlan | Plan,
+    hide: str = "nothing",
+    seed: int = 0,
+    catalogue: Catalogue | None = None,
+) -> "Rehearsal":
+    """Measure a plan in a simulated cell in which an effect is hidden.
+
+    The arm, its tracker and what is hidden are drawn from the seed. No device is simulated; the
+    readings are drawn at once, each the mean of `[acquire] samples` measurements.
+
+    >>> cell = hc.Cell.load(CELL)
+    >>> plan = hc.plan(cell, poses=6)
+    >>> first = hc.simulate(cell, plan, hide="creep", seed=3)
+    >>> again = hc.simulate(first, plan, seed=4)  # the same arm, other noise
+    >>> first.hidden, len(first.readings) == len(again.readings)
+    ('creep', True)
+
+    Args:
+        cell: the cell, whose `[simulation]` has the strength of what is hidden; or what an earlier
+            call returned, for a further campaign of the same arm.
+        plan: what is measured.
+        hide: of the first campaign: an effect of `hilcal effects`, "random", "nothing", or
+            "invented", a law that the catalogue lacks.
+        seed: of everything random; of a further campaign of its noise.
+        catalogue: has effects of your own, which can be hidden, too.
+
+    Returns:
+        The campaign: `readings`, `hidden`, `mode`, and the truth in `world`; `save` writes a
+        campaign file.
+
+    Raises:
+        InputError: an effect that cannot be hidden; lists the valid ones.
+    """
+    from drivers.simulated import rehearsal  # the simulated world is of no use but here
+
+    what = plan.plan if isinstance(plan, CheckedPlan) else plan
+    if not isinstance(cell, Cell):
+        return rehearsal.read_plan(cell, what, [seed])
+    if hide == rehearsal.INVENTED:
+        catalogue = rehearsal.invented_law(catalogue or installed())
+    config = cell.configured()
+    case = rehearsal.case_of_plan(config, what, hide, seed, catalogue, cell.base_dir)
+    return rehearsal.read_plan(case, what, [seed, 1])
 
 
 @contextmanager

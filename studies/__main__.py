@@ -9,7 +9,6 @@ from hilcal.cli import application, execute
 from studies.all_effects_command import all_effects
 from studies.carried_bands_command import carried_bands
 from studies.carry_command import carry
-from studies.carry_picture import carry_picture
 from studies.change_command import change
 from studies.compensation_command import compensation
 from studies.corrected import corrected
@@ -18,8 +17,8 @@ from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
 from studies.discover_real_command import discover_real
 from studies.few_poses_command import few_poses
-from studies.few_poses_picture import few_poses_picture
 from studies.gross_errors_command import gross_errors
+from studies.made_of_command import made_of
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -41,14 +40,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)
     app.command("few-poses")(few_poses)
-    app.command("few-poses-picture")(few_poses_picture)
+    app.command("made-of")(made_of)
     app.command("all-effects")(all_effects)
     app.command("scaling")(scaling)
     app.command("serial-noise")(serial_noise)
     app.command("real")(real)
     app.command("carry")(carry)
     app.command("carried-bands")(carried_bands)
-    app.command("carry-picture")(carry_picture)
     app.command("compensation")(compensation)
     app.command("change")(change)
     app.command("corrected")(corrected)

@@ -1,28 +1,18 @@
-"""`python -m studies carry-picture`: the error against the number of poses, with and without prior.
+"""The error against the number of poses, with and without prior, of what `studies carry` kept."""
 
-The points are those that `python -m studies carry` kept. The picture is an SVG of plotly, written
-by a headless chromium; no network is needed.
-"""
-
-import base64
 import json
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import plotly.graph_objects as go
-import typer
-from plotly.offline import get_plotlyjs
 
 from hilcal.errors import InputError
 from hilcal.present.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
-from hilcal.whole_file import replace_file
+from studies.picture import HEIGHT, WIDTH
 
 PICTURE = "../images/carry-over.svg"
 """Its place from the page of results."""
-WIDTH, HEIGHT = 720, 400
 SERIES = {
     "B": ("the other half of Series B", MEASURED, "circle"),
     "C": ("Series C, other joint ranges", HOLDOUT, "diamond"),
@@ -46,18 +36,16 @@ class Point:
     without_m: list[float]
 
 
-def carry_picture(
-    kept: Annotated[list[Path], typer.Argument(metavar="F.json...", help="What `carry` kept.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="F.svg", help="The picture.")],
-) -> None:
-    """Draw the error with and without prior."""
-    points: list[Point] = []
-    for path in kept:
-        try:
-            points += [Point(**p) for p in json.loads(path.read_text(encoding="utf-8"))["points"]]
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: not kept by studies carry ({error})") from None
-    replace_file(output, svg(chart(points)))
+def carry_points(kept: Path) -> list[Point]:
+    """Return the points that `carry` kept.
+
+    Raises:
+        InputError: a file that it did not keep.
+    """
+    try:
+        return [Point(**p) for p in json.loads(kept.read_text(encoding="utf-8"))["points"]]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{kept}: not kept by studies carry ({error})") from None
 
 
 def chart(points: Sequence[Point]) -> go.Figure:
@@ -105,35 +93,3 @@ def chart(points: Sequence[Point]) -> go.Figure:
     out.update_xaxes(type="log", tickvals=ticks)
     out.update_yaxes(type="log", tickvals=[50, 100, 200, 500, 1000])
     return out
-
-
-def svg(of: go.Figure) -> str:
-    """Draw a figure as SVG.
-
-    Raises:
-        InputError: no chromium, or no playwright.
-    """
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        raise InputError("no chromium found: on Debian install chromium")
-    from playwright.sync_api import sync_playwright  # a package of the tests
-
-    with sync_playwright() as p:
-        browser = p.chromium.launch(executable_path=chromium, args=["--no-sandbox"])
-        page = browser.new_page()
-        page.set_content("<div id='chart'></div>")
-        page.add_script_tag(content=get_plotlyjs())
-        size = {"format": "svg", "width": WIDTH, "height": HEIGHT}
-        found: str = page.evaluate(
-            "([f, size]) => Plotly.newPlot('chart', f.data, f.layout)"
-            ".then(c => Plotly.toImage(c, {...size, imageDataOnly: true}))",
-            [json.loads(of.to_json()), size],
-        )
-        browser.close()
-    text = found if found.lstrip().startswith("<svg") else _decoded(found)
-    return text + "\n"
-
-
-def _decoded(text: str) -> str:
-    """Return the picture of a base64 text."""
-    return base64.b64decode(text).decode("utf-8")

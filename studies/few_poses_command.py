@@ -145,7 +145,7 @@ def few_poses(
 
 def refined(case: Case) -> Found:
     """Refine the poses of a case, and predict the others."""
-    cell, readings = _series(case.path)
+    cell, readings = series_of(case.path)
     if not case.attitudes:
         value, covariance = readings.value[:, :3], readings.covariance[:, :3, :3]
         readings = replace(readings, value=value, covariance=covariance)
@@ -196,7 +196,7 @@ def _planned(cell: Cell, readings: Readings, case: Case) -> Ints:
     return np.flatnonzero(design.counts)
 
 
-def _series(path: Path) -> tuple[Cell, Readings]:
+def series_of(path: Path) -> tuple[Cell, Readings]:
     """The cell and all readings of a series."""
     with path.open(encoding="utf-8") as stream:
         header = stream.readline()

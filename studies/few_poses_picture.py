@@ -1,26 +1,16 @@
-"""`python -m studies few-poses-picture`: two pictures of the page on naming and predicting.
-
-The mean error at other poses against their number, of what `python -m studies few-poses` kept; and
-what an arm is made of, of a campaign that `hilcal refine` gave a background.
-"""
+"""The error against the number of poses, of what `python -m studies few-poses` kept."""
 
 import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import plotly.graph_objects as go
-import typer
 
-from hilcal.campaign.campaign import Campaign
 from hilcal.errors import InputError
-from hilcal.identification.family_sizes import family_sizes
-from hilcal.present.charts.made_of import made_of
 from hilcal.present.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
-from hilcal.whole_file import replace_file
-from studies.carry_picture import HEIGHT, WIDTH, svg
 from studies.few_poses_command import SKETCH_MM
+from studies.picture import HEIGHT, WIDTH
 
 MEAN = re.compile(r"(\S+), (\d+) positions: mean error at .*")
 SERIES = {
@@ -40,18 +30,12 @@ FRAMES_MM = {
 of the same positions each."""
 
 
-def few_poses_picture(
-    kept: Annotated[list[Path], typer.Argument(metavar="F.json...", help="What was kept.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="F.svg", help="The picture.")],
-    of: Annotated[
-        Path | None,
-        typer.Option("--of", metavar="RUN.hilcal", help="Draw what its arm is made of."),
-    ] = None,
-    made: Annotated[
-        Path | None, typer.Option("--made-of", metavar="F.svg", help="The picture of it.")
-    ] = None,
-) -> None:
-    """Draw the error against the number of poses."""
+def few_poses_errors(kept: Sequence[Path]) -> dict[str, dict[int, float]]:
+    """Return the mean errors, mm, by series and number of poses, that studies kept.
+
+    Raises:
+        InputError: a file that `few-poses` did not keep.
+    """
     errors: dict[str, dict[int, float]] = {}
     for path in kept:
         try:
@@ -62,12 +46,7 @@ def few_poses_picture(
             if found := MEAN.fullmatch(f["what"]):
                 mean = float(f["measured"].split()[0])
                 errors.setdefault(found[1], {})[int(found[2])] = mean
-    replace_file(output, svg(chart(errors)))
-    if of is not None and made is not None:
-        with Campaign.open(of, read_only=True) as run:
-            drawn = made_of(family_sizes(run.fit()))
-        drawn.update_layout(paper_bgcolor=LIGHT, width=WIDTH)
-        replace_file(made, svg(drawn))
+    return errors
 
 
 def chart(errors: dict[str, dict[int, float]]) -> go.Figure:

@@ -25,8 +25,10 @@ from hilcal.config import CellConfig
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.measuring.route import approach_sides, home, route
+from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
+from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import UNLOADED, Plan
 from hilcal.toml import suggest
 from hilcal.types import Floats, Ints
@@ -97,6 +99,21 @@ class Rehearsal(SimulationCase):
     """
 
     readings: Readings
+
+    def save(self, path: str | Path) -> None:
+        """Write a new campaign file of the readings, which `Campaign.open` and commands take.
+
+        Raises:
+            InputError: a file is there already, or it cannot be written.
+        """
+        CampaignFile.create(
+            Path(path),
+            self.config.to_json(),
+            str(self.cell.base_dir),
+            "simulated campaign",
+            more={COVERS: WHOLE},
+            readings=self.readings,
+        ).close()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

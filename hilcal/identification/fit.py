@@ -153,6 +153,9 @@ class Fit(WithVarianceFactor):
     def residuals(self, frame: Frame = "sensor") -> Floats:
         """Residuals (D, m), measured − predicted, m and rad.
 
+        They are of `readings[~outlier][whitening.reading]`: of deflections the loaded readings,
+        which are not in the order of the campaign.
+
         Args:
             frame: axes that they are given in: "sensor", or "base" of the arm.
 

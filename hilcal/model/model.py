@@ -129,12 +129,14 @@ class Model:
         """Where each effect's parameters lie in the vector of all."""
         return self._slices
 
-    def __add__(self, effect: Effect | EffectSpec) -> "Model":
+    def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
         """Return the model with one more effect; one that is only named is built for it.
 
         Raises:
             InputError: an effect that is there already, or cannot be built.
         """
+        if isinstance(effect, str | type):
+            effect = EffectSpec(effect)
         if isinstance(effect, EffectSpec):
             return self._with(effect)
         return replace(self, effects=(*self.effects, effect))

@@ -22,12 +22,14 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.mapping import Mapping
 from hilcal.tables.table import write_table
 from hilcal.toml import check_section
+from studies.page_figures import NAMES
 from studies.random_campaigns import rehearse
 from tests.support import readme
 from tests.support.cli_cases import CELL, Capsys, ok, quickly_planned
 from tests.support.paths import ROOT
 
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 
 
 def blocks(path: Path, language: str = "python") -> list[str]:
@@ -37,11 +39,17 @@ def blocks(path: Path, language: str = "python") -> list[str]:
     )
 
 
-@pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+@pytest.mark.parametrize("path", [*DOCUMENTS, *TUTORIALS], ids=lambda p: str(p.relative_to(ROOT)))
 def test_links_lead_to_files_of_the_tree(path: Path) -> None:
     links = re.findall(r"\]\(([^)#:]+)\)", path.read_text())
-    missing = [link for link in links if not (path.parent / link).exists()]
-    assert missing == []
+    drawn = {ROOT / "docs" / name for name in NAMES}  # in the build of the site
+    places = [(path.parent / link).resolve() for link in links]
+    assert [place for place in places if not place.exists() and place not in drawn] == []
+
+
+def test_each_figure_that_is_drawn_is_on_a_page() -> None:
+    text = "".join(path.read_text() for path in DOCUMENTS)
+    assert [name for name in NAMES if f"/{name})" not in text] == []
 
 
 @pytest.fixture
