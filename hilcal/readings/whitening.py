@@ -157,11 +157,6 @@ class Whitening:
         """Return the number of measurements D (readings or deflections)."""
         return len(self.reading)
 
-    @property
-    def by_reading(self) -> bool:
-        """Whether each reading is a measurement, in its order, and none shares an error."""
-        return self.mode == "absolute" and _each_alone(self.buckets)
-
     def raw(self, x: Floats) -> Floats:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":

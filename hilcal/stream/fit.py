@@ -52,7 +52,6 @@ from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
-from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
 from hilcal.stream.passes import (
@@ -372,7 +371,7 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
     z = prior_coordinates(basis, point.y, by.prior)
 
     def equations_of(triangle: Floats) -> NormalEquations:
-        rows = written(by.basis.rows(space.columns(triangle[:, :-1])[:, live]))
+        rows = by.basis.rows(space.columns(triangle[:, :-1])[:, live])
         return NormalEquations(basis, rows.T @ rows, rows.T @ (triangle[:, -1] + rows @ z))
 
     equations, size = equations_of(point.triangle), len(theta) + 1
