@@ -75,7 +75,7 @@ class Minimum(Generic[P]):
 
     Attributes:
         point: the last point.
-        by: what its linear problem is regularised by.
+        by: priors, noise factor and basis of the last linear problem.
         iterations: steps taken.
         converged: whether the last step was negligible.
         rows: (R, L) rows of the last linearisation, where the point is within a negligible step of

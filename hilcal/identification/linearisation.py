@@ -241,10 +241,9 @@ def linearise(fit: Fit) -> Linearisation:
 class ModelColumns:
     """The columns of a fitted model in ordinary magnitudes of its parameters.
 
-    Those of parameters that are held at zero are left out, but for those by which their effect
-    would be scored as a suspect.
-
-    A carried prior's are by the coordinates in which it is independent.
+    Parameters that are held at zero have no column, unless a test of their effect needs it
+    (`Effect.for_scoring`). With a carried prior, columns are derivatives by the coordinates in
+    which that prior is independent.
 
     Attributes:
         parameter: (L,) indices of the parameters, or coordinates, ascending.

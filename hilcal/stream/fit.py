@@ -270,7 +270,7 @@ def _count(rows: Mapping[int, Ints]) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Found:
+class _StreamMinimum:
     """The minimum, and the normal equations there: of all, and without each fold."""
 
     problem: _Stream
@@ -352,7 +352,7 @@ class _Found:
         )
 
 
-def _solved(problem: _Stream, theta: Floats) -> _Found:
+def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
     """Return the minimum from parameters (P,) on.
 
     Raises:
@@ -380,4 +380,4 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
     for fold in point.folds:
         rest = combined((r for k, r in point.folds.items() if k != fold), size)
         change[fold] = transform @ (equations_of(rest).solve(by.beta) - now)
-    return _Found(problem, point, by, converged, equations, change)
+    return _StreamMinimum(problem, point, by, converged, equations, change)
