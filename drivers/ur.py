@@ -112,7 +112,7 @@ class UrArm:
         return replace(sample, torque=self._torques.mean())
 
     def take_control(self, mass: float, com: Floats) -> None:
-        """Become the one who commands the arm, and set its payload; see `ArmDevice.take_control`."""
+        """Take control of the arm and set its payload; see `ArmDevice.take_control`."""
         if self._motion is not None:
             raise failure(self._host, "the motion before has not ended")
         self._give_back()
