@@ -184,8 +184,7 @@ def whitened_jacobian(
     model: Model, prediction: Prediction, theta: Floats, w: Whitening, live: Ints
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live parameters."""
-    jacobian = model.jacobian(prediction, theta, w.m, live)
-    return w.whiten_readings(jacobian)
+    return w.whiten_readings(model.jacobian(prediction, theta, w.m, live), overwrite=True)
 
 
 def columns_of(

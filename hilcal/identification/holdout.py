@@ -116,9 +116,12 @@ def _with_families(
     ridge = np.zeros((len(others), len(others)))
     ridge[:flat, :flat] = solution.beta * per.T @ per
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
+    rows = solution.rows  # copied only where it must be: it may take a gigabyte
+    if len(dropped) or np.any(np.diff(order) != 1):
+        rows = np.hstack([rows[:, order], more * guess])
     found = solutions(
         FamilyProblem(
-            rows=np.hstack([solution.rows[:, order], more * guess]),
+            rows=rows,
             target=solution.white + solution.rows @ coordinates,
             ridge=ridge,
             pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),
