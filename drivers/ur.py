@@ -105,14 +105,14 @@ class UrArm:
         )
 
     def sample(self) -> ArmSample:
-        """Return a sample that is newer than the call; see `Arm.sample`."""
+        """Return a sample that is newer than the call; see `ArmDevice.sample`."""
         sample = self._read().sample
         if self._torques is None or self._motion is not None:
             return sample
         return replace(sample, torque=self._torques.mean())
 
     def take_control(self, mass: float, com: Floats) -> None:
-        """Become the one who commands the arm, and set its payload; see `Arm.take_control`."""
+        """Take control of the arm and set its payload; see `ArmDevice.take_control`."""
         if self._motion is not None:
             raise failure(self._host, "the motion before has not ended")
         self._give_back()

@@ -109,7 +109,7 @@ def _placed(cell: Cell, stored: Sequence[Mapping[str, Any]]) -> Cell:
     """Return a cell with its observers where a revision has them."""
     frames = [np.array(o["frame"], dtype=float) for o in stored]
     if not all(f.shape == (4, 4) and _is_frame(f) for f in frames):
-        raise ValueError("frames that are none")
+        raise ValueError("the stored frames are no rigid transforms")
     pairs = zip(cell.observers, frames, stored, strict=True)
     found = [replace(o, frame=f, offset=float(s["offset_m"])) for o, f, s in pairs]
     return replace(cell, observers=tuple(found))
@@ -239,14 +239,14 @@ def restore_model(
 def _restored(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None
 ) -> tuple[Model, Floats]:
-    """Do so; other errors than its own tell of a damaged record."""
+    """Return `restored` of a record that may be damaged: then any exception can be raised."""
     stored: Mapping[str, Any] = record.parameters_json
     targets = np.array(stored.get("targets", [stored["target"]]), dtype=float)
     registration = np.array(stored["registration"], dtype=float)
     if registration.shape != (4, 4) or targets.shape[1:] != (4, 4):
-        raise ValueError("frames that are none")
+        raise ValueError("the stored frames are no rigid transforms")
     if not all(_is_frame(frame) for frame in (registration, *targets)):
-        raise ValueError("frames that are none")
+        raise ValueError("the stored frames are no rigid transforms")
     if len(targets) != len(cell.known_targets):
         raise InputError(
             f"revision {record.number} is of {len(targets)} targets, the cell has "

@@ -140,7 +140,7 @@ def calibrate(
         more += ["--prior", str(prior)]
     for path in effects_from or ():
         more += ["--effects-from", str(path)]
-    told = _Told(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
+    told = _Continuation(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
     p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
     kept = p.settings.prior
     if kept is not None and prior is None and Path(kept).parent != output.absolute().parent:
@@ -205,8 +205,8 @@ def _asked(
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
-    """How to go on.
+class _Continuation:
+    """How an interrupted calibration is continued, for people.
 
     Attributes:
         t: where people are told.
@@ -248,7 +248,7 @@ def _procedure(
     cell: Cell,
     catalogue: Catalogue,
     asked: dict[str, Any],
-    told: _Told,
+    told: _Continuation,
 ) -> Procedure:
     """Begin a calibration, or take it up from its file.
 

@@ -66,15 +66,15 @@ class Next:
         planned: the plan.
         powers: of each pair, both ways round.
         shares: by load, the share of what separates the weakest pair.
-        stretched: how far the arm reaches in the poses that separate it most, by that in an
-            ordinary candidate.
+        reach_ratio: horizontal reach of the target, averaged over the planned poses by how much
+            they separate the weakest pair, over its mean in all candidate poses.
         notes: what was left out, one line each.
     """
 
     planned: Planned
     powers: tuple[PairPower, ...]
     shares: dict[str, float]
-    stretched: float
+    reach_ratio: float
     notes: tuple[str, ...]
 
 
@@ -141,8 +141,8 @@ def measure_next(
     if never:
         notes = (*notes, not_ruled_out(never))
     weakest = min(of.pairs, key=lambda pair: power(pair, then))
-    shares, stretched = _where(made, weakest, then)
-    return Next(made, powers, shares, stretched, notes)
+    shares, reach_ratio = _where(made, weakest, then)
+    return Next(made, powers, shares, reach_ratio, notes)
 
 
 def expected(
@@ -254,7 +254,7 @@ def reordered(
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:
-    """Shares of the loads in uᵀ M u of a pair, and how far the arm reaches where it is largest.
+    """Return the shares of the loads in uᵀ M u of a pair, and the ratio of the reach (see `Next`).
 
     Deflections that share an unloaded reading are correlated: a load's share is then what it
     adds to those before it.

@@ -42,7 +42,6 @@ from hilcal.identification.effect_columns import (
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import HeldOut, Linearisation, by_pose, linearise
 from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.factored import Tall
 from hilcal.regression.leave_out import left_out_residual
 from hilcal.regression.paired_test import improves
 from hilcal.regression.schur import eliminate
@@ -330,7 +329,7 @@ def _scored(
             of_s, largest = spectrum(s), most(of, bare)
             scored.append(_Scored(of, s, of_s, g, largest, p.score_of(of_s, g, largest)))
         able = [c for c in scored if c.score.p_value < level and c.score.log_evidence > 0]
-        held = iter(_left_out(p, [(c.of.tall, c.score) for c in able]))
+        held = iter(_left_out(p, [(c.of.white, c.score) for c in able]))
         yield tuple(replace(c, held=next(held)) if c in able else c for c in scored)
 
 
@@ -341,7 +340,7 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     columns: Callable[[], EffectColumns] = lambda: of  # noqa: E731 - of the small ones alone
     if of.numbers > MOST_KEPT:
         columns = partial(effect_columns, p.fit, effect)
-    left_out = LeftOut(lambda: _left_out(p, [(columns().tall, result)])[0])
+    left_out = LeftOut(lambda: _left_out(p, [(columns().white, result)])[0])
     if known is not None:
         left_out = LeftOut(lambda: known)
 
@@ -374,7 +373,7 @@ def _suspect(p: Linearisation, scored: _Scored, level: float, count: int) -> Sus
     )
 
 
-def _left_out(p: Linearisation, families: Sequence[tuple[Tall, FamilyScore]]) -> list[HeldOut]:
+def _left_out(p: Linearisation, families: Sequence[tuple[Floats, FamilyScore]]) -> list[HeldOut]:
     """Reductions of the error on poses left out by families of whitened columns (R, P)."""
     products = p.products(x for x, _ in families)
     scores = [score for _, score in families]

@@ -71,7 +71,7 @@ def _least(tests: "SuspectTests", full: EffectColumns, start: Strength) -> Stren
     p = tests.p
     rng = np.random.default_rng(_SEED)
     beta = rng.standard_normal((len(full.scale), DRAWS))
-    signal = full.tall @ beta
+    signal = full.white @ beta
     noise = max(p.fit.variance_factor, 1.0)
     error = np.sqrt(noise) * rng.standard_normal(signal.shape)
     moved = np.sqrt(np.mean(np.sum(np.einsum("dip,pk->dik", full.motion, beta) ** 2, axis=1)))

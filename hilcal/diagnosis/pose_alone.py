@@ -6,10 +6,10 @@ much: what is missing depends on the pose, and on nothing else that changed with
 
 The residual is split by constants of each pose, three displacements of the target. Where they leave
 noise and take nearly all of the misfit, the effects are listed whose own columns are such constants
-to nearly all of their square. A family tells its parameters from each other when the poses measure
-about as many elements as it has parameters. How many more poses tell is the least number of those
-tried with which the first of these effects, at the size of the misfit, passes every test of a
-suspect nine times in ten (see `more_poses`).
+to nearly all of their square. The parameters of a family can be told apart once the poses measure
+about as many elements as the family has parameters. The number of further poses that is proposed is
+the smallest of the numbers tried at which the first of these effects, as large as the misfit, would
+pass every test of a suspect with a probability of 0.9 (see `more_poses`).
 """
 
 from collections.abc import Sequence

@@ -50,7 +50,7 @@ def kept_by_step(p: Linearisation, of: EffectColumns, score: FamilyScore) -> flo
         score: of the effect.
     """
     fit, s = p.fit, p.fit.solution
-    aim = s.white - of.tall @ score.step
+    aim = s.white - of.white @ score.step
     z = p.projection.solve(p.rows.T @ aim - p.projection.ridge * s.coordinates())
     model = replace(fit.model, effects=(*fit.model.effects, of.effect))
     theta = [s.theta + s.transform @ z, of.scale * score.step]

@@ -39,7 +39,6 @@ from scipy.linalg import block_diag, lapack, solve_triangular
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE, candidates
 from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.wide_suspects import WideColumns
 from hilcal.model.observe import motion
 from hilcal.readings.covariance import instrument_root
 from hilcal.readings.reading_groups import Group, arrival_groups, deflection_groups, runs
@@ -64,8 +63,7 @@ readings far better; choices, rough but for little computing."""
 FEWEST = 12
 """Readings below which nothing is estimated; a choice."""
 MOST_READINGS = 600
-"""Measurements above which nothing is estimated; a choice by timing: effects with over a thousand
-columns, as a transmission error, are kept by factors (`wide_suspects`) where noise is white."""
+"""Measurements above which nothing is estimated; a choice by timing."""
 POSITION = 3
 """Elements of a reading by which it is estimated: an attitude follows its position."""
 MOST_ROWS = 450
@@ -218,10 +216,7 @@ class _SerialProblem:
             return np.asarray(white @ white.T)
 
         for of in columns_of_each(self.fit, candidates(self.fit)):
-            moved = of.of_readings
-            if isinstance(moved, WideColumns):
-                moved = moved.readings(slice(None))
-            yield of.effect.name, of_columns(moved[self.rows])
+            yield of.effect.name, of_columns(of.of_readings[self.rows])
         time = kept.states.time
         t = np.arange(len(kept), dtype=float) if time is None else time
         scaled = 2 * (t - t.min()) / max(float(np.ptp(t)), 1e-300) - 1

@@ -145,7 +145,7 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Changeable of an elastic deviation by P changes of the slot wrenches.
+    """Derivative of an elastic deviation by P changes of the wrenches at the slots of the chain.
 
     Attributes:
         dq: (N, P, n) or None.
@@ -158,7 +158,7 @@ class Response:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Changeable of the load on the arm, in axes that move with it.
+    """Change of the load on the arm, in axes that move with it.
 
     Attributes:
         point: (3,) shift of the load point, flange axes, m; None for none.
@@ -289,7 +289,7 @@ class Effect(ABC):
         return found
 
     def response(self, theta: Floats, s: Situation, change: Floats) -> Response:
-        """Changeable of the deviation by changes (N, P, n + 1, 6) of the slot wrenches.
+        """Return how the deviation changes with changes (N, P, n + 1, 6) of the slot wrenches.
 
         For `dq`, `s.along(change)` are the torques of the drives (see `Situation.torque`).
         """
@@ -300,7 +300,7 @@ class Effect(ABC):
         return None
 
     def wrench_change(self, theta: Floats, s: Situation) -> Floats | None:
-        """Changeable (N, 6) of the load's wrench at the load point, base axes, or None.
+        """Return the change (N, 6) of the load's wrench at the load point, base axes, or None.
 
         For effects by which the recorded wrench `s.states.wrench` is not what acts; at the
         orientation of `s.chain`. The changes of several effects add.

@@ -21,13 +21,11 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.wide_effects import measured_columns
 from hilcal.model.model import Model
 from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
 from hilcal.readings.covariance import scatter_alone, with_scatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
-from hilcal.regression.factored import Factored, Tall
 from hilcal.regression.variance_components import (
     BlockRows,
     VarianceComponents,
@@ -90,7 +88,7 @@ class _Whitened:
     readings: Readings
     w: Whitening
     y: Floats
-    rows: Tall
+    rows: Floats
 
     def blocks(self, components: list[list[Floats]]) -> list[BlockRows]:
         """Rows in blocks, with the whitened blocks of each component."""
@@ -99,9 +97,7 @@ class _Whitened:
             groups, size = len(b.loaded), b.factor.shape[-1]
             stop = at + groups * size
             y = self.y[at:stop].reshape(groups, size)
-            rows = self.rows
-            if not isinstance(rows, Factored):  # which has one bucket
-                rows = rows[at:stop].reshape(groups, size, rows.shape[1])
+            rows = self.rows[at:stop].reshape(groups, size, -1)
             out.append(BlockRows(y, rows, np.stack([c[k] for c in components])))
             at = stop
         return out
@@ -172,14 +168,9 @@ def _whitened(fit: Fit) -> _Whitened:
     return _Whitened(some, w, white + rows @ s.coordinates(), rows)
 
 
-def _rows(fit: Fit, w: Whitening, chosen: Ints, live: Ints) -> Tall:
+def _rows(fit: Fit, w: Whitening, chosen: Ints, live: Ints) -> Floats:
     """Columns (R, K) of a fit, by its identifiable coordinates, in some readings."""
     s = fit.solution
-    if isinstance(s.tall, Factored) and w.by_reading:
-        columns = measured_columns(fit.model, s.prediction, s.theta, fit.whitening, live)
-        if isinstance(columns, Factored):
-            tall = columns.of(chosen).turned_rows(w.buckets[0].factor)
-            return s.equations.basis.restricted(s.estimated).rows(tall)
     jacobian = fit.model.jacobian(s.prediction, s.theta, w.m, live)[chosen]
     white = w.whiten(w.raw(jacobian)).reshape(w.m * len(w), len(live))
     return np.asarray(white @ s.transform[live])

@@ -1,7 +1,6 @@
 """The columns of effects that are not in a fitted model, at the parameters of the fit.
 
-Those of many effects are computed and whitened together. A wide effect, as the harmonics of a
-transmission error, is kept by its factors (`wide_suspects`).
+Those of many effects are computed and whitened together.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -12,9 +11,7 @@ import numpy as np
 
 from hilcal.effects.protocol import Effect
 from hilcal.identification.fit import Fit
-from hilcal.identification.wide_suspects import WideColumns, wide_effect
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.factored import Tall, written
 from hilcal.types import Bools, Floats
 
 TOGETHER = 8_000_000
@@ -31,55 +28,40 @@ class EffectColumns:
     Attributes:
         effect: the effect.
         scale: (P,) ordinary magnitudes, SI.
-        together: (R, Q) whitened columns of all effects that were whitened together; None for one
-            that is kept by its factors.
+        together: (R, Q) whitened columns of all effects that were whitened together.
         within: which of them are this effect's, P.
-        of_readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad; or its
-            factors.
+        of_readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
         whitening: of the readings.
         bare: (N,) which readings are unloaded.
     """
 
     effect: Effect
     scale: Floats
-    together: Floats | None
+    together: Floats
     within: slice
-    of_readings: Floats | WideColumns
+    of_readings: Floats
     whitening: Whitening
     bare: Bools
 
     @property
-    def tall(self) -> Tall:
-        """(R, P) whitened columns, by their factors where they are kept so."""
-        if isinstance(self.of_readings, WideColumns):
-            return self.of_readings.white
-        assert self.together is not None  # noqa: S101 - one of the two is there
-        return self.together[:, self.within]
-
-    @property
     def white(self) -> Floats:
         """(R, P) whitened columns."""
-        return written(self.tall)
+        return self.together[:, self.within]
 
     @property
     def numbers(self) -> int:
         """How many numbers are kept."""
-        of = self.of_readings
-        return of.numbers if isinstance(of, WideColumns) else of.size
+        return self.of_readings.size
 
     @cached_property
     def motion(self) -> Floats:
         """(D, 3, P) displacement of each measured position, m."""
-        of = self.of_readings
-        moved = of.readings(slice(None)) if isinstance(of, WideColumns) else of
-        return self.whitening.raw(moved[:, :3])
+        return self.whitening.raw(self.of_readings[:, :3])
 
     @cached_property
     def unloaded(self) -> Floats:
         """(U, 3, P) displacement of the target in each unloaded reading, sensor axes, m."""
-        of = self.of_readings
-        moved = of.readings(self.bare) if isinstance(of, WideColumns) else of[self.bare]
-        return np.asarray(moved[:, :3])
+        return np.asarray(self.of_readings[self.bare, :3])
 
 
 def computable(fit: Fit, effect: Effect) -> bool:
@@ -106,37 +88,27 @@ def columns_in_parts(fit: Fit, effects: Sequence[Effect]) -> Iterator[tuple[Effe
     w, solution = fit.whitening, fit.solution
     s = solution.prediction.situation
     count, bare = len(s.angle), fit.readings[~fit.outlier].unloaded
-    wide = {e.name: found for e in effects if (found := wide_effect(e, s, w)) is not None}
 
     def numbers(effect: Effect) -> int:
-        return count * len(effect.magnitudes) * (1 if effect.name in wide else w.m)
+        return count * len(effect.magnitudes) * w.m
 
     for group in _groups(effects, numbers, TOGETHER):
-        narrow = tuple(e for e in group if e.name not in wide)
-        scale = np.concatenate([np.zeros(0), *(e.magnitudes for e in narrow)])
-        drives = np.empty((count, w.m, fit.model.cell.arm.n))
+        scale = np.concatenate([e.magnitudes for e in group])
         jacobian = fit.model.jacobian_of(
-            narrow, solution.prediction, solution.theta, w.m, scale=scale, drives=drives
+            group, solution.prediction, solution.theta, w.m, scale=scale
         )
-        white_drives = w.whiten_readings(drives) if len(narrow) < len(group) else drives
         parts, start = tuple(_groups(group, numbers, WHITENED)), 0
         for part in parts:
-            sizes = [len(e.magnitudes) if e.name not in wide else 0 for e in part]
-            ends = np.cumsum([0, *sizes]).tolist()
+            ends = np.cumsum([0, *(len(e.magnitudes) for e in part)]).tolist()
             own = jacobian[:, :, start : start + ends[-1]]
             start += ends[-1]
             if len(parts) > 1:  # what is kept of a part does not keep the others
                 own = own.copy()
             white = w.whiten_readings(own)
-            out = []
-            for e, within in zip(part, map(slice, ends[:-1], ends[1:]), strict=True):
-                if e.name in wide:
-                    of = wide[e.name].columns(drives, white_drives)
-                    out.append(EffectColumns(e, e.magnitudes, None, within, of, w, bare))
-                else:
-                    mine = own[:, :, within]
-                    out.append(EffectColumns(e, e.magnitudes, white, within, mine, w, bare))
-            yield tuple(out)
+            yield tuple(
+                EffectColumns(e, e.magnitudes, white, within, own[:, :, within], w, bare)
+                for e, within in zip(part, map(slice, ends[:-1], ends[1:]), strict=True)
+            )
 
 
 def _groups(

@@ -21,11 +21,9 @@ from hilcal.identification.gauss_newton_steps import (
 from hilcal.identification.priors import prior_of
 from hilcal.identification.regularisation import LinearProblem, spent_parameters
 from hilcal.identification.residual import residual
-from hilcal.identification.wide_effects import whitened_columns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.factored import Tall, written
 from hilcal.regression.normal_equations import Basis, NormalEquations
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
@@ -44,7 +42,6 @@ class Solution:
         equations: normal equations at the solution, in identifiable coordinates z of y.
         live: (L,) indices of the y that are not held at zero.
         rows: (R, K) whitened derivative of the measurements by z.
-        tall: the same, by its factors where that pays.
         prediction: prediction at the solution.
         raw: (D, m) residual.
         white: (R,) whitened residual.
@@ -61,7 +58,6 @@ class Solution:
     equations: NormalEquations
     live: Ints
     rows: Floats
-    tall: Tall
     prediction: Prediction
     raw: Floats
     white: Floats
@@ -126,10 +122,8 @@ class _Problem(NewtonProblem[_Iterate]):
         a = self.columns(point, live)
         return linear_problem(point, prior, a, point.white, self.w.rank, noise, self.whitened)
 
-    def columns(self, point: _Iterate, live: Ints) -> Tall:
+    def columns(self, point: _Iterate, live: Ints) -> Floats:
         """Whitened derivative (R, L) by the live coordinates."""
-        if not len(self.coordinates.index):
-            return whitened_columns(self.model, point.prediction, point.theta, self.w, live)
         return columns_of(self.model, self.coordinates, point.prediction, point.theta, self.w, live)
 
 
@@ -162,8 +156,7 @@ def solve(
     point, by = found.point, found.by
     live = np.flatnonzero(by.prior > 0)
     columns = problem.columns(point, live) if found.rows is None else found.rows
-    turned = by.basis.rows(columns)
-    rows = written(turned)
+    rows = by.basis.rows(columns)
     beta = point.mean_square(len(by.basis.singular)) if w.scaling == "none" else by.beta
     # Formed anew at the solution, so that folds can be taken out of them exactly.
     basis = over_all_parameters(by.basis, live, model.size)
@@ -178,7 +171,6 @@ def solve(
         equations=equations,
         live=live,
         rows=rows,
-        tall=turned,
         prediction=point.prediction,
         raw=point.raw,
         white=point.white,
@@ -192,8 +184,7 @@ def whitened_jacobian(
     model: Model, prediction: Prediction, theta: Floats, w: Whitening, live: Ints
 ) -> Floats:
     """Whitened derivative (R, L) of the measurements by the live parameters."""
-    jacobian = model.jacobian(prediction, theta, w.m, live)
-    return w.whiten_readings(jacobian)
+    return w.whiten_readings(model.jacobian(prediction, theta, w.m, live), overwrite=True)
 
 
 def columns_of(

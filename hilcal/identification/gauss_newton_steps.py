@@ -22,7 +22,6 @@ from hilcal.identification.regularisation import (
 )
 from hilcal.identification.solver import shortened
 from hilcal.model.model import Model
-from hilcal.regression.factored import Tall, gram, written
 from hilcal.regression.normal_equations import TALL
 from hilcal.regression.triangle import triangle_of
 from hilcal.types import Floats
@@ -76,7 +75,7 @@ class Minimum(Generic[P]):
 
     Attributes:
         point: the last point.
-        by: what its linear problem is regularised by.
+        by: priors, noise factor and basis of the last linear problem.
         iterations: steps taken.
         converged: whether the last step was negligible.
         rows: (R, L) rows of the last linearisation, where the point is within a negligible step of
@@ -87,7 +86,7 @@ class Minimum(Generic[P]):
     by: Regularisation
     iterations: int
     converged: bool
-    rows: Tall | None
+    rows: Floats | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,7 +118,7 @@ class NewtonProblem(Generic[P]):
 def linear_problem(
     point: NewtonPoint,
     prior: Floats,
-    a: Tall,
+    a: Floats,
     white: Floats,
     rank: int,
     noise: float,
@@ -137,10 +136,10 @@ def linear_problem(
     origin = np.where(np.isinf(prior), point.y, 0.0)
     rows = a
     if len(a) > TALL and 2 * np.count_nonzero(np.isinf(prior)) > len(live):
-        triangle = triangle_of(written(a), white)
+        triangle = triangle_of(a, white)
         a, white = triangle[:, :-1], triangle[:, -1]
     target = white + a @ (point.y - origin)[live]
-    return LinearProblem(live, origin, a, gram(a), target, rank, noise, whitened, rows)
+    return LinearProblem(live, origin, a, a.T @ a, target, rank, noise, whitened, rows)
 
 
 def minimum(problem: NewtonProblem[P], start: Floats | None, prior: Floats | None) -> Minimum[P]:

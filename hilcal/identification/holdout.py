@@ -12,12 +12,10 @@ fit where that is more.
 
 import numpy as np
 
-from hilcal.identification.gauss_newton import Solution
+from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.priors import FIRST_GUESS, prior_of, scales_of
-from hilcal.identification.wide_effects import measured_columns, whitened_columns
 from hilcal.model.model import Model
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.factored import beside, of_rows, ordered, scaled
 from hilcal.regression.fold_evidence import FamilyProblem, solutions
 from hilcal.regression.leave_out import Fold, folds
 from hilcal.types import Floats, Ints
@@ -88,10 +86,10 @@ def leave_out(model: Model, solution: Solution, fold: Ints, w: Whitening) -> Flo
     else:
         change = changes(model, solution, fold, w)
     moved = np.flatnonzero(np.any(change != 0, axis=0))
-    columns = measured_columns(model, solution.prediction, solution.theta, w, moved)
-    predicted, row = solution.raw.copy(), w.rows_of(fold)
+    columns = w.raw(model.jacobian(solution.prediction, solution.theta, w.m, moved))
+    predicted = solution.raw.copy()
     for f, by in enumerate(change[:, moved]):
-        predicted[fold == f] -= (of_rows(columns, row == f) @ by).reshape(-1, w.m)
+        predicted[fold == f] -= columns[fold == f] @ by
     return predicted
 
 
@@ -105,7 +103,7 @@ def _with_families(
     if len(dropped) * solution.raw.size > MOST_ELEMENTS:
         dropped = dropped[:0]
     guess = FIRST_GUESS * scales_of(model)[dropped]
-    more = whitened_columns(model, solution.prediction, solution.theta, w, dropped)
+    more = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
     shrunk = groups[basis.held] >= 0
     others = np.concatenate([np.arange(flat), flat + np.flatnonzero(~shrunk)])
     kept = flat + np.flatnonzero(shrunk)
@@ -118,9 +116,12 @@ def _with_families(
     ridge = np.zeros((len(others), len(others)))
     ridge[:flat, :flat] = solution.beta * per.T @ per
     ridge[np.arange(flat, len(others)), np.arange(flat, len(others))] = solution.beta
+    rows = solution.rows  # copied only where it must be: it may take a gigabyte
+    if len(dropped) or np.any(np.diff(order) != 1):
+        rows = np.hstack([rows[:, order], more * guess])
     found = solutions(
         FamilyProblem(
-            rows=beside(ordered(solution.tall, order), scaled(more, guess)),
+            rows=rows,
             target=solution.white + solution.rows @ coordinates,
             ridge=ridge,
             pull=np.concatenate([-solution.beta * per.T @ own, np.zeros(len(others) - flat)]),

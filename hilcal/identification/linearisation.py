@@ -25,9 +25,7 @@ from hilcal.identification.folds import random_folds
 from hilcal.identification.gauss_newton import columns_of
 from hilcal.identification.holdout import folds_of
 from hilcal.identification.priors import scales_of
-from hilcal.identification.wide_effects import whitened_columns
 from hilcal.regression.evidence import FamilyScore, score_family
-from hilcal.regression.factored import Tall, gram, scaled, written
 from hilcal.regression.leave_out import (
     FamilyProducts,
     Fold,
@@ -164,7 +162,7 @@ class Linearisation:
             return self.projection.schur(x.whole.gram, x.whole.cross)
         return self.projection.information(x)
 
-    def products(self, families: Iterable[Tall]) -> list[FamilyProducts]:
+    def products(self, families: Iterable[Floats]) -> list[FamilyProducts]:
         """Return the products of families of whitened columns, which `held_out` needs."""
         return family_products(self.folds, self.projection, self.fit.white, families)
 
@@ -191,17 +189,15 @@ class Linearisation:
         The model's columns and the residual are multiplied by all that were whitened together at
         once.
         """
+        if not columns:
+            return []
         own = np.column_stack([self.rows, self.residual])
-        together = next((of.together for of in columns if of.together is not None), None)
-        of_all = None if together is None else own.T @ together
+        of_all = own.T @ columns[0].together
         out = []
         for of in columns:
-            if of_all is not None and of.together is together:
-                both = of_all[:, of.within]
-            else:
-                both = (of.tall.T @ own).T
+            both = of_all[:, of.within]
             lifted = self.projection.inverse_root @ both[:-1]
-            out.append((gram(of.tall) - lifted.T @ lifted, both[-1]))
+            out.append((of.white.T @ of.white - lifted.T @ lifted, both[-1]))
         return out
 
     def misfit(self) -> float:
@@ -245,10 +241,9 @@ def linearise(fit: Fit) -> Linearisation:
 class ModelColumns:
     """The columns of a fitted model in ordinary magnitudes of its parameters.
 
-    Those of parameters that are held at zero are left out, but for those by which their effect
-    would be scored as a suspect.
-
-    A carried prior's are by the coordinates in which it is independent.
+    Parameters that are held at zero have no column, unless a test of their effect needs it
+    (`Effect.for_scoring`). With a carried prior, columns are derivatives by the coordinates in
+    which that prior is independent.
 
     Attributes:
         parameter: (L,) indices of the parameters, or coordinates, ascending.
@@ -275,13 +270,8 @@ def model_columns(fit: Fit) -> ModelColumns:
     kept = (s.prior > 0) | (np.array(scored, dtype=np.bool_) & ~carried)
     parameter = np.flatnonzero(kept)
     scale = s.space.scales(scales_of(model))[parameter]
-    columns: Tall
-    if len(s.space.index):
-        columns = columns_of(model, s.space, s.prediction, s.theta, w, parameter)
-    else:
-        columns = whitened_columns(model, s.prediction, s.theta, w, parameter)
-    columns = scaled(columns, scale)
-    return ModelColumns(parameter, scale, written(columns), gram(columns))
+    columns = columns_of(model, s.space, s.prediction, s.theta, w, parameter) * scale
+    return ModelColumns(parameter, scale, columns, columns.T @ columns)
 
 
 def eliminate_effect(fit: Fit, columns: ModelColumns, effect: str) -> ReducedModel:

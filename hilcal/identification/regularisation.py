@@ -10,7 +10,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from hilcal.regression.empirical_bayes import maximise_evidence, spent_by_groups
-from hilcal.regression.factored import Tall, keep_columns
 from hilcal.regression.normal_equations import (
     Basis,
     FlatProducts,
@@ -48,13 +47,13 @@ class LinearProblem:
 
     live: Ints
     origin: Floats
-    a: Tall
+    a: Floats
     gram: Floats
     target: Floats
     rank: int
     noise: float
     whitened: bool
-    rows: Tall
+    rows: Floats
     _triangles: dict[bytes, Floats] = field(default_factory=dict, repr=False)
     _products: dict[bytes, FlatProducts] = field(default_factory=dict, repr=False)
 
@@ -68,8 +67,8 @@ class LinearProblem:
             return self
         gram = self.gram[np.ix_(kept, kept)]
         same = self.rows is self.a
-        a = keep_columns(self.a, kept)
-        rows = a if same else keep_columns(self.rows, kept)
+        a = self.a[:, kept]
+        rows = a if same else self.rows[:, kept]
         known = {key: of.restricted(kept) for key, of in self._products.items()}
         live = self.live[kept]
         return replace(self, live=live, a=a, gram=gram, rows=rows, _products=known)

@@ -39,14 +39,12 @@ from scipy.stats import chi2
 
 from hilcal.identification.coordinates import Coordinates
 from hilcal.identification.folds import block_folds, region_folds
-from hilcal.identification.gauss_newton import Solution
+from hilcal.identification.gauss_newton import Solution, whitened_jacobian
 from hilcal.identification.holdout import changes
 from hilcal.identification.priors import prior_of, scales_of
-from hilcal.identification.wide_effects import whitened_columns
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Whitening
-from hilcal.regression.factored import Tall, gram
 from hilcal.regression.normal_equations import NULL_SHARE, Basis
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root
@@ -138,7 +136,7 @@ def _hyperparameter_factors(
     dropped = np.flatnonzero((groups >= 0) & (solution.prior == 0))
     if w.scaling == "none" or not len(dropped) or not solution.rows.shape[1]:
         return factor
-    columns = whitened_columns(model, solution.prediction, solution.theta, w, dropped)
+    columns = whitened_jacobian(model, solution.prediction, solution.theta, w, dropped)
     transform = solution.transform
     return factor * dropped_group_factors(
         transform, solution.projection(), columns, groups[dropped], beta
@@ -246,7 +244,7 @@ def _of_group(covariance: Floats, theta: Floats, prior: float) -> Floats:
 
 
 def dropped_group_factors(
-    transform: Floats, p: Projection, columns: Tall, groups: Ints, beta: float
+    transform: Floats, p: Projection, columns: Floats, groups: Ints, beta: float
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
@@ -257,7 +255,7 @@ def dropped_group_factors(
         groups: (Q,) their groups.
         beta: noise factor that priors are weighed against.
     """
-    cross, own_gram = p.rows.T @ columns, gram(columns)
+    cross, own_gram = p.rows.T @ columns, columns.T @ columns
     norm2 = np.diag(own_gram)
     free = np.maximum(norm2 - np.sum((p.inverse_root @ cross) ** 2, axis=0), 0.0)
     reach = np.bincount(groups, weights=free) / np.maximum(np.bincount(groups), 1)

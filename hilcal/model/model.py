@@ -222,14 +222,12 @@ class Model:
         theta: Floats,
         m: int,
         live: Ints | None = None,
-        drives: Floats | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by all parameters, sensor axes.
 
-        With `live`, an ascending list of L parameters, only those: (N, m, L). Where `drives`
-        (N, m, n) is given, the derivative by displacements of the drives is written to it.
+        With `live`, an ascending list of L parameters, only those: (N, m, L).
         """
-        return self.jacobian_of(self.effects, prediction, theta, m, live, drives=drives)
+        return self.jacobian_of(self.effects, prediction, theta, m, live)
 
     def jacobian_of(
         self,
@@ -239,7 +237,6 @@ class Model:
         m: int,
         live: Ints | None = None,
         scale: Floats | None = None,
-        drives: Floats | None = None,
     ) -> Floats:
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
@@ -260,9 +257,7 @@ class Model:
         out = np.empty((count, m, len(live)))
 
         for rows in chunks(count, m * len(live)):
-            moves = self._fill(out[rows], effects, places, prediction[rows], theta, units)
-            if drives is not None:
-                drives[rows] = moves.drives
+            self._fill(out[rows], effects, places, prediction[rows], theta, units)
         return out
 
     def _fill(
@@ -273,7 +268,7 @@ class Model:
         prediction: Prediction,
         theta: Floats,
         scale: Floats | None,
-    ) -> ReadingDerivative:
+    ) -> None:
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
@@ -296,7 +291,6 @@ class Model:
             elif (change := e.wrench_columns(at, s)) is not None:
                 columns.add_wrench_changes(change, place)
         columns.write(out)
-        return moves
 
     def _motion(
         self, prediction: Prediction, theta: Floats, m: int

@@ -409,8 +409,8 @@ def _difference(found: Next) -> str:
         if share >= _LEAST_SHARE
     ]
     words = f"What separates the weakest pair comes from {numbers.names(named)}"
-    if found.stretched > _STRETCHED:
+    if found.reach_ratio > _STRETCHED:
         words += ", most of it with the arm stretched out"
-    elif found.stretched < 1 / _STRETCHED:
+    elif found.reach_ratio < 1 / _STRETCHED:
         words += ", most of it with the arm drawn in"
     return f"{words}."

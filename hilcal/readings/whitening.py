@@ -39,7 +39,8 @@ MANY = 1000
 """Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
 rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
 timing."""
-
+TOGETHER = 1_000_000
+"""Numbers that are whitened at a time; a choice by memory."""
 RUN = 200
 """Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
 larger ones the whitening costs as much as predicting."""
@@ -157,32 +158,31 @@ class Whitening:
         """Return the number of measurements D (readings or deflections)."""
         return len(self.reading)
 
-    @property
-    def by_reading(self) -> bool:
-        """Whether each reading is a measurement, in its order, and none shares an error."""
-        return self.mode == "absolute" and _each_alone(self.buckets)
-
     def raw(self, x: Floats) -> Floats:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
             return x if _each_alone(self.buckets) else x[self.reading]
         return np.concatenate([b.difference(x) for b in self.buckets])
 
-    def whiten(self, raw: Floats) -> Floats:
-        """Whitened rows (D·m, ...) of measurements (D, m, ...)."""
-        shape = (len(raw) * self.m, *raw.shape[2:])
-        flat, start = raw.reshape(len(raw) * self.m, math.prod(raw.shape[2:])), 0
-        parts = []
+    def whiten(self, raw: Floats, overwrite: bool = False) -> Floats:
+        """Whitened rows (D·m, ...) of measurements (D, m, ...); in their memory if `overwrite`."""
+        flat = raw.reshape(len(raw) * self.m, math.prod(raw.shape[2:]))
+        out = flat if overwrite else np.empty_like(flat)
+        start = 0
         for b in self.buckets:
             groups, size = b.factor.shape[:2]
-            block = flat[start : start + groups * size].reshape(groups, size, flat.shape[1])
-            parts.append((b.factor @ block).reshape(groups * size, flat.shape[1]))
-            start += groups * size
-        return (parts[0] if len(parts) == 1 else np.concatenate(parts)).reshape(shape)
+            some = max(1, TOGETHER // max(size * flat.shape[1], 1))
+            for first in range(0, groups, some):
+                factor = b.factor[first : first + some]
+                rows = slice(start, start + len(factor) * size)
+                block = flat[rows].reshape(len(factor), size, flat.shape[1])
+                out[rows] = (factor @ block).reshape(len(factor) * size, flat.shape[1])
+                start = rows.stop
+        return out.reshape(len(flat), *raw.shape[2:])
 
-    def whiten_readings(self, x: Floats) -> Floats:
+    def whiten_readings(self, x: Floats, overwrite: bool = False) -> Floats:
         """Whitened rows (D·m, ...) of values at the readings (N, m, ...)."""
-        return self.whiten(self.raw(x))
+        return self.whiten(self.raw(x), overwrite)
 
     def rows_of(self, measurements: Ints) -> Ints:
         """Repeat a number per measurement (D,) for each of its rows (D·m,)."""

@@ -19,7 +19,6 @@ import numpy as np
 import scipy.linalg as sl
 
 from hilcal.regression.empirical_bayes import EmpiricalPrior, maximise_evidence
-from hilcal.regression.factored import Tall, gram, of_rows
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Bools, Floats, Ints
 
@@ -38,7 +37,7 @@ class FamilyProblem:
         beta: noise variance factor by all rows.
     """
 
-    rows: Tall
+    rows: Floats
     target: Floats
     ridge: Floats
     pull: Floats
@@ -76,8 +75,8 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
 
 def _products(p: FamilyProblem, rows: Bools) -> tuple[Floats, Floats]:
     """AᵀA and Aᵀy of some rows."""
-    own = of_rows(p.rows, rows)
-    return gram(own), own.T @ p.target[rows]
+    own = p.rows[rows]
+    return own.T @ own, own.T @ p.target[rows]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression.factored import Factored, Tall, of_rows
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.projection import Projection
 from hilcal.regression.schur import inverse_root, positive_solve
@@ -132,18 +131,18 @@ class FamilyProducts:
     Their sums over the folds serve the tests of the whole family.
 
     Attributes:
-        x: (R, F) whitened columns, or their factors.
+        x: (R, F) whitened columns.
         parts: of each fold.
         whole: of all rows.
     """
 
-    x: Tall
+    x: Floats
     parts: tuple["_Products", ...]
     whole: "_Products"
 
 
 def family_products(
-    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Tall]
+    folds: tuple[Fold, ...], p: Projection, white: Floats, families: Iterable[Floats]
 ) -> list[FamilyProducts]:
     """Form the products of families of whitened columns (R, F).
 
@@ -157,7 +156,7 @@ def family_products(
 
     def products(fold: Fold) -> list[_Products]:
         own, y = fold.rows(p), white[fold.out]
-        return [_Products.of(own, of_rows(x, fold.out), y) for x in every]
+        return [_Products.of(own, x[fold.out], y) for x in every]
 
     by_fold = [products(fold) for fold in folds]
     return [
@@ -187,7 +186,7 @@ def left_out_of_families(
         out, own = fold.out, fold.rows(p)
         for (of, ridge), left, known in zip(families, found, small, strict=True):
             back, step = known[f] if known else _without(fold, of.whole, of.parts[f], ridge)
-            left[out] = white[out] - own @ back - of_rows(of.x, out) @ step
+            left[out] = white[out] - own @ back - of.x[out] @ step
     return found
 
 
@@ -241,11 +240,8 @@ class _Products:
     rhs: Floats
 
     @classmethod
-    def of(cls, rows: Floats, x: Tall, white: Floats) -> "_Products":
+    def of(cls, rows: Floats, x: Floats, white: Floats) -> "_Products":
         """Form them."""
-        if isinstance(x, Factored):
-            both = x.T @ np.column_stack([rows, white])
-            return cls(both[:, :-1].T, x.gram(), both[:, -1])
         return cls(rows.T @ x, x.T @ x, x.T @ white)
 
     @classmethod

@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg as sl
 
-from hilcal.regression.factored import Factored, Tall, written
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.regression.triangle import Triangle
 from hilcal.types import Bools, Floats, Ints
@@ -78,12 +77,12 @@ class Basis:
             held=place[self.held],
         )
 
-    def flat_rows(self, a: Tall) -> Floats:
+    def flat_rows(self, a: Floats) -> Floats:
         """Return rows (R, F) by the flat coordinates of rows A (R, P) by the parameters."""
         flat = np.flatnonzero(self.flat)
         return np.asarray(a[:, flat] @ self.transform[flat, : len(self.singular)])
 
-    def rows(self, a: Tall) -> Tall:
+    def rows(self, a: Floats) -> Floats:
         """Return rows (R, K) by z of rows A (R, P) by the parameters: A T.
 
         A column with a prior is only scaled, and a part of the rows is worked on at a time: for a
@@ -93,8 +92,6 @@ class Basis:
         out = np.empty((len(a), self.transform.shape[1]))
         sigma = self.transform[self.held, count + np.arange(len(self.held))]
         turned = self.transform[flat, :count]
-        if isinstance(a, Factored):
-            return a.turned(flat, turned, self.held, sigma)
         for start in range(0, len(a), _ROWS):
             part = slice(start, start + _ROWS)
             out[part, :count] = a[part][:, flat] @ turned
@@ -103,7 +100,7 @@ class Basis:
 
 
 def find_basis(
-    a: Tall,
+    a: Floats,
     scale: Floats,
     prior: Floats,
     spread: float | None = 1.0,
@@ -141,11 +138,11 @@ def find_basis(
     return Basis(transform, precision, null, flat, held, s[keep], structural, *conditions)
 
 
-def flat_triangle(a: Tall, columns: Ints, scale: Floats) -> Floats:
+def flat_triangle(a: Floats, columns: Ints, scale: Floats) -> Floats:
     """Return R of the QR of some columns of A (R, P), multiplied by their magnitudes (P,)."""
     if len(a) > TALL and len(columns):
         whole = Triangle(len(columns))
-        whole.add(written(a) if len(columns) == a.shape[1] else a[:, columns])
+        whole.add(a if len(columns) == a.shape[1] else a[:, columns])
         return np.asarray(whole.r * scale[columns])
     scaled = a[:, columns] * scale[columns]
     return np.asarray(sl.qr(scaled, mode="r", check_finite=False)[0], dtype=float)[: len(columns)]
@@ -215,14 +212,14 @@ class FlatProducts:
         return replace(self, all=self.all[:, kept], columns=self.columns[kept])
 
 
-def flat_products(a: Tall, target: Floats, basis: Basis) -> FlatProducts:
+def flat_products(a: Floats, target: Floats, basis: Basis) -> FlatProducts:
     """Form the products of the flat coordinates of a basis: the rows are orthonormal."""
     rows = basis.flat_rows(a)
     return FlatProducts(rows.T @ rows, rows.T @ a, rows.T @ target, a.T @ target)
 
 
 def normal_equations(
-    a: Tall, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
+    a: Floats, target: Floats, basis: Basis, gram: Floats, known: FlatProducts | None = None
 ) -> NormalEquations:
     """Form the normal equations of A (R, P) in the coordinates of a basis.
 

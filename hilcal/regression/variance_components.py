@@ -27,7 +27,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.regression.factored import Factored, Tall, forms, gram
 from hilcal.regression.schur import inverse_root, positive_solve
 from hilcal.types import Floats
 
@@ -45,19 +44,13 @@ class BlockRows:
 
     Attributes:
         y: (G, S) residual.
-        rows: (G, S, K) columns B of the model; (G·S, K) by their factors.
+        rows: (G, S, K) columns B of the model.
         components: (C, G, S, S) blocks of the K_i.
     """
 
     y: Floats
-    rows: Floats | Factored
+    rows: Floats
     components: Floats
-
-    def turned(self, by: Floats) -> Tall:
-        """Return rows (G·S, K) of the columns, those of each block turned by (G, S, S)."""
-        if isinstance(self.rows, Factored):
-            return self.rows.turned_rows(by)
-        return _flat(by @ self.rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,10 +141,11 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _RemlPo
         log_det += 2 * float(np.log(np.diagonal(low, axis1=1, axis2=2)).sum())
         root = np.linalg.inv(low)
         inverses.append(np.swapaxes(root, 1, 2) @ root)
-        h += gram(b.turned(root))
+        white = _flat(root @ b.rows)
+        h += white.T @ white
     t = inverse_root(h)
     log_det += _log_det(t)
-    weighted = [b.turned(inverse) for inverse, b in zip(inverses, blocks, strict=True)]
+    weighted = [_flat(inverse @ b.rows) for inverse, b in zip(inverses, blocks, strict=True)]
 
     def project(x: list[Floats]) -> list[Floats]:
         """P x of columns (G, S, Q)."""
@@ -165,7 +159,8 @@ def _at(blocks: Sequence[BlockRows], ridge: Floats, variance: Floats) -> _RemlPo
     trace = np.zeros(len(variance))
     moved = []
     for b, inverse, w, p in zip(blocks, inverses, weighted, py, strict=True):
-        own = inverse - forms(w, t, b.y.shape[1])
+        seen = (w @ t.T).reshape(*b.y.shape, len(t))
+        own = inverse - seen @ np.swapaxes(seen, 1, 2)
         trace += np.einsum("gij,cgji->c", own, b.components)
         moved.append(np.einsum("cgij,gj->gic", b.components, p))
     turned = project(moved)

@@ -75,7 +75,7 @@ def with_conventions(
 
     Limits are those of the controller's values and stay.
 
-    Where the arm has couplings C of its own already, they act on what results.
+    Couplings C that the arm has already are applied to the converted values: θ = C (S q + o + K q).
 
     Args:
         arm: the arm as drawn.

@@ -52,7 +52,6 @@ from hilcal.identification.variance_factor import WithVarianceFactor
 from hilcal.model.model import Model
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
-from hilcal.regression.factored import written
 from hilcal.regression.normal_equations import NormalEquations
 from hilcal.regression.triangle import combined
 from hilcal.stream.passes import (
@@ -271,7 +270,7 @@ def _count(rows: Mapping[int, Ints]) -> int:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Found:
+class _StreamMinimum:
     """The minimum, and the normal equations there: of all, and without each fold."""
 
     problem: _Stream
@@ -353,7 +352,7 @@ class _Found:
         )
 
 
-def _solved(problem: _Stream, theta: Floats) -> _Found:
+def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
     """Return the minimum from parameters (P,) on.
 
     Raises:
@@ -372,7 +371,7 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
     z = prior_coordinates(basis, point.y, by.prior)
 
     def equations_of(triangle: Floats) -> NormalEquations:
-        rows = written(by.basis.rows(space.columns(triangle[:, :-1])[:, live]))
+        rows = by.basis.rows(space.columns(triangle[:, :-1])[:, live])
         return NormalEquations(basis, rows.T @ rows, rows.T @ (triangle[:, -1] + rows @ z))
 
     equations, size = equations_of(point.triangle), len(theta) + 1
@@ -381,4 +380,4 @@ def _solved(problem: _Stream, theta: Floats) -> _Found:
     for fold in point.folds:
         rest = combined((r for k, r in point.folds.items() if k != fold), size)
         change[fold] = transform @ (equations_of(rest).solve(by.beta) - now)
-    return _Found(problem, point, by, converged, equations, change)
+    return _StreamMinimum(problem, point, by, converged, equations, change)

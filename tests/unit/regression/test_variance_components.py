@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
-from hilcal.regression.factored import Factored, written
 from hilcal.regression.variance_components import BlockRows, variance_components
 from hilcal.types import Floats
 
@@ -92,25 +91,3 @@ def test_the_scale_of_a_component_does_not_matter(scale: float) -> None:
     scaled = BlockRows(b.y, b.rows, scale * b.components)
     found = variance_components([scaled], np.zeros(1))
     assert scale * found.variance[0] == pytest.approx(whole.variance[0], rel=1e-3)
-
-
-def test_columns_by_their_factors_are_the_same_columns() -> None:
-    rng, count, size = np.random.default_rng(11), 40, 6
-    f = Factored(
-        rng.standard_normal((count * size, 3)),
-        np.array([0, 4, 5]),
-        rng.standard_normal((count, size, 2)),
-        rng.standard_normal((count, 4)),
-        np.array([0, 0, 1, 1]),
-        np.array([1, 2, 3, 6]),
-    )
-    z = rng.standard_normal((2, count, size, 2))
-    y = rng.standard_normal((count, size)) + (z[0] @ rng.standard_normal((count, 2, 1)))[:, :, 0]
-    ridge, k = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 0.0, 2.0]), z @ np.swapaxes(z, 2, 3)
-    found = variance_components([BlockRows(y, f, k)], ridge)
-    whole = BlockRows(y, written(f).reshape(count, size, -1), k)
-    expected = variance_components([whole], ridge)
-    assert found.variance[0] > 0.1
-    np.testing.assert_allclose(found.variance, expected.variance, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9, atol=1e-12)
-    assert found.log_likelihood == pytest.approx(expected.log_likelihood, rel=1e-9)
