@@ -61,7 +61,10 @@ CASES = {
         lambda: (SMALL, doubtful("base_compliance", 2).rehearsal.readings),
     ),
     "unknown": ("absolute", lambda: study("absolute", "swaying bench")),
-    "unknown although tried": ("deflection", lambda: study("deflection", "relaxing bench", n_poses=12)),
+    "unknown although tried": (
+        "deflection",
+        lambda: study("deflection", "relaxing bench", n_poses=12),
+    ),
     "adequate": ("deflection", lambda: study("deflection")),
     "noise": ("deflection", lambda: study("deflection", stated=0.5, cycles=2)),
     "correlated": ("absolute", lambda: correlated()),
