@@ -30,11 +30,12 @@ KINDS = {
         figaroh's own regressor, and one judge: det(M)^(1/p) over that of figaroh's continuous
         optimum for as many readings. The continuous optima agree. figaroh gives every candidate to
         a general cone solver (CVXOPT, through PICOS), and its time grows fast with their number;
-        hilcal's method is made for this problem and drops candidates on its way. For a number of
-        poses figaroh takes those of most weight, or exchanges one pose at a time (its `Detmax`,
-        which needs no continuous optimum, is as fast as hilcal's whole search among few
-        candidates, and returns the value that it reached but not the poses). hilcal searches for
-        whole numbers from the continuous optimum on, and states a proved bound of what is lost.
+        hilcal solves the problem for few of them, and scans the others for those that would add
+        something. For a number of poses figaroh takes those of most weight, or exchanges one pose
+        at a time (its `Detmax`, which needs no continuous optimum, is as fast as hilcal's whole
+        search among few candidates, and returns the value that it reached but not the poses).
+        hilcal searches for whole numbers from the continuous optimum on, and states a proved bound
+        of what is lost.
         """,
     ),
     "calibration": (
