@@ -74,7 +74,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.M
 
     monkeypatch.setattr("hilcal.cli.demo.first_plan", plan)
     path, recording = tmp_path / "demo.hilcal", tmp_path / "demo.rrd"
-    arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "-o", path)
+    arguments = ("demo", FAST, "--hide", "hysteresis", "--seed", "1", "--poses", "8", "-o", path)
     words = ok(capsys, *arguments, "--record", recording).out
     for part in (
         " readings.",

@@ -25,7 +25,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, create_run
 from tests.support.campaigns import Campaign, campaign, configuration, noiseless, plan, with_noise
-from tests.support.cli_cases import ok, refused, run
+from tests.support.cli_cases import ok, quickly_planned, refused, run
 from tests.support.fake_bench import POSES, Bench
 from tests.support.fake_world import REGISTRATION
 
@@ -228,7 +228,8 @@ class Site:
         q = np.array([POSES["reference"], *near.values()])
         self.plan = Plan(("reference", *near), q, tuple(steps))
         (self.directory / "plan.json").write_text(self.plan.to_json(), encoding="utf-8")
-        (self.directory / "cell.toml").write_text(to_toml(b.config), encoding="utf-8")
+        toml = to_toml(quickly_planned(b.config))
+        (self.directory / "cell.toml").write_text(toml, encoding="utf-8")
         b.world.position = self.position  # type: ignore[method-assign]
 
     def position(self) -> Any:
@@ -299,7 +300,8 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     cell = site.directory / "cell.toml"
     assert f"plan on with: hilcal plan {cell} -o more.json --after {path}" in line[0]
     ok(capsys, "identify", path)
-    ok(capsys, "plan", cell, "-o", site.directory / "more.json", "--after", path, "--quick")
+    more = ("-o", site.directory / "more.json", "--after", path)
+    ok(capsys, "plan", cell, *more, "--poses", "2", "--quick")
     ok(capsys, "refine", path)
 
 
