@@ -62,6 +62,18 @@ def opened(*content: object) -> rr.RecordingStream:
     return rec
 
 
+def fixed(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
+    """Log what never changes."""
+    rec.log(path, *drawn, static=True)
+
+
+def along(
+    rec: rr.RecordingStream, path: str, time: rr.TimeColumn, columns: rr.ComponentColumnList
+) -> None:
+    """Send what an entity is at each of some times."""
+    rec.send_columns(path, indexes=[time], columns=columns)
+
+
 def require_folder(path: Path) -> None:
     """Refuse a file in a folder that is not there.
 

@@ -33,6 +33,7 @@ BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(story.LIMITS[0], 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
+_BARS = str.maketrans("", "", "▁▂▃▄▅▆▇█")  # of tables on a terminal; not in the viewer's fonts
 _UNSAFE = re.compile(rf"[^\n\x20-\x7e\u00a1-\u00ac\u00ae-\u00ff\u0391-\u03a9\u03b1-\u03c9{_SIGNS}]")
 _MARKDOWN = re.compile(r"([\\`*_\[\]<>|#~$])")
 
@@ -44,7 +45,7 @@ def safe(text: str) -> str:
 
 def escaped(text: str) -> str:
     """Text made safe, on one line, and without any meaning in markdown."""
-    return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.split())))
+    return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.translate(_BARS).split())))
 
 
 def nice(value: float) -> float:
@@ -66,6 +67,11 @@ def markdown(blocks: Iterable[Block]) -> str:
 def document(text: str) -> rr.TextDocument:
     """Return markdown as the viewer takes it."""
     return rr.TextDocument(text, media_type="text/markdown")
+
+
+def documents(texts: list[str]) -> rr.ComponentColumnList:
+    """Return one such document for each of some times."""
+    return rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
 
 
 def _one(block: Block) -> str:
