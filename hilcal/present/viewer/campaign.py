@@ -17,6 +17,7 @@ from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
 from hilcal.present.story import LEVEL_NAMES, DependenceCurve, Story, StoryRevision, levels
 from hilcal.present.viewer import campaign_scene, layout, recording, style
+from hilcal.present.viewer.recording import along, fixed
 from hilcal.types import Floats, Ints
 
 
@@ -29,10 +30,6 @@ class Served:
 
 def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
     """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
-
-    Args:
-        story: what is told.
-        sinks: where it goes.
 
     Returns:
         The open stream; it closes, and ends its sinks, when it is dropped.
@@ -71,17 +68,16 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
         InputError: the port is taken.
         HilcalError: the port cannot be served.
     """
+    at = f"viewer server {ip}:{port}"
     recording.disable_analytics()
     try:
         recording.bind(ip, port)
     except (OSError, OverflowError) as error:
-        raise InputError(
-            f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
-        ) from error
+        raise InputError(f"{at}: {error}; choose a free port of this machine") from error
     try:
         rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
     except (OSError, RuntimeError) as error:
-        raise HilcalError(f"viewer server {ip}:{port}: {error}") from error
+        raise HilcalError(f"{at}: {error}") from error
     try:
         yield Served(f"rerun+http://{ip}:{port}/proxy")
     finally:
@@ -111,8 +107,9 @@ def tell(rec: rr.RecordingStream, story: Story) -> None:
 def begin(rec: rr.RecordingStream, story: Story) -> None:
     """Log what is the same in every revision."""
     campaign_scene.static_scene(rec, story)
-    error_series(rec)
-    rec.log("words/guide", style.document(GUIDE), static=True)
+    for entity, name, color in SERIES:
+        fixed(rec, f"errors/{entity}", *style.series(name, color, 1.5, 4.0))
+    fixed(rec, "words/guide", style.document(GUIDE))
 
 
 def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -128,19 +125,21 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
 
 def _poses(rec: rr.RecordingStream, story: Story) -> None:
     """Tell the last revision on the timeline `pose`, and move the arm along it."""
-    last = story.revisions[-1]
     rec.set_time("pose", sequence=int(story.poses[0]))
-    tell_revision(rec, story, last)
+    tell_revision(rec, story, story.revisions[-1])
     rec.reset_time()
     campaign_scene.pose_scene(rec, story)
-    time = [rr.TimeColumn("pose", sequence=story.poses)]
-    cards = pose_cards(story)
-    rec.send_columns(
-        "words/verdict",
-        indexes=time,
-        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
-    )
-    pose_charts(rec, story)
+    time = rr.TimeColumn("pose", sequence=story.poses)
+    along(rec, "words/verdict", time, style.documents(pose_cards(story)))
+    # the bar of the current pose; its name puts it in front of the others
+    sigma = np.sqrt(pose_norm2(story, story.revisions[-1]))
+    starts, left, width = _bar_places(story)
+    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
+        rec.set_time("pose", sequence=int(story.poses[starts[k]]))
+        one = slice(k, k + 1)
+        bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
+        rec.log("bars/zcurrent", bar)
+    rec.reset_time()
 
 
 FOLLOWS = "What the residual follows"
@@ -153,29 +152,22 @@ def blueprint(story: Story) -> rrb.Blueprint:
 
     It opens at the first revision and stands there; that of a growing story goes along with it.
     """
+    residual, deflection, bars = titles(story)
+    errors = rrb.TimeSeriesView(origin="errors", name=ERRORS)
     left = rrb.Vertical(
-        rrb.Tabs(
-            _view3d(story, residual_title(story), "deflection"),
-            _view3d(story, deflection_title(story), "residual"),
-        ),
-        rrb.Tabs(
-            rrb.TimeSeriesView(origin="errors", name=ERRORS),
-            _bars("bars", bars_title(story)),
-        ),
+        rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
+        rrb.Tabs(errors, _bars("bars", bars)),
         row_shares=[11, 4],
     )
     laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
+    words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
-        rrb.Tabs(
-            rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
-            rrb.TextDocumentView(origin="words/details", name="Details"),
-            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
-        ),
+        rrb.Tabs(*(layout.text(of, name) for of, name in words)),
         rrb.Tabs(
             _bars("follows", FOLLOWS),
             *laws,
-            rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
-            rrb.TextDocumentView(origin="words/revisions", name="Table"),
+            layout.text("parameters", "Parameters ± σ"),
+            layout.text("revisions", "Table"),
             rrb.TextLogView(origin="log", name="Log"),
         ),
         row_shares=[5, 4],
@@ -185,26 +177,20 @@ def blueprint(story: Story) -> rrb.Blueprint:
     return layout.whole(both, "revision", play, fps=1.0)
 
 
-def residual_title(story: Story) -> str:
-    """Return the title of the residual view, with its scale and how much it shows."""
+def titles(story: Story) -> tuple[str, str, str]:
+    """Return the titles of residuals, deflections and bars, with their scales and counts."""
     shown, n = len(campaign_scene.shown(story, story.revisions[0])), len(story)
     part = f" (about {shown} of {n} readings)" if shown < n else ""
-    scale = f"{campaign_scene.residual_scale(story):g}"
-    return f"Residual ×{scale}{part}: an arrow that leaves its noise ball = model wrong"
-
-
-def deflection_title(story: Story) -> str:
-    """Return the title of the deflection view, with its scale."""
     what = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
-    scale = f"{campaign_scene.deflection_scale(story):g}"
-    return f"{what} ×{scale}: blue measured, white predicted, red missed"
-
-
-def bars_title(story: Story) -> str:
-    """Return the title of the bars, with what one bar stands for."""
     several = poses_per_bar(story)
-    part = f" ({several} poses per bar)" if several > 1 else ""
-    return f"Worst reading of each pose, in σ{part}: grey noise, amber doubtful, red model wrong"
+    poses = f" ({several} poses per bar)" if several > 1 else ""
+    return (
+        f"Residual ×{campaign_scene.residual_scale(story):g}{part}: an arrow that leaves its "
+        "noise ball = model wrong",
+        f"{what} ×{campaign_scene.deflection_scale(story):g}: blue measured, white predicted, red "
+        "missed",
+        f"Worst reading of each pose, in σ{poses}: grey noise, amber doubtful, red model wrong",
+    )
 
 
 def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
@@ -229,15 +215,6 @@ BARS = 150
 """Bars of poses at most."""
 _BINS = 12
 """Of single readings over what they may follow, for their mean."""
-_PARTS = ("mean", "law")
-
-
-def error_series(rec: rr.RecordingStream) -> None:
-    """Log what the series of errors are called, and how they look."""
-    for entity, name, color in SERIES:
-        line = rr.SeriesLines(names=[name], colors=[color], widths=[1.5])
-        mark = rr.SeriesPoints(names=[name], colors=[color], markers=["circle"], marker_sizes=[4.0])
-        rec.log(f"errors/{entity}", line, mark, static=True)
 
 
 def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -251,18 +228,6 @@ def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> 
         curve_bars(rec, "law", r.laws[0] if r.laws else None)
 
 
-def pose_charts(rec: rr.RecordingStream, story: Story) -> None:
-    """Send the bar of the current pose along `pose`, with the last revision."""
-    sigma = np.sqrt(pose_norm2(story, story.revisions[-1]))
-    starts, left, width = _bar_places(story)
-    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
-        rec.set_time("pose", sequence=int(story.poses[starts[k]]))
-        one = slice(k, k + 1)
-        bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
-        rec.log("bars/zcurrent", bar)  # the name puts it in front of the others
-    rec.reset_time()
-
-
 def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log the worst reading of each pose in σ, its Mahalanobis distance, one series per level.
 
@@ -270,19 +235,13 @@ def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """
     starts, left, width = _bar_places(story)
     norm2 = np.maximum.reduceat(pose_norm2(story, r), starts)
-    height, level = np.sqrt(norm2), levels(norm2)
     for i, name in enumerate(style.LEVEL_NAMES):
-        of = np.flatnonzero(level == i)
-        some = of if len(of) else np.arange(1)
-        rec.log(
-            f"bars/{name}",
-            rr.BarChart(
-                height[some] if len(of) else [0.0],
-                abscissa=left[some],
-                widths=width[some],
-                color=style.LEVEL_COLORS[i].tolist(),
-            ),
-        )
+        mine = levels(norm2) == i
+        some = mine if mine.any() else np.arange(len(norm2)) == 0  # else a bar without a height
+        color = style.LEVEL_COLORS[i].tolist()
+        height = np.where(mine, np.sqrt(norm2), 0.0)[some]
+        bar = rr.BarChart(height, abscissa=left[some], widths=width[some], color=color)
+        rec.log(f"bars/{name}", bar)
 
 
 def pose_norm2(story: Story, r: StoryRevision) -> Floats:
@@ -307,27 +266,22 @@ def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) 
 
     Single readings are drawn by their mean in bins of equal count.
     """
-    bars: dict[str, tuple[Floats, Floats]] = {}
+    bars: dict[str, Floats] = {}
+    edges = np.zeros(0)
     if c is not None and len(c.x):
         x, y = (c.x, c.y) if c.error is not None else _means(c)
-        bars["mean"] = np.arange(float(len(x))) if c.names else x, y
+        order = np.arange(len(x)) if c.names else np.argsort(x, kind="stable")
+        bars["mean"] = y[order]
         if c.line is not None:
-            bars["law"] = x, np.interp(x, *c.line)
-    for k, part in enumerate(_PARTS):
+            bars["law"] = np.interp(x[order], *c.line)
+        edges = _edges(order.astype(float) if c.names else x[order])
+    for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
         if part not in bars:
             rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
             continue
-        x, y = bars[part]
-        order = np.argsort(x, kind="stable")
-        edges = _edges(x[order])
         width = np.diff(edges) / len(bars)
-        chart = rr.BarChart(
-            y[order],
-            abscissa=edges[:-1] + k * width,
-            widths=width,
-            color=(style.MEASURED, style.NOISE)[k],
-        )
-        rec.log(f"{entity}/{part}", chart)
+        at = edges[:-1] + k * width
+        rec.log(f"{entity}/{part}", rr.BarChart(bars[part], abscissa=at, widths=width, color=color))
 
 
 def _edges(x: Floats) -> Floats:
@@ -361,11 +315,9 @@ def place(story: Story, r: StoryRevision) -> str:
         return f"Revision {r.revision}"
     told = [o.revision for o in story.revisions]
     k, count = told.index(r.revision) + 1, len(told)
-    if told == list(range(1, count + 1)):
-        where = f"Revision {k} of {count}"
-    else:
-        where = f"Revision {r.revision} ({k} of {count})"
-    return f"{where}, the last" if k == count > 1 else where
+    plain = told == list(range(1, count + 1))
+    where = f"of {count}" if plain else f"({k} of {count})"
+    return f"Revision {r.revision} {where}{', the last' * (k == count > 1)}"
 
 
 def details(story: Story, r: StoryRevision) -> str:
@@ -383,28 +335,24 @@ def details(story: Story, r: StoryRevision) -> str:
 
 def pose_cards(story: Story) -> list[str]:
     """Return each pose of the last revision in words: residual of each load, and joints."""
-    r = story.revisions[-1]
-    length, sigma, level = r.size_m.tolist(), r.sigma.tolist(), r.level.tolist()
-    rms = np.sqrt(np.bincount(story.row, r.size_m**2) / np.bincount(story.row)).tolist()
-    joints, units = story.q[story.first].tolist(), story.arm.units
+    r, size = story.revisions[-1], story.revisions[-1].size_m
+    sigma, level = r.sigma, r.level
+    rms = np.sqrt(np.bincount(story.row, size**2) / np.bincount(story.row))
     order = np.argsort(story.row, kind="stable")
     ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
     out = []
     for k, rows in enumerate(np.split(order, ends[:-1])):
         cells = (
-            (
-                story.load_names[i],
-                numbers.length(length[i]),
-                f"{sigma[i]:.1f}",
-                LEVEL_NAMES[level[i]],
-            )
+            (story.load_names[i], numbers.length(float(size[i])), f"{sigma[i]:.1f}",
+             LEVEL_NAMES[level[i]])
             for i in rows[:_POSE_LOADS].tolist()
-        )
+        )  # fmt: skip
+        joints = map(numbers.joint_value, story.q[story.first[k]].tolist(), story.arm.units)
         card: list[Block] = [
-            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(rms[k])} rms"),
+            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(float(rms[k]))} rms"),
             f"With the model of revision {r.revision}: {r.name}.",
             table("load", "residual", "in σ", "", rows=cells, left=(0, 3)),
-            f"Joints {', '.join(map(numbers.joint_value, joints[k], units))}.",
+            f"Joints {', '.join(joints)}.",
         ]
         out.append(style.markdown(card))
     return out

@@ -6,6 +6,7 @@ import rerun as rr
 from hilcal import numbers
 from hilcal.present.story import Story, StoryRevision, worst_and_even
 from hilcal.present.viewer import arm_shapes, style
+from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
 
@@ -17,7 +18,6 @@ ARROWS, BALLS, PAIRS = 150, 60, 150
 """How much is drawn at most, so that a picture stays legible and a file small."""
 _LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
 _DOT = 0.012  # m, half the distance of two dots of a leader
-LEADER_RADIUS = rr.Radius.ui_points(0.5)
 
 
 def residual_scale(story: Story) -> float:
@@ -34,23 +34,14 @@ def deflection_scale(story: Story) -> float:
 
 
 def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:
-    """Half axes (K, 3), m, and quaternions (K, 4) of readings' noise balls, as they are drawn."""
-    half, quaternions = ellipsoids(story.covariance[rows])
-    return np.maximum(style.BALL_SIGMAS * residual_scale(story) * half, 1e-3), quaternions
+    """Half axes (K, 3), m, and quaternions (K, 4) of readings' noise balls, as they are drawn.
 
-
-def ellipsoids(covariance: Floats) -> tuple[Floats, Floats]:
-    """Half axes sqrt(w) and orientations of C = V diag(w) Vᵀ, V a proper rotation.
-
-    Args:
-        covariance: (N, 3, 3), m².
-
-    Returns:
-        (N, 3) half axes at one σ, m, and (N, 4) quaternions x y z w.
+    C = V diag(w) Vᵀ, V a proper rotation, has half axes of sqrt(w) at one σ.
     """
-    w, v = np.linalg.eigh(covariance)
+    w, v = np.linalg.eigh(story.covariance[rows])
     v[:, :, 0] *= np.sign(np.linalg.det(v))[:, None]
-    return np.sqrt(np.maximum(w, 0.0)), arm_shapes.quaternions_of(v)
+    half = style.BALL_SIGMAS * residual_scale(story) * np.sqrt(np.maximum(w, 0.0))
+    return np.maximum(half, 1e-3), arm_shapes.quaternions_of(v)
 
 
 def worst(r: StoryRevision) -> int:
@@ -71,55 +62,39 @@ def shown(story: Story, r: StoryRevision) -> Ints:
 
 def static_scene(rec: rr.RecordingStream, story: Story) -> None:
     """Log what never changes: the arm's shapes and the axes of the world."""
-    rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
     arm_shapes.log_bodies(rec, capsules(story.arm))
-    numbers_read = () if story.target is None else np.unique(story.target)
-    names = [style.safe(story.target_names[k]) for k in numbers_read]
-    arm_shapes.log_targets(rec, story.arm, story.targets, style.MEASURED, names)
+    several = () if story.target is None else np.unique(story.target)
+    names = [style.safe(story.target_names[k]) for k in several]
+    arm_shapes.log_targets(rec, story.arm, story.targets, names)
 
 
 def revision_scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
-    far = worst(r)
+    far, drawn, balls = worst(r), shown(story, r), balled(story, r)
     arm_shapes.stand(rec, story.bodies[story.row[far]])
-    drawn = shown(story, r)
     level = r.level[drawn]
-    rec.log(
-        "world/residual/arrows",
-        rr.Arrows3D(
-            origins=story.anchor[drawn],
-            vectors=arrows(story, r, drawn),
-            colors=style.LEVEL_COLORS[level],
-            radii=np.where(level > 0, 0.0055, 0.0035),
-        ),
+    found = rr.Arrows3D(
+        origins=story.anchor[drawn],
+        vectors=arrows(story, r, drawn),
+        colors=style.LEVEL_COLORS[level],
+        radii=np.where(level > 0, 0.0055, 0.0035),
     )
-    balls = balled(story, r)
+    rec.log("world/residual/arrows", found)
     half, quaternions = noise_balls(story, balls)
-    rec.log(
-        "world/residual/noise",
-        rr.Ellipsoids3D(
-            centers=story.anchor[balls],
-            half_sizes=half,
-            quaternions=quaternions,
-            colors=[(*style.NOISE, 46)],
-            fill_mode="solid",
-        ),
+    noise = rr.Ellipsoids3D(
+        centers=story.anchor[balls],
+        half_sizes=half,
+        quaternions=quaternions,
+        colors=[(*style.NOISE, 46)],
+        fill_mode="solid",
     )
-    rec.log(
-        "world/residual/worst",
-        arm_shapes.labels(
-            [story.anchor[far] + _LABEL_ABOVE],
-            [f"worst: pose {story.pose_name(far)}, {pose_words(story, r, far)}"],
-        ),
-    )
-    rec.log(
-        "world/residual/leader",
-        rr.LineStrips3D(
-            list(leader(story.anchor[far], noise_balls(story, np.array([far]))[0])),
-            colors=[style.LEADER],
-            radii=LEADER_RADIUS,
-        ),
-    )
+    rec.log("world/residual/noise", noise)
+    at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
+    rec.log("world/residual/worst", arm_shapes.labels([at + _LABEL_ABOVE], [words]))
+    dots = list(leader(at, noise_balls(story, np.array([far]))[0]))
+    lines = rr.LineStrips3D(dots, colors=[style.LEADER], radii=rr.Radius.ui_points(0.5))
+    rec.log("world/residual/leader", lines)
     _deflections(rec, story, r)
 
 
@@ -128,39 +103,27 @@ def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
     r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
     arm_shapes.send_stands(rec, time, story.bodies)
     far = story.last_of_poses(r.whitened_norm2)
-    half, quaternions = noise_balls(story, far)
-    dots = [leader(at, ball) for at, ball in zip(story.anchor[far], half, strict=True)]
-    words = [f"pose {story.pose_name(i)}: {pose_words(story, r, i)}" for i in far.tolist()]
-    for name, columns in (
-        (
-            "current",
-            rr.Arrows3D.columns(
-                origins=story.anchor[far],
-                vectors=arrows(story, r, far),
-                colors=style.LEVEL_COLORS[r.level[far]],
-                radii=np.full(len(far), 0.012),
-            ),
-        ),
-        (
-            "ball",
-            rr.Ellipsoids3D.columns(
-                centers=story.anchor[far],
-                half_sizes=half,
-                quaternions=quaternions,
-                colors=np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1)),
-            ),
-        ),
-        (
-            "leader",
-            rr.LineStrips3D.columns(strips=np.concatenate(dots)).partition([len(x) for x in dots]),
-        ),
-        ("worst", arm_shapes.label_columns(story.anchor[far] + _LABEL_ABOVE, words)),
-    ):
-        rec.send_columns(f"world/residual/{name}", indexes=[time], columns=columns)
+    at, (half, quaternions) = story.anchor[far], noise_balls(story, far)
+    now = rr.Arrows3D.columns(
+        origins=at,
+        vectors=arrows(story, r, far),
+        colors=style.LEVEL_COLORS[r.level[far]],
+        radii=np.full(len(far), 0.012),
+    )
+    along(rec, "world/residual/current", time, now)
+    bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
+    ball = rr.Ellipsoids3D.columns(
+        centers=at, half_sizes=half, quaternions=quaternions, colors=bright
+    )
+    along(rec, "world/residual/ball", time, ball)
+    dots = [leader(a, h) for a, h in zip(at, half, strict=True)]
+    strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
+    along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
+    words = [f"pose {story.pose_name(i)}: {_words(story, r, i)}" for i in far.tolist()]
+    along(rec, "world/residual/worst", time, arm_shapes.label_columns(at + _LABEL_ABOVE, words))
 
 
-def pose_words(story: Story, r: StoryRevision, i: int) -> str:
-    """Return a reading's residual as words: length, and in σ."""
+def _words(story: Story, r: StoryRevision, i: int) -> str:
     name = ""
     if story.target is not None:
         name = f"{style.safe(story.target_names[story.target[i]])} "
@@ -211,15 +174,8 @@ def _deflections(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> Non
     ):
         moved = capped(story.deviation(value)[some] * scale, _DEFLECTION_CAP)
         tips.append(at + moved)
-        rec.log(
-            f"world/deflection/{name}",
-            rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius]),
-        )
-    rec.log(
-        "world/deflection/missed",
-        rr.LineStrips3D(
-            list(np.stack(tips, 1)),
-            colors=style.LEVEL_COLORS[r.level[some]],
-            radii=rr.Radius.ui_points(1.6),
-        ),
-    )
+        drawn = rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius])
+        rec.log(f"world/deflection/{name}", drawn)
+    colors, thin = style.LEVEL_COLORS[r.level[some]], rr.Radius.ui_points(1.6)
+    missed = rr.LineStrips3D(np.stack(tips, 1), colors=colors, radii=thin)
+    rec.log("world/deflection/missed", missed)

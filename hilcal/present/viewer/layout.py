@@ -107,6 +107,11 @@ def whole(
     )
 
 
+def text(of: str, name: str) -> rrb.TextDocumentView:
+    """Return a view of words."""
+    return rrb.TextDocumentView(origin=f"words/{of}", name=name)
+
+
 def view3d(
     origin: str,
     name: str,

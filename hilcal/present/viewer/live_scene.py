@@ -531,7 +531,7 @@ class LiveScene:
         rec.set_time("revision", sequence=new.revision)
         campaign.tell_revision(rec, self._story, new)
         rec.disable_timeline("revision")
-        titles = _titles(self._story)
+        titles = campaign.titles(self._story)
         if titles != self._titles or not earlier:
             views = campaign.blueprint(self._story)
             rec.send_blueprint(views, make_active=True, make_default=True)
@@ -559,7 +559,3 @@ def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
         colors=[(*style.NOISE, 46)],
         fill_mode="solid",
     )
-
-
-def _titles(of: Story) -> tuple[str, ...]:
-    return campaign.residual_title(of), campaign.deflection_title(of), campaign.bars_title(of)

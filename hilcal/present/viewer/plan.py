@@ -185,10 +185,12 @@ def blueprint(d: PlanView) -> rrb.Blueprint:
     legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
     times = rrb.TimeSeriesView(origin="schedule", name=SCHEDULE, plot_legend=legend)
     words = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
-    told = [rrb.TextDocumentView(origin=f"words/{of}", name=name) for of, name in words]
-    details = rrb.TextDocumentView(origin="words/details", name="Details")
     left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
-    right = rrb.Vertical(rrb.Tabs(*told), details, row_shares=[5, 4])
+    right = rrb.Vertical(
+        rrb.Tabs(*(layout.text(*w) for w in words)),
+        layout.text("details", "Details"),
+        row_shares=[5, 4],
+    )
     return layout.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)
 
 

@@ -64,6 +64,15 @@ def markdown(blocks: Iterable[Block]) -> str:
     return "\n\n".join(filter(None, map(_one, blocks)))
 
 
+def series(name: str, color: Color, width: float, mark: float) -> tuple[rr.AsComponents, ...]:
+    """Return how a series of numbers is drawn: a line of some width with marks of some size."""
+    names, colors = [safe(name)], [color]
+    return (
+        rr.SeriesLines(names=names, colors=colors, widths=[width]),
+        rr.SeriesPoints(names=names, colors=colors, markers=["circle"], marker_sizes=[mark]),
+    )
+
+
 def document(text: str) -> rr.TextDocument:
     """Return markdown as the viewer takes it."""
     return rr.TextDocument(text, media_type="text/markdown")

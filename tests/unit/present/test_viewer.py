@@ -241,7 +241,7 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert path.stat().st_size < 20e6
     arrows = rows(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = campaign.residual_title(big)
+    title = campaign.titles(big)[0]
     assert f"about {len(arrows[0])} of 3000" in title
     balls = rows(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
     origins = rows(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
@@ -258,21 +258,15 @@ def test_subsample_keeps_the_worst():
     assert np.diff(chosen).max() < 100
 
 
-def test_ellipsoids_give_the_covariance_back():
+def test_noise_balls_give_the_covariance_back():
     rng = np.random.default_rng(3)
-    a = rng.standard_normal((50, 3, 3))
-    covariance = a @ a.transpose(0, 2, 1)
-    half, quaternion = campaign_scene.ellipsoids(covariance)
-    x, y, z, w = quaternion.T
-    rotation = np.stack(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    a = 1e-5 * rng.standard_normal((12, 3, 3))
+    told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
+    half, quaternion = campaign_scene.noise_balls(told, np.arange(12))
+    half = half / (style.BALL_SIGMAS * campaign_scene.residual_scale(told))
+    rotation = Rotation.from_quat(quaternion).as_matrix()
     again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
-    np.testing.assert_allclose(again, covariance, atol=1e-12)
+    np.testing.assert_allclose(again, told.covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_levels_hold_the_share_of_noise_they_name():
