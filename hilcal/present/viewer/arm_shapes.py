@@ -84,9 +84,10 @@ def log_bodies(
     parts = [*((p, shade(p.body)) for p in own), *((p, DARK) for p in carried)]
     for i in sorted({p.body for p, _ in parts}):
         mine = [(p, color) for p, color in parts if p.body == i]
-        of = (np.array([getattr(p, k) for p, _ in mine]) for k in ("start", "end", "radius"))
+        start, end = (np.array([getattr(p, k) for p, _ in mine]) for k in ("start", "end"))
+        radius = np.array([p.radius for p, _ in mine])
         colors = np.array([color for _, color in mine], dtype=np.uint8)
-        fixed(rec, f"world/arm/body{i}", capsules(*of, colors))
+        fixed(rec, f"world/arm/body{i}", capsules(start, end, radius, colors))
 
 
 def log_targets(

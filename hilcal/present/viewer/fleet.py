@@ -126,9 +126,9 @@ def arms(rec: rr.RecordingStream, path: str, d: DrawnType) -> None:
     )
     top = np.array([0.0, 0.0, 1.06 * float((np.maximum(start, end)[:, 2] + radius).max())])
     at, marked = places(d), np.asarray(d.odd.any(axis=1))
-    ends = (np.concatenate([x + p for p in at]) for x in (start, end))
+    low, high = (np.concatenate([x + p for p in at]) for x in (start, end))
     colors = np.concatenate([_colors(d, a)[body] for a in range(len(at))])
-    fixed(rec, f"{path}/arms", arm_shapes.capsules(*ends, np.tile(radius, len(at)), colors))
+    fixed(rec, f"{path}/arms", arm_shapes.capsules(low, high, np.tile(radius, len(at)), colors))
     named = np.flatnonzero(marked | (len(at) <= _NAMED))
     # Long words stand above the names of the neighbours, each arm's on a line of its own.
     step = np.cumsum(marked)[named] * marked[named]

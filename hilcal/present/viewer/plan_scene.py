@@ -224,8 +224,8 @@ def static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
     _beads(rec, d)
     if d.tracker is not None:
         at = d.tracker
-        ends = ((at + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
-        fixed(rec, "world/tracker", arm_shapes.capsules(*ends, np.array([_HEAD]), [_TRACKER]))
+        low, high = ((at + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
+        fixed(rec, "world/tracker", arm_shapes.capsules(low, high, np.array([_HEAD]), [_TRACKER]))
         name = arm_shapes.labels([at + 2.2 * _HEAD * _UP], ["tracker"])
         fixed(rec, "world/tracker/name", name)
 
@@ -363,9 +363,9 @@ def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
                 ("capsules", "arrow"), rr.Clear(recursive=False)
             )
             if hung:
-                ends = ([x.start[i] for x in hung], [x.end[i] for x in hung])
+                start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
                 radius = np.array([x.radius for x in hung])
-                parts["capsules"] = arm_shapes.capsules(*map(np.array, ends), radius, [color])
+                parts["capsules"] = arm_shapes.capsules(start, end, radius, [color])
             if force.any():
                 way = [_FORCE_LENGTH * force / most]
                 parts["arrow"] = rr.Arrows3D(
