@@ -109,9 +109,9 @@ def _floor(efficiency: float) -> str:
     return f"{int(min(max(efficiency, 0.0), 1.0) * 1000 + 1e-6) / 10:.1f} %"
 
 
-def load_name(name: str) -> str:
-    """Return a load's name for people."""
-    return "unloaded" if name == UNLOADED else name
+def load_name(name: str, under: str = "") -> str:
+    """Return a load's name for people, e.g. after "under "."""
+    return "unloaded" if name == UNLOADED else under + name
 
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
