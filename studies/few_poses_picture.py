@@ -16,7 +16,7 @@ import typer
 from hilcal.campaign.campaign import Campaign
 from hilcal.errors import InputError
 from hilcal.identification.family_sizes import family_sizes
-from hilcal.present.charts.made_of import made_of
+from hilcal.present.charts.comparisons import made_of
 from hilcal.present.charts.style import GREY, HOLDOUT, LIGHT, MEASURED, figure
 from hilcal.whole_file import replace_file
 from studies.carry_picture import HEIGHT, WIDTH, svg

@@ -150,7 +150,6 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         revision=k,
         change="" if k == 0 else "+ " + EFFECTS[k] + names,
         verdict=verdict,
-        message=words,
         residual=residual,
         predicted=predicted + offset,
         whitened_norm2=norm2,

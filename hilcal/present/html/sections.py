@@ -12,8 +12,7 @@ from hilcal.diagnosis.repeats import classes
 from hilcal.identification.family_sizes import family_sizes
 from hilcal.present.campaign import info_report
 from hilcal.present.charts import evidence, readings
-from hilcal.present.charts.comparisons import error_per_revision
-from hilcal.present.charts.made_of import made_of
+from hilcal.present.charts.comparisons import error_per_revision, made_of
 from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
 from hilcal.present.document import (
     Block,

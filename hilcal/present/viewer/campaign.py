@@ -306,7 +306,7 @@ def verdict(story: Story, r: StoryRevision) -> str:
     """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
     mark = _MARKS.get(r.verdict, "")
     head = heading(f"{place(story, r)}: {mark}{r.verdict.replace('_', ' ')}")
-    return style.markdown([head, *(r.panels.get("verdict") or [r.message])])
+    return style.markdown([head, *r.panels.get("verdict", ())])
 
 
 def place(story: Story, r: StoryRevision) -> str:

@@ -103,7 +103,8 @@ def _one(block: Block) -> str:
 
 def _table(of: Table) -> str:
     if not any(of.heads):
-        return "\n".join(f"- **{escaped(name)}** {escaped(said)}" for name, said in of.rows)
+        rows = ((f"**{escaped(name)}** " if name else "") + escaped(said) for name, said in of.rows)
+        return "\n".join(f"- {row}" for row in rows)
     cells = [of.heads, *of.rows]
     lines = [f"| {' | '.join(escaped(c) or ' ' for c in row)} |" for row in cells]
     sides = ["---" if k in of.left else "---:" for k in range(len(of.heads))]

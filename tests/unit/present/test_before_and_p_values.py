@@ -87,7 +87,7 @@ def test_a_p_value_reads_the_same_wherever_it_stands(absolute):
     revision = story.revisions[0]
     panel = viewer.verdict(story, revision)
     assert f"| {value.replace('<', chr(92) + '<')} |" in panel
-    assert numbers.p_equals(lead.score.p_value) in revision.message
+    assert numbers.p_equals(lead.score.p_value) in str(revision.panels["verdict"][0])
 
 
 @pytest.mark.parametrize(
