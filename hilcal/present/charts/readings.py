@@ -199,7 +199,9 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     traces: list[object] = [style.line(ends, ends, "exact", dash="dash")]
     colors = (style.MEASURED, style.HOLDOUT, style.AMBER)
     for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
-        told = f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} µm<extra></extra>"
+        told = (
+            f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} µm<extra></extra>"
+        )
         at, text = (x[d.index, k], y[d.index, k], color, style.SYMBOLS[k]), d.named()
         traces.append(style.marks(*at, name=f"base {axis}", text=text, hovertemplate=told))
     what = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"

@@ -13,7 +13,7 @@ import rerun.blueprint as rrb
 from hilcal import numbers
 from hilcal.present.document import heading
 from hilcal.present.fleet import FAR, type_report, unlike_words
-from hilcal.present.viewer import arm_shapes, layout, recording, style
+from hilcal.present.viewer import arm_shapes, recording, style
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses, capsules
@@ -231,7 +231,7 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
         middle = at.mean(axis=0) + np.array([0.0, 0.0, 0.35 * d.reach])
         eye = middle + (np.ptp(at, axis=0).max() + d.reach) * np.array([0.68, 0.0, 0.36])
         name = f"{of}{len(at)} arms; a red frame: unlike the others, the red joint says where"
-        scenes.append(layout.view3d(f"arms{i}", name, eye, middle))
+        scenes.append(style.view3d(f"arms{i}", name, eye, middle))
         low, high = float(d.seconds.min()), float(d.seconds.max())
         wide = max(0.05 * (high - low), _LEAST_RANGE_S)
         ends = [rrb.TimeRangeBoundary.absolute(seconds=t) for t in (low - wide, high + wide)]
@@ -242,7 +242,7 @@ def _blueprint(types: list[DrawnType]) -> rrb.Blueprint:
             dates.append(
                 rrb.TimeSeriesView(origin=at_k, name=name, plot_legend=quiet, axis_x=whole)
             )
-        words.append(layout.text(f"type{i}", f"{of}Unlike the type"))
+        words.append(style.text(f"type{i}", f"{of}Unlike the type"))
     left = rrb.Vertical(rrb.Tabs(*scenes), rrb.Tabs(*dates), row_shares=[3, 2])
-    right = rrb.Tabs(*words, layout.text("guide", "How to read this"))
-    return layout.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "date")
+    right = rrb.Tabs(*words, style.text("guide", "How to read this"))
+    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "date")

@@ -16,7 +16,7 @@ from hilcal.present.document import Block, Items, heading, table
 from hilcal.present.live_viewer import Measuring, Revised
 from hilcal.present.running import figures, met_words, spoken, status_words
 from hilcal.present.story import LIMITS, Story, levels
-from hilcal.present.viewer import campaign, layout, style
+from hilcal.present.viewer import campaign, style
 from hilcal.present.viewer.arm_shapes import MovingArm, labels
 from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.body import body_poses
@@ -252,12 +252,12 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = layout.center(d.targets, d.told.arm.reach)
+    middle, size = style.center(d.targets, d.told.arm.reach)
     seen = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
-    scene = layout.view3d(
+    scene = style.view3d(
         "world",
         f"{of} {RESIDUALS}",
-        layout.near(middle, layout.EYE * size, seen),
+        style.near(middle, style.EYE * size, seen),
         middle,
         [f"+ {world}/**"],
         overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
@@ -269,11 +269,11 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
         axis_x=archetypes.TimeAxis(view_range=rr.TimeRange(start=ever, end=ever)),
     )
     words = rrb.Tabs(
-        layout.text("measuring", "So far"), layout.text("live_guide", "How to read this")
+        style.text("measuring", "So far"), style.text("live_guide", "How to read this")
     )
     left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
     right = rrb.Vertical(words, _log(), row_shares=[3, 2])
-    return layout.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
+    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
 
 
 def _log() -> rrb.TextLogView:

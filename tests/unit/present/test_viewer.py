@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
-from hilcal.present.viewer import campaign, campaign_scene, save, style
+from hilcal.present.viewer import campaign, save, style
 from hilcal.robot.body import body_poses, capsules
 from tests.support.recordings import rows, same, texts, values
 from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
@@ -116,7 +116,7 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
 
 def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
     strips = rows(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
-    balls, _ = campaign_scene.noise_balls(told, np.arange(len(told)))
+    balls, _ = campaign.noise_balls(told, np.arange(len(told)))
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
         dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
@@ -162,14 +162,14 @@ def test_timelines_are_revision_and_pose(recording):
 
 def test_every_reading_has_its_arrow(told, recording):
     drawn = rows(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = campaign_scene.residual_scale(told)
+    scale = campaign.residual_scale(told)
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (READINGS, 3)
         length = np.linalg.norm(r.residual, axis=1) * scale
         np.testing.assert_allclose(
             np.linalg.norm(vectors, axis=1),
-            np.minimum(length, campaign_scene.ARROW_CAP),
+            np.minimum(length, campaign.ARROW_CAP),
             rtol=1e-5,
         )
 
@@ -262,8 +262,8 @@ def test_noise_balls_give_the_covariance_back():
     rng = np.random.default_rng(3)
     a = 1e-5 * rng.standard_normal((12, 3, 3))
     told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
-    half, quaternion = campaign_scene.noise_balls(told, np.arange(12))
-    half = half / (style.BALL_SIGMAS * campaign_scene.residual_scale(told))
+    half, quaternion = campaign.noise_balls(told, np.arange(12))
+    half = half / (style.BALL_SIGMAS * campaign.residual_scale(told))
     rotation = Rotation.from_quat(quaternion).as_matrix()
     again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
     np.testing.assert_allclose(again, told.covariance, rtol=1e-9, atol=1e-18)

@@ -7,9 +7,8 @@ import pytest
 
 from hilcal.design.summary import DetectableEffect, PredictedParameter
 from hilcal.errors import InputError
-from hilcal.present.viewer import plan, plan_scene, style
-from hilcal.present.viewer.plan import record_plan
-from hilcal.present.viewer.plan_scene import PlanView
+from hilcal.present.viewer import plan, style
+from hilcal.present.viewer.plan import PlanView, record_plan
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.picture import Shot, pictures, vulkan_available
 from tests.support.recordings import rows, same, texts
@@ -31,7 +30,7 @@ __all__ = ["recording", "shadowed", "strict"]  # fixtures
 
 def test_the_schedule_has_every_reading_at_its_minute_in_its_loads_series(shadowed, recording):
     minutes = PlanView(*shadowed, PLAN, SUMMARY).time / 60.0
-    colors = plan_scene.load_colors(PLAN.loads)
+    colors = plan.load_colors(PLAN.loads)
     drawn = {}
     for k, load in enumerate(PLAN.loads):
         at = rows(recording, f"/schedule/load{k}", "Scalars:scalars")
