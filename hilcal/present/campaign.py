@@ -1,7 +1,7 @@
 """What a campaign holds, and two of its revisions side by side."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,7 @@ MOST_EVENTS = 30
 
 
 def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
-    """Yield what a campaign holds, for people.
-
-    Args:
-        o: the campaign.
-        name: of its file.
-        covariance: what the covariances consist of, in words.
-    """
+    """Yield what the campaign of a file name holds; `covariance` says what its covariances are."""
     count = 0 if o.readings is None else len(o.readings)
     yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
     yield pairs(_head(o, covariance))
@@ -61,12 +55,12 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     yield "made", f"{_time(o.created)} UTC{by}; {o.source}"
     if o.planned is not None:
         sessions = sum(e["kind"] == "start" for e in o.events)
-        plans = f", {o.plans} plans" if o.plans > 1 else ""
-        yield (
-            "measured",
-            f"{o.measured} of {o.planned} planned steps in {sessions} "
-            f"session{'s' * (sessions != 1)}{plans}{_duration(o)}",
-        )
+        words = f"{sessions} session{'s' * (sessions != 1)}"
+        words += f", {o.plans} plans" if o.plans > 1 else ""
+        time = None if o.readings is None else o.readings.states.time
+        if time is not None:
+            words += f", {np.ptp(time) / 60:.0f} min from first to last reading"
+        yield "measured", f"{o.measured} of {o.planned} planned steps in {words}"
     if o.readings is None:
         yield "readings", "none yet"
         return
@@ -79,25 +73,16 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     yield "readings", f"{kind}; {covariance}"
 
 
-def _duration(o: Overview) -> str:
-    if o.readings is None or o.readings.states.time is None:
-        return ""
-    return f", {np.ptp(o.readings.states.time) / 60:.0f} min from first to last reading"
-
-
 def _instrument(name: str, serial: str | None) -> str:
     return name if serial is None or serial in name else f"{name}, serial number {serial}"
 
 
 def _checks(o: Overview) -> Iterator[tuple[str, str]]:
     if o.tares:
-        moved = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
-        force, moment = (np.linalg.norm(m, axis=1).max() for m in (moved[:, :3], moved[:, 3:]))
-        yield (
-            "tares",
-            f"{len(o.tares)}; the zero moved by up to {numbers.digits(force, 2)} N and "
-            f"{numbers.digits(moment, 2)} N·m",
-        )
+        change = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
+        sizes = (np.linalg.norm(m, axis=1).max() for m in np.split(change, 2, axis=1))
+        force, moment = (numbers.digits(size, 2) for size in sizes)
+        yield "tares", f"{len(o.tares)}; the zero moved by up to {force} N and {moment} N·m"
     else:
         yield "tares", "none: no force sensor, or nothing measured yet"
     yield "drift", _drift(o)
@@ -106,13 +91,12 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
-        joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
-        yield (
-            "repeatability",
-            f"{r.dof} returns to {r.poses} poses scatter by {numbers.length(r.scatter)}, the "
-            f"instrument alone by {numbers.length(r.instrument)}; "
-            f"{joints if r.shown else 'the joints do not show beside it'}",
-        )
+        scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
+        joints = "the joints do not show beside it"
+        if r.shown:
+            joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
+        returns = f"{r.dof} returns to {r.poses} poses scatter by {scatter}"
+        yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
 
 
 def _drift(o: Overview) -> str:
@@ -217,14 +201,7 @@ NONE = "–"
 
 @dataclass(frozen=True, slots=True)
 class RevisionDifference:
-    """What two revisions say of one thing.
-
-    Attributes:
-        what: it is about, with its unit.
-        first: what the one says.
-        second: what the other says.
-        difference: second minus first; empty where they agree.
-    """
+    """What two revisions say of something, with its unit; no `difference` where they agree."""
 
     what: str
     first: str
@@ -236,11 +213,8 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[RevisionDiffere
     """Return model, cell, verdict, errors and parameters of two revisions, as they were stored."""
     added = [f"+ {name}" for name in b.effects if name not in a.effects]
     removed = [f"− {name}" for name in a.effects if name not in b.effects]
-    rows = [_row("model", model_name(a.effects), model_name(b.effects))]
-    if added or removed:
-        rows = [
-            RevisionDifference("model", rows[0].first, rows[0].second, " ".join([*added, *removed]))
-        ]
+    model = _row("model", model_name(a.effects), model_name(b.effects))
+    rows = [replace(model, difference=" ".join([*added, *removed]) or model.difference)]
     if a.cell or b.cell:
         cells = [cell_words(r.cell) or "as told at first" for r in (a, b)]
         rows.append(_row("cell", *cells))
@@ -253,10 +227,10 @@ def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[RevisionDiffere
         first, second = (numbers.length(x) for x in errors)
         differs = f"{sign}{numbers.length(by)}{share}".replace("-", "−")
         rows.append(RevisionDifference(what, first, second, differs if first != second else ""))
-    factors = [float(r.result_json["identify"]["variance_factor"]) for r in (a, b)]
-    rows.append(_row("variance factor", *(numbers.digits(x) for x in factors)))
-    count = [str(r.result_json["identify"]["n_readings"]) for r in (a, b)]
-    rows.append(_row("readings", *count))
+    fits = [r.result_json["identify"] for r in (a, b)]
+    factors = (numbers.digits(float(f["variance_factor"])) for f in fits)
+    rows.append(_row("variance factor", *factors))
+    rows.append(_row("readings", *(str(f["n_readings"]) for f in fits)))
     return (*rows, *_parameters(a, b))
 
 

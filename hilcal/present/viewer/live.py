@@ -69,7 +69,7 @@ def follow(messages: BinaryIO, reply: ViewerReply, record: Path, port: int) -> N
                 whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
                 now = isinstance(what, Measuring | Revised)
                 outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole, now=now)
-    guard = threading.Thread(target=lambda: [x.end() for x in outlets], daemon=True)
+    guard = threading.Thread(target=lambda: list(map(_Outlet.end, outlets)), daemon=True)
     guard.start()
     guard.join(_END_S)
 
