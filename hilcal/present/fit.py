@@ -415,13 +415,13 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
     yield heading(f"Model: {model_name(fit.model.names)}")
     yield f"Fitted to {fit.readings} absolute readings of a stream, in {fit.passes} passes.\n"
     meaning = {f"{e.name}.{p.name}": p.meaning for e in fit.model.effects for p in e.parameters}
-    rows, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
+    out, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
     for p in fit.parameters:
         if p.value is None or p.std is None:
             unseen.append(p.name)
         else:
-            rows.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
-    yield rows
+            out.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
+    yield out
     yield note("±: standard uncertainty.\n")
     if unseen:
         yield f"Not determined by these readings: {', '.join(unseen)}.\n"

@@ -12,7 +12,7 @@ from hilcal.identification.priors import names_of
 from hilcal.identification.validation import Validation
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.fit import error_words, kind, model_name
-from hilcal.store.plan import UNLOADED
+from hilcal.present.plan import load_name
 from hilcal.types import Floats
 
 MOST = 4
@@ -48,13 +48,11 @@ def validation_report(judged: Judged, found: Validation, beyond: Extrapolation) 
     """Yield the errors, inside and outside of what was measured, and where outside is."""
     out = table(error_words(found.readings), "rms", "mean", "largest", "rms in σ", "stated", "z")
     inside, outside = beyond.inside_error, beyond.outside_error
-    everything = np.ones(len(beyond.z), dtype=np.bool_)
-    rows = [("never fitted" if judged.unseen else "fitted", found.error, everything)]
+    every = np.ones(len(beyond.z), dtype=np.bool_)
+    rows = [("never fitted" if judged.unseen else "fitted", found.error, every)]
     if inside is not None and outside is not None:
-        rows += [
-            ("inside", inside, ~beyond.outside),
-            ("outside", outside, beyond.outside),
-        ]
+        parts = (("inside", inside, ~beyond.outside), ("outside", outside, beyond.outside))
+        rows += parts
     for name, e, mine in rows:
         lengths = (numbers.length(x) for x in (e.rms_m, e.mean_m, e.max_m))
         stated = numbers.length(_rms(beyond.stated_m[mine]))
@@ -119,19 +117,14 @@ def worst_table(found: Acceptance) -> Table:
 
 
 def _shares_table(of: str, at: str, shares: Iterable[Share], limit: float | None) -> Table:
-    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %", "limit")
-    rows = ((*_cells(s), *_verdict(s, limit)) for s in shares)
-    return table(*heads[: None if limit is not None else -1], rows=rows, left=(0, 4))
-
-
-def _cells(s: Share) -> tuple[str, ...]:
-    lengths = [numbers.length(x) for x in (s.rms_m, s.max_m, s.stated_m)]
-    within = f"{100 * s.within:.0f} %"
-    return s.name, str(s.count), *lengths[:2], s.worst, lengths[2], f"{s.z:.2f}", within
-
-
-def _verdict(s: Share, limit: float | None) -> tuple[str, ...]:
-    return () if limit is None else ("kept" if s.passes(limit) else "over",)
+    heads = (of, "n", "rms", "largest", at, "stated", "z", "in 95 %")
+    out = table(*heads, *(() if limit is None else ("limit",)), left=(0, 4))
+    for s in shares:
+        rms, largest, stated = (numbers.length(x) for x in (s.rms_m, s.max_m, s.stated_m))
+        kept = () if limit is None else ("kept" if s.passes(limit) else "over",)
+        within = f"{100 * s.within:.0f} %"
+        out.add(s.name, str(s.count), rms, largest, s.worst, stated, f"{s.z:.2f}", within, *kept)
+    return out
 
 
 def _limit_words(found: Acceptance, limit: float) -> str:
@@ -149,7 +142,7 @@ def _limit_words(found: Acceptance, limit: float) -> str:
 
 def _place(worst: Share) -> str:
     """Return a pose and the load of its largest error."""
-    return f"{worst.name} " + ("unloaded" if worst.worst == UNLOADED else f"under {worst.worst}")
+    return f"{worst.name} {load_name(worst.worst, 'under ')}"
 
 
 def validation_failure(found: Acceptance, judged: Judged) -> str:
@@ -198,24 +191,21 @@ def bootstrap_report(found: Bootstrap) -> Iterator[Block]:
 
 
 def _table(found: Bootstrap) -> Table:
-    rows = table(
-        "parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit",
-        left=(0, 6),
-    )  # fmt: skip
-    fit, (low, high) = found.fit, found.interval()
+    heads = ("parameter", "value", "± stated", "± drawn", "ratio", "95 % of the draws", "unit")
+    out = table(*heads, left=(0, 6))
+    fit, ends = found.fit, found.interval()
     units = [p.unit for e in fit.model.effects for p in e.parameters]
     for k, name in enumerate(names_of(fit.model)):
         if not found.compared[k]:
             continue
-        unit, factor = numbers.unit_for(units[k], [float(fit.theta[k])])
-        value, stated = numbers.with_std(
-            factor * float(fit.theta[k]), factor * float(fit.uncertainty.std[k])
-        )
+        theta, std = float(fit.theta[k]), float(fit.uncertainty.std[k])
+        unit, factor = numbers.unit_for(units[k], [theta])
+        value, stated = numbers.with_std(factor * theta, factor * std)
         drawn = numbers.with_std(0.0, factor * float(found.std[k]))[1]
         places = len(stated.partition(".")[2])
-        between = f"{factor * float(low[k]):.{places}f} to {factor * float(high[k]):.{places}f}"
-        rows.add(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
-    return rows
+        between = " to ".join(f"{factor * float(end[k]):.{places}f}" for end in ends)
+        out.add(name, value, stated, drawn, f"{found.ratio[k]:.2f}", between, unit)
+    return out
 
 
 def bootstrap_remarks(found: Bootstrap) -> Iterator[str]:

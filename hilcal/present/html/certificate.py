@@ -222,9 +222,9 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         return f"{head}: {so}{end}", passed
     error = left_out_errors(m.fit)
     over = int(np.sum(error > m.limit_m))
-    head = "PASSED" if over == 0 else "FAILED"
     return (
-        f"{head}: {len(error) - over} of {len(error)} errors are within {limit}, each pose "
+        f"{'FAILED' if over else 'PASSED'}: {len(error) - over} of {len(error)} errors are within "
+        f"{limit}, each pose "
         f"predicted without itself (largest {numbers.length(float(error.max()))}). No validation "
         "campaign was given: an independent test is missing."
     ), over == 0
