@@ -24,6 +24,8 @@ from hilcal.present.charts.readings import (
     residual_over,
 )
 from hilcal.present.fit import CERTAIN, follows, misses, model_name
+from hilcal.present.story import DependenceCurve
+from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.store.revision import RevisionRecord
@@ -75,9 +77,9 @@ def snapshot(view: View, d: Snapshot) -> None:
                 fell(view, d)
             with ui.column().classes("part"):
                 compared(view, d)
-            if d.revision.laws:
+            if found := curves_of_laws(d.fit):
                 with ui.column().classes("part"):
-                    laws(view, d)
+                    laws(view, found)
         with ui.column().classes("stack"):
             with ui.column().classes("part"):
                 revisions(view, d)
@@ -417,10 +419,10 @@ def compared(view: View, d: Snapshot) -> None:
     chart(view, measured_predicted(d.story, d.revision))
 
 
-def laws(view: View, d: Snapshot) -> None:
+def laws(view: View, found: tuple[DependenceCurve, ...]) -> None:
     """Draw the laws of the model that the catalogue does not have."""
     title("Laws beyond the catalogue")
-    for one in d.revision.laws:
+    for one in found:
         told = "; ".join(f"{what}: {said}" for what, said in one.facts)
         ui.label(f"{one.title}: {told}").classes("soft")
         chart(view, curve_chart(one)).props("data-part=law")

@@ -29,7 +29,7 @@ from hilcal.present.fit import background_line, parameters, remarks, scalings_ta
 from hilcal.present.html.certificate import ReportContent, certificate, first_screen, utc
 from hilcal.present.html.page import render
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import curve, regressor
+from hilcal.present.story import curve, laws, regressor
 from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
 from hilcal.store.command_line import COMMAND
@@ -104,7 +104,7 @@ def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
 
 
 def _laws(m: ReportContent) -> PageSection | None:
-    found = m.story.revisions[-1].laws
+    found = laws(m.fit)
     if not found:
         return None
     parts: list[Block] = []
@@ -247,15 +247,13 @@ def _planned(m: ReportContent) -> Iterator[Block]:
     predicted = None if m.plan is None else m.plan.about.get("predicted_std")
     if not isinstance(predicted, dict):
         return
-    reached = {p.name: p for p in m.fit.parameters if p.std is not None}
-    rows = [
-        (n, numbers.sizes([(reached[n].unit, s)]),
-         numbers.sizes([(reached[n].unit, float(reached[n].std or 0.0))]))
-        for n, s in predicted.items() if isinstance(s, int | float) and n in reached
-    ]  # fmt: skip
-    if rows:
-        heads = ("parameter", "planned", "reached")
-        yield table(*heads, rows=rows, caption="Standard uncertainties")
+    out = table("parameter", "planned", "reached", caption="Standard uncertainties")
+    for p in m.fit.parameters:
+        planned = predicted.get(p.name)
+        if p.std is not None and isinstance(planned, int | float):
+            out.add(p.name, *(numbers.sizes([(p.unit, float(s))]) for s in (planned, p.std)))
+    if out.rows:
+        yield out
 
 
 def _provenance(m: ReportContent) -> Iterator[Block]:

@@ -17,7 +17,6 @@ from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
 from hilcal.present.story import (
     LEVEL_NAMES,
-    DependenceCurve,
     Story,
     StoryRevision,
     levels,
@@ -125,7 +124,8 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
     revision_scene(rec, story, r)
     revision_charts(rec, story, r)
     rec.log("words/verdict", style.document(verdict(story, r)))
-    rec.log("words/parameters", style.document(style.markdown(r.panels.get("parameters", ()))))
+    for panel in PANELS:
+        rec.log(f"words/{panel}", style.document(style.markdown(r.panels.get(panel, ()))))
     rec.log("words/revisions", style.document(revisions(story, r.revision)))
     rec.log("words/details", style.document(details(story, r)))
     rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
@@ -150,8 +150,7 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
     rec.reset_time()
 
 
-FOLLOWS = "What the residual follows"
-LAW = "Law beyond the catalogue"
+PANELS = {"follows": "What the residual follows", "law": "Law", "parameters": "Parameters ± σ"}
 ERRORS = "Error of each revision [µm]"
 
 
@@ -161,20 +160,22 @@ def blueprint(story: Story) -> rrb.Blueprint:
     It opens at the first revision and stands there; that of a growing story goes along with it.
     """
     residual, deflection, bars = titles(story)
-    errors = rrb.TimeSeriesView(origin="errors", name=ERRORS)
+    errors, quiet = (
+        rrb.TimeSeriesView(origin="errors", name=ERRORS),
+        rrb.PlotLegend(visible=False),
+    )
     left = rrb.Vertical(
         rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
-        rrb.Tabs(errors, _bars("bars", bars)),
+        rrb.Tabs(errors, rrb.BarChartView(origin="bars", name=bars, plot_legend=quiet)),
         row_shares=[11, 4],
     )
-    laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
+    law = any(r.panels.get("law") for r in story.revisions)
+    panels = [panel for panel in PANELS if law or panel != "law"]
     words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
         rrb.Tabs(*(style.text(of, name) for of, name in words)),
         rrb.Tabs(
-            _bars("follows", FOLLOWS),
-            *laws,
-            style.text("parameters", "Parameters ± σ"),
+            *(style.text(panel, PANELS[panel]) for panel in panels),
             style.text("revisions", "Table"),
             rrb.TextLogView(origin="log", name="Log"),
         ),
@@ -207,10 +208,6 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     return style.view3d("world", name, place, middle, contents)
 
 
-def _bars(origin: str, name: str) -> rrb.BarChartView:
-    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
-
-
 SERIES = (
     ("fit", "fitted poses, rms", style.MEASURED),
     ("holdout", "poses left out, rms", style.HOLDOUT),
@@ -220,8 +217,6 @@ SERIES = (
 """Of the errors of revisions: entity, name and colour."""
 BARS = 150
 """Bars of poses at most."""
-_BINS = 12
-"""Of single readings over what they may follow, for their mean."""
 
 
 def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -230,9 +225,6 @@ def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> 
     for (entity, *_), size in zip(SERIES, (*sizes, story.noise_floor_m), strict=True):
         rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
     pose_bars(rec, story, r)
-    curve_bars(rec, "follows", r.follows)
-    if any(one.laws for one in story.revisions):
-        curve_bars(rec, "law", r.laws[0] if r.laws else None)
 
 
 def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -266,43 +258,6 @@ def _bar_places(story: Story) -> tuple[Ints, Floats, Floats]:
     starts = np.arange(0, len(story.poses), poses_per_bar(story))
     edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
     return starts, edges[:-1], np.diff(edges)
-
-
-def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
-    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
-
-    Single readings are drawn by their mean in bins of equal count.
-    """
-    bars: dict[str, Floats] = {}
-    edges = np.zeros(0)
-    if c is not None and len(c.x):
-        x, y = (c.x, c.y) if c.error is not None else _means(c)
-        order = np.arange(len(x)) if c.names else np.argsort(x, kind="stable")
-        bars["mean"] = y[order]
-        if c.line is not None:
-            bars["law"] = np.interp(x[order], *c.line)
-        edges = _edges(order.astype(float) if c.names else x[order])
-    for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
-        if part not in bars:
-            rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
-            continue
-        width = np.diff(edges) / len(bars)
-        at = edges[:-1] + k * width
-        rec.log(f"{entity}/{part}", rr.BarChart(bars[part], abscissa=at, widths=width, color=color))
-
-
-def _edges(x: Floats) -> Floats:
-    """(K + 1,) of bins about growing centres (K,): half-way between them."""
-    if len(x) == 1:
-        return np.array([x[0] - 0.5, x[0] + 0.5])
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
-
-
-def _means(c: DependenceCurve) -> tuple[Floats, Floats]:
-    order = np.argsort(c.x, kind="stable")
-    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
-    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])
 
 
 _MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
@@ -402,14 +357,14 @@ is the worst reading; the order in µm can be another, where some readings are n
 in µm, against the noise. Left-out error far above the fitted one = too many parameters.
 
 **What the residual follows**: its mean over the leading suspect, or, where that explains little of
-it, over the recorded variable that carries most of it; *Details* names both axes.
+it, over the recorded variable that carries most of it.
 """
 
 
-SIGMA_LENGTH = 0.02  # one σ is drawn this long, m
-ARROW_CAP = 0.40  # longest arrow, m
-DEFLECTION_LENGTH = 0.25  # a large measured deflection is drawn this long, m
-_DEFLECTION_CAP = 0.6
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40
+"""One σ is drawn this long, and no arrow longer, m."""
+DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6
+"""The same of a large measured deflection, m."""
 ARROWS, BALLS, PAIRS = 150, 60, 150
 """How much is drawn at most, so that a picture stays legible and a file small."""
 _LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
@@ -568,7 +523,7 @@ def _deflections(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> Non
         ("measured", story.measured, style.MEASURED, 0.0055),
         ("predicted", r.predicted, style.PREDICTED, 0.0045),
     ):
-        moved = capped(story.deviation(value)[some] * scale, _DEFLECTION_CAP)
+        moved = capped(story.deviation(value)[some] * scale, DEFLECTION_CAP)
         tips.append(at + moved)
         drawn = rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius])
         rec.log(f"world/deflection/{name}", drawn)

@@ -95,7 +95,7 @@ def require_folder(path: Path) -> None:
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
 ) -> None:
-    """Write what is told to a stream as a file, and close the stream.
+    """Write what is told to a stream as a file, whole or not at all, and close the stream.
 
     The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
 

@@ -143,25 +143,14 @@ def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
 def direction(
     turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
 ) -> Floats:
-    """Return the direction (3,) to the eye, in half sizes of the picture.
+    """Return the direction (3,) to the eye, in half sizes (m) of the picture about its middle (3,).
 
-    Args:
-        turn: about z, that is preferred, rad.
-        middle: (3,) of the picture, m.
-        size: half size of the picture, m.
-        points: (K, 3) what is to be seen, m.
-        things: what may hide it.
+    It is that near the preferred `turn` about z, rad, from where things hide fewest points (K, 3).
     """
-    places = [
-        np.array([1.7 * np.cos(turn + a), 1.7 * np.sin(turn + a), z])
-        for z in _HEIGHTS
-        for a in _TURNS
-    ]
-    cost = [
-        hidden(middle + size * place, points, things).mean() + _WORTH * k
-        for k, place in enumerate(places)
-    ]
-    return places[int(np.argmin(cost))]
+    angles = [(turn + a, z) for z in _HEIGHTS for a in _TURNS]
+    places = [np.array([1.7 * np.cos(a), 1.7 * np.sin(a), z]) for a, z in angles]
+    covered = [hidden(middle + size * place, points, things).mean() for place in places]
+    return places[int(np.argmin(covered + _WORTH * np.arange(len(places))))]
 
 
 def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
