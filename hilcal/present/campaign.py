@@ -1,7 +1,6 @@
 """What a campaign holds, and two of its revisions side by side."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -199,39 +198,34 @@ def _time(utc: str) -> str:
 NONE = "–"
 
 
-@dataclass(frozen=True, slots=True)
-class RevisionDifference:
-    """What two revisions say of something, with its unit; no `difference` where they agree."""
+def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
+    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored.
 
-    what: str
-    first: str
-    second: str
-    difference: str
+    The difference, second minus first, is empty where they agree.
+    """
+    heads = ("", f"revision {a.number}", f"revision {b.number}", "difference")
+    out = table(*heads, left=(0, 1, 2, 3))
 
+    def add(what: str, first: str, second: str, difference: str = "differs") -> None:
+        out.add(what, first, second, difference if first != second else "")
 
-def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[RevisionDifference, ...]:
-    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored."""
-    added = [f"+ {name}" for name in b.effects if name not in a.effects]
-    removed = [f"− {name}" for name in a.effects if name not in b.effects]
-    model = _row("model", model_name(a.effects), model_name(b.effects))
-    rows = [replace(model, difference=" ".join([*added, *removed]) or model.difference)]
+    names = [f"+ {name}" for name in b.effects if name not in a.effects]
+    names += [f"− {name}" for name in a.effects if name not in b.effects]
+    add("model", model_name(a.effects), model_name(b.effects), " ".join(names) or "differs")
     if a.cell or b.cell:
-        cells = [cell_words(r.cell) or "as told at first" for r in (a, b)]
-        rows.append(_row("cell", *cells))
-    rows.append(_row("verdict", verdict_of(a), verdict_of(b)))
-    for what, of in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
-        errors = [float(r.result_json["identify"]["error"][of]["rms_m"]) for r in (a, b)]
-        by = errors[1] - errors[0]
-        share = f" ({100 * by / errors[0]:+.0f} %)" if errors[0] else ""
-        sign = "+" if by > 0 else ""
-        first, second = (numbers.length(x) for x in errors)
-        differs = f"{sign}{numbers.length(by)}{share}".replace("-", "−")
-        rows.append(RevisionDifference(what, first, second, differs if first != second else ""))
+        add("cell", *(cell_words(r.cell) or "as told at first" for r in (a, b)))
+    add("verdict", verdict_of(a), verdict_of(b))
     fits = [r.result_json["identify"] for r in (a, b)]
-    factors = (numbers.digits(float(f["variance_factor"])) for f in fits)
-    rows.append(_row("variance factor", *factors))
-    rows.append(_row("readings", *(str(f["n_readings"]) for f in fits)))
-    return (*rows, *_parameters(a, b))
+    for what, of in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
+        before, after = (float(f["error"][of]["rms_m"]) for f in fits)
+        share = f" ({100 * (after - before) / before:+.0f} %)" if before else ""
+        by = f"{'+' * (after > before)}{numbers.length(after - before)}{share}".replace("-", "−")
+        add(what, numbers.length(before), numbers.length(after), by)
+    add("variance factor", *(numbers.digits(float(f["variance_factor"])) for f in fits))
+    add("readings", *(str(f["n_readings"]) for f in fits))
+    for row in _parameters(*fits):
+        add(*row)
+    return out
 
 
 def verdict_of(record: RevisionRecord) -> str:
@@ -263,13 +257,9 @@ def refitted(before: Fit, after: Fit) -> str:
     )
 
 
-def _row(what: str, first: str, second: str) -> RevisionDifference:
-    return RevisionDifference(what, first, second, "differs" if first != second else "")
-
-
-def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[RevisionDifference]:
+def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
     known: list[dict[str, Mapping[str, Any]]] = [
-        {p["name"]: p for p in r.result_json["identify"]["parameters"]} for r in (a, b)
+        {p["name"]: p for p in f["parameters"]} for f in (a, b)
     ]
     for name in dict.fromkeys([*known[0], *known[1]]):
         found = [of.get(name) for of in known]
@@ -279,11 +269,11 @@ def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[RevisionDiffer
         first, second = (_value(p, factor) for p in found)
         if {first, second} <= {NONE, UNSEEN}:
             continue
-        difference = ""
-        if first != second and not {first, second} & {NONE, UNSEEN}:
-            by = factor * (values[1] - values[0])
-            difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
-        yield RevisionDifference(f"{name} [{unit}]" if unit else name, first, second, difference)
+        by = factor * (values[1] - values[0])
+        difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
+        if {first, second} & {NONE, UNSEEN}:
+            difference = ""
+        yield f"{name} [{unit}]" if unit else name, first, second, difference
 
 
 UNSEEN = "not determined"

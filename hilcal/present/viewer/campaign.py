@@ -140,12 +140,9 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
     time = rr.TimeColumn("pose", sequence=story.poses)
     along(rec, "words/verdict", time, style.documents(pose_cards(story)))
     # the bar of the current pose; its name puts it in front of the others
-    sigma = np.sqrt(pose_norm2(story, story.revisions[-1]))
-    starts, left, width = _bar_places(story)
-    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
-        rec.set_time("pose", sequence=int(story.poses[starts[k]]))
-        one = slice(k, k + 1)
-        bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
+    for pose, left, width, height in zip(*_bar_places(story, story.revisions[-1]), strict=True):
+        rec.set_time("pose", sequence=int(pose))
+        bar = rr.BarChart([height], abscissa=[left], widths=[width], color=style.MEASURED)
         rec.log("bars/zcurrent", bar)
     rec.reset_time()
 
@@ -232,20 +229,13 @@ def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
 
     The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
     """
-    starts, left, width = _bar_places(story)
-    norm2 = np.maximum.reduceat(pose_norm2(story, r), starts)
+    _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
-        mine = levels(norm2) == i
-        some = mine if mine.any() else np.arange(len(norm2)) == 0  # else a bar without a height
-        color = style.LEVEL_COLORS[i].tolist()
-        height = np.where(mine, np.sqrt(norm2), 0.0)[some]
-        bar = rr.BarChart(height, abscissa=left[some], widths=width[some], color=color)
+        mine = levels(height**2) == i
+        some = mine if mine.any() else np.arange(len(height)) == 0  # else a bar without a height
+        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(mine, height, 0.0)[some]
+        bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
         rec.log(f"bars/{name}", bar)
-
-
-def pose_norm2(story: Story, r: StoryRevision) -> Floats:
-    """(P,) largest squared Mahalanobis distance of each pose."""
-    return r.whitened_norm2[story.last_of_poses(r.whitened_norm2)]
 
 
 def poses_per_bar(story: Story) -> int:
@@ -253,11 +243,13 @@ def poses_per_bar(story: Story) -> int:
     return -(-len(story.poses) // BARS)
 
 
-def _bar_places(story: Story) -> tuple[Ints, Floats, Floats]:
-    """First pose (index), left edge and width of every bar, in pose numbers."""
+def _bar_places(story: Story, r: StoryRevision) -> tuple[Ints, Floats, Floats, Floats]:
+    """First pose (its number), left edge, width and height, σ, of every bar."""
     starts = np.arange(0, len(story.poses), poses_per_bar(story))
     edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
-    return starts, edges[:-1], np.diff(edges)
+    worst_of_poses = r.sigma[story.last_of_poses(r.whitened_norm2)]
+    height = np.maximum.reduceat(worst_of_poses, starts)
+    return story.poses[starts], edges[:-1], np.diff(edges), height
 
 
 _MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
