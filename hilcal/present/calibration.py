@@ -357,7 +357,6 @@ def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
     for f in found:
         passed = f"the arm passes its place within {numbers.length(f.blend_m)} and does not stop"
         out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
-    yield ""
-    yield out
+    yield from ("", out)
     if any(f.blend_m > 0 and f.done == "corrected" for f in found):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."

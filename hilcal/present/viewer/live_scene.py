@@ -242,13 +242,7 @@ def _status(d: LiveTally) -> Iterator[Block]:
 
 
 def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
-    """Return the blueprint.
-
-    Args:
-        d: the campaign.
-        world: the entity below which its readings are drawn.
-        series: the entity below which its residuals are in time.
-    """
+    """Return the blueprint, of readings below `world` and residuals in time below `series`."""
     ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
     every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
@@ -324,9 +318,7 @@ class LiveScene:
     def end(self, to_open: bool) -> None:
         """Tell the story once more, whole: its words know now which revision is the last.
 
-        Args:
-            to_open: let the recording open at the first revision, as a file does; else whoever
-                watches stays at the last one.
+        `to_open`: let it open at the first revision, as a file does; else it stays at the last one.
         """
         self.settle()
         self._now = None
