@@ -46,7 +46,10 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
         f"fit, left out: rms of the {what}, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor."
     )
-    yield _used(o)
+    used = "→ used by every command: the latest one; hilcal accept RUN N chooses another."
+    if o.accepted is not None:
+        used = f"→ revision {o.accepted} is accepted: every command uses it."
+    yield used
 
 
 def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
@@ -182,12 +185,6 @@ def model_words(r: RevisionRecord) -> str:
     scatter = r.parameters_json.get("arm_scatter") is not None and not r.cell
     found = change(r.added, r.removed, scatter) or model_name(r.effects)
     return f"{found}; {cell_words(r.cell)}" if r.cell else found
-
-
-def _used(o: Overview) -> str:
-    if o.accepted is not None:
-        return f"→ revision {o.accepted} is accepted: every command uses it."
-    return "→ used by every command: the latest one; hilcal accept RUN N chooses another."
 
 
 def _time(utc: str) -> str:

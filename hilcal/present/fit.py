@@ -11,7 +11,6 @@ from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
 from hilcal.identification.carried import DriftGroup as CarriedGroup
-from hilcal.identification.drift import Conflict
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
@@ -310,20 +309,16 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
             out.add(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
+    tested = [p for p in places if p.group not in ("pose", "direction")]
+    tests = numbers.many_tests(len(tested), FALSE_ALARM, "variables")
     least = numbers.percent(LEAST_SHARE)
     rest = len([p for p in places if p.share < LEAST_SHARE])
     more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
     yield note(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
         "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}"
+        f"{more}. p-value: chance of that share in noise; {tests}"
     )
-
-
-def tests_of(places: Sequence[MisfitShare]) -> tuple[int, float, str]:
-    """Return how many variables were looked at, and the level that they share."""
-    kinds = [p for p in places if p.group not in ("pose", "direction")]
-    return len(kinds), FALSE_ALARM, "variables"
 
 
 @dataclass(frozen=True, slots=True)
@@ -458,7 +453,8 @@ def prior_lines(found: Fit) -> list[str]:
     name = source.campaign or "a posterior"
     name += f", revision {source.revision}" if source.revision else ""
     lines = [f"Prior: {name} ({source.n_readings} readings{'' if fleet else of})."]
-    told = disagreements(found)
+    # the groups about which prior and readings disagree beyond chance, worst first
+    told = [c for c in found.conflicts if c.p_value * len(found.conflicts) < TELL_P]
     lines += [
         f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior allows: "
         "wear, a crash or a repair?"
@@ -476,12 +472,6 @@ def prior_lines(found: Fit) -> list[str]:
     elif not told:
         lines.append("  The readings agree with it.")
     return lines
-
-
-def disagreements(found: Fit) -> list[Conflict]:
-    """Return the groups about which prior and readings disagree beyond chance, worst first."""
-    all_of = found.conflicts
-    return [c for c in all_of if c.p_value * len(all_of) < TELL_P]
 
 
 def _of(group: CarriedGroup) -> str:

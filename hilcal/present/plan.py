@@ -81,7 +81,9 @@ def plan_report(s: PlanSummary) -> Iterator[Block]:
         yield f"{order_remark(s)}\n"
     if s.parameters:
         yield heading("Predicted standard uncertainty")
-        yield from parameters_table(s)
+        heads = ("parameter", "±", "magnitude", "unit", "± in %")
+        yield table(*heads, rows=_parameter_rows(s.parameters), left=(0, 3))
+        yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
     if s.criteria:
         yield heading("Comparison of criteria, for the same number of readings")
         yield from criteria_table(s)
@@ -191,16 +193,6 @@ def _parameter_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[
 
 def _effect(name: str) -> str:
     return name.split(".")[0]
-
-
-def parameters_table(s: PlanSummary) -> Iterator[Block]:
-    """Yield the table of predicted standard uncertainties."""
-    yield table(
-        *("parameter", "±", "magnitude", "unit", "± in %"),
-        rows=_parameter_rows(s.parameters),
-        left=(0, 3),
-    )
-    yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
 
 
 def criteria_table(s: PlanSummary) -> Iterator[Block]:

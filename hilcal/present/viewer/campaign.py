@@ -122,7 +122,10 @@ def begin(rec: rr.RecordingStream, story: Story) -> None:
 def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
     revision_scene(rec, story, r)
-    revision_charts(rec, story, r)
+    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m, story.noise_floor_m)
+    for (entity, *_), size in zip(SERIES, sizes, strict=True):
+        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
+    pose_bars(rec, story, r)
     rec.log("words/verdict", style.document(verdict(story, r)))
     for panel in PANELS:
         rec.log(f"words/{panel}", style.document(style.markdown(r.panels.get(panel, ()))))
@@ -214,14 +217,6 @@ SERIES = (
 """Of the errors of revisions: entity, name and colour."""
 BARS = 150
 """Bars of poses at most."""
-
-
-def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log one revision at the recording's current time."""
-    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m)
-    for (entity, *_), size in zip(SERIES, (*sizes, story.noise_floor_m), strict=True):
-        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
-    pose_bars(rec, story, r)
 
 
 def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
