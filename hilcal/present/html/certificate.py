@@ -222,11 +222,11 @@ def limit_words(m: ReportContent) -> tuple[str, bool | None]:
         return f"{head}: {so}{end}", passed
     error = left_out_errors(m.fit)
     over = int(np.sum(error > m.limit_m))
+    largest = numbers.length(float(error.max()))
     return (
         f"{'FAILED' if over else 'PASSED'}: {len(error) - over} of {len(error)} errors are within "
-        f"{limit}, each pose "
-        f"predicted without itself (largest {numbers.length(float(error.max()))}). No validation "
-        "campaign was given: an independent test is missing."
+        f"{limit}, each pose predicted without itself (largest {largest}). No validation campaign "
+        "was given: an independent test is missing."
     ), over == 0
 
 
@@ -324,7 +324,8 @@ def _by_load(m: ReportContent) -> Table:
         if m.limit_m is not None:
             row.append("kept" if error[worst] <= m.limit_m else "over")
         rows.append(row)
-    heads = ["load", "n", "rms", "largest", "at pose"] + (["limit"] if m.limit_m else [])
+    limit = () if m.limit_m is None else ("limit",)
+    heads = ("load", "n", "rms", "largest", "at pose", *limit)
     return table(*heads, rows=rows, caption="Error of poses left out, by load")
 
 

@@ -160,10 +160,8 @@ def blueprint(story: Story) -> rrb.Blueprint:
     It opens at the first revision and stands there; that of a growing story goes along with it.
     """
     residual, deflection, bars = titles(story)
-    errors, quiet = (
-        rrb.TimeSeriesView(origin="errors", name=ERRORS),
-        rrb.PlotLegend(visible=False),
-    )
+    errors = rrb.TimeSeriesView(origin="errors", name=ERRORS)
+    quiet = rrb.PlotLegend(visible=False)
     left = rrb.Vertical(
         rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
         rrb.Tabs(errors, rrb.BarChartView(origin="bars", name=bars, plot_legend=quiet)),

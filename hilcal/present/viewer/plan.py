@@ -467,8 +467,7 @@ def sight(d: PlanView) -> str:
 def step_card(d: PlanView, k: int) -> str:
     """Return step k (from 0) in words."""
     step = d.plan.steps[k]
-    under = "unloaded" if step.load == UNLOADED else f"under {step.load}"
-    head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {under}")
+    head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {load_name(step.load, 'under ')}")
     when = f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}."
     changes = bool(k) and d.load[k] != d.load[k - 1]
     change = "everything is taken off" if step.load == UNLOADED else f"{step.load} is hung"
