@@ -431,7 +431,9 @@ def record_plan(
 def _log(rec: rr.RecordingStream, d: PlanView) -> None:
     rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
     static_scene(rec, d)
-    details = style.markdown(plan_blocks.plan_report(d.summary))
+    _, _, *tables = plan_blocks.plan_report(d.summary)
+    times = pairs(row for row in plan_blocks.cost_rows(d.summary) if row[0] in NOT_FIRST)
+    details = style.markdown([times, *tables])
     for name, text in (("plan", overview(d)), ("guide", GUIDE), ("details", details)):
         fixed(rec, f"words/{name}", style.document(text))
     recording.flush(rec)
@@ -441,11 +443,15 @@ def _log(rec: rr.RecordingStream, d: PlanView) -> None:
     recording.flush(rec)
 
 
+NOT_FIRST = ("", "takes about")
+"""Rows of what a plan costs that stand with the details."""
+
+
 def overview(d: PlanView) -> str:
     """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
     s = d.summary
     told = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
-    rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in ("", "takes about")]
+    rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in NOT_FIRST]
     asked: list[Block] = []
     if d.powers:
         names = list(dict.fromkeys(t.effect for t in d.powers))
