@@ -15,8 +15,7 @@ from hilcal.names import quoted
 from hilcal.present.campaign import info_report
 from hilcal.present.fit import model_name
 from hilcal.present.progress import counting
-from hilcal.present.registration import covariance_words
-from hilcal.present.torques import torque_lines
+from hilcal.present.registration import covariance_words, torque_lines
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview, to_json

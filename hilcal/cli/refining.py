@@ -68,9 +68,8 @@ from hilcal.present.diagnosis import (
 from hilcal.present.discovery import refined_laws
 from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
-from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line
+from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
 from hilcal.present.story import Chapter
-from hilcal.present.torques import torque_lines
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model

@@ -24,8 +24,8 @@ from hilcal.present.registration import (
     observed_words,
     other_arm_line,
     registration_lines,
+    torque_lines,
 )
-from hilcal.present.torques import torque_lines
 from hilcal.readings.readings import Readings
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file

@@ -17,11 +17,11 @@ from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.acceptance import Acceptance
 from hilcal.present.document import Block, heading, note, table
+from hilcal.present.plan import load_name
 from hilcal.present.registration import base_line
 from hilcal.present.running import spoken
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source
 from hilcal.readings.whitening import Mode
-from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
@@ -41,39 +41,30 @@ TITLES: Mapping[str, str] = {
     "compare": "Compare before and after",
 }
 DOES: Mapping[str, str] = {
-    "plan": "Poses, loads and their order are chosen",
-    "refine": "Effects are added until what is left is noise",
-    "decide": "What is in doubt, and what further readings would tell, is predicted",
-    "plan_validation": "Poses within what was measured are drawn, none of those that were fitted",
-    "validate": "The readings are frozen by their hash and then predicted",
-    "correct": "Joint values are found at which each pose is where it should be under its load",
-    "compare": "Each point as measured at its uncorrected and at its corrected joint values",
+    "plan": "Poses, loads and their order are chosen: seconds to a minute",
+    "refine": "Effects are added until what is left is noise: seconds to minutes, by the number of "
+    "readings",
+    "decide": "What is in doubt, and what further readings would tell, is predicted: seconds; a "
+    "minute where something is in doubt",
+    "plan_validation": "Poses within what was measured are drawn, none of those that were fitted: "
+    "seconds",
+    "validate": "The readings are frozen by their hash and then predicted: seconds",
+    "correct": "Joint values are found at which each pose is where it should be under its load: "
+    "seconds",
+    "compare": "Each point as measured at its uncorrected and at its corrected joint values: "
+    "seconds",
 }
-LASTING: Mapping[str, str] = {
-    "plan": "seconds to a minute",
-    "refine": "seconds to minutes, by the number of readings",
-    "decide": "seconds; a minute where something is in doubt",
-    "plan_validation": "seconds",
-    "validate": "seconds",
-    "correct": "seconds",
-    "compare": "seconds",
-}
-"""How long computing takes, in words: of a campaign of some hundred readings."""
+"""Steps that compute, and how long they take for a campaign of some hundred readings."""
 MOST_LEFT = 6
 """Points without a correction that are listed."""
 
 
 def step_heading(step: "ProcedureStep", clock: float = 1.0) -> Iterator[Block]:
-    """Yield what comes next, and how long it takes.
-
-    Args:
-        step: the step.
-        clock: cell seconds per real second.
-    """
+    """Yield what comes next, and how long it takes, of `clock` cell seconds per real second."""
     yield ""
     yield heading(TITLES[step.kind])
     if not step.moves:
-        yield f"{DOES[step.kind]}: {LASTING[step.kind]}.\n"
+        yield f"{DOES[step.kind]}.\n"
         return
     of = "" if step.missing == step.planned else f" of {step.planned}"
     changes = step.load_changes
@@ -99,23 +90,18 @@ def standing(step: "ProcedureStep") -> str:
 def decision_report(
     d: "Decision", goal_m: float | None, mode: Mode, clock: float = 1.0
 ) -> Iterator[str]:
-    """Yield what was decided after a refinement, and why.
+    """Yield what was decided after a refinement of deflections or absolute readings, and why.
 
-    Args:
-        d: the decision.
-        goal_m: the goal, m; None without one.
-        mode: what is fitted.
-        clock: cell seconds per real second.
+    `goal_m` is in m, None without one; `clock` in cell seconds per real second.
     """
     now = numbers.length(d.error.now_m)
-    share = f"{100 * BAND:.0f} %"
-    yield f"Predicted after compensation: {share} of the points within {now}."
+    yield f"Predicted after compensation: {100 * BAND:.0f} % of the points within {now}."
     goal = "" if goal_m is None else numbers.length(goal_m)
     then = "" if d.then_m is None else numbers.length(d.then_m)
-    cost = ""
-    if d.plan is not None:
-        cost = f"{len(d.plan.steps)} further readings ({lasting(d.seconds, clock)})"
+    cost = f"further readings ({lasting(d.seconds, clock)})"
+    cost = "" if d.plan is None else f"{len(d.plan.steps)} {cost}"
     names = numbers.names(d.suspects)
+    would = f"separate {names}" if d.suspects else f"lower the predicted error to {then}"
     power = "" if d.power is None else f"with a power of {d.power:.2f} at least"
     of, rest = "", ""
     if mode == "deflection":
@@ -132,8 +118,8 @@ def decision_report(
         f"{f' ({then})' if then else ''}. Nothing more is measured.",
         "inseparable": f"{names} are in doubt, and no measurement in this cell separates them: any "
         "of them corrects these readings. Nothing more is measured.",
-        "time": f"{cost} would {_told(d, names, then)}; --max-time does not allow them.",
-        "plans": f"{cost} would {_told(d, names, then)}, but as many plans before did not do; "
+        "time": f"{cost} would {would}; --max-time does not allow them.",
+        "plans": f"{cost} would {would}, but as many plans before did not do; "
         "nothing more is measured.",
         "unknown_effect": "Something is missing that no effect of the catalogue explains: more "
         "readings of this kind will not name it. The validation says how much it matters.",
@@ -144,11 +130,6 @@ def decision_report(
         "wrongly does: the diagnosis names them.",
     }
     yield f"{reasons[d.reason]}\n"
-
-
-def _told(d: "Decision", names: str, then: str) -> str:
-    """Say what a further plan would have told."""
-    return f"separate {names}" if d.suspects else f"lower the predicted error to {then}"
 
 
 def validation_lines(found: Acceptance) -> Iterator[str]:
@@ -212,7 +193,7 @@ def improvement_summary(found: Improvement) -> str:
 
 def _rows(part: Improved) -> Iterator[tuple[str, ...]]:
     """Yield before, after and noise of some points."""
-    name = "unloaded" if part.name == UNLOADED else part.name
+    name = load_name(part.name)
     before, after = (
         tuple(numbers.length(x) for x in (s.mean_m, s.rms_m, s.max_m))
         for s in (part.before, part.after)
@@ -287,29 +268,22 @@ def _outside(o: Outside, k: int) -> str:
     return f"{r.variable} {numbers.digits(value)} {r.unit}, measured {low} to {high}"
 
 
-def _degrees(value: float) -> str:
-    return f"{np.degrees(value):.1f}°"
-
-
 def compensation_report(
     calibration: Calibration, names: Sequence[str], before: Floats, c: Compensation
 ) -> Iterator[Block]:
     """Yield the summary and the points with the largest corrections.
 
-    Args:
-        calibration: the calibration.
-        names: of the N points.
-        before: (N, n) joint values that were given.
-        c: the compensation.
+    `before` (N, n) are the joint values that were given for the points of these names.
     """
     now, later = c.before.error_m, c.after.band_m
+    expected = numbers.length(float(np.sqrt(np.mean(c.after.std_m**2))))
     asked = "the unloaded arm" if calibration.mode == "deflection" else "the nominal arm"
     yield heading(f"{len(names)} points compensated")
     yield (
         f"  error before   {numbers.length(float(now.mean()))} mean, "
         f"{numbers.length(float(now.max()))} largest, from where {asked} has the tool\n"
         f"  error after    {100 * BAND:.0f} % of the points within "
-        f"{numbers.length(float(later.max()))}; expected {numbers.length(_rms(c.after.std_m))} rms"
+        f"{numbers.length(float(later.max()))}; expected {expected} rms"
     )
     yield f"  the latter includes {', '.join(_parts(calibration, c.untold))}"
     yield f"  {base_line(calibration.model.cell, calibration.frames, calibration.mode)}"
@@ -318,27 +292,19 @@ def compensation_report(
     for k in sorted(order):
         turn = np.abs(c.q[k] - before[k])
         joint = int(np.argmax(turn))
-        size = numbers.joint_value(turn[joint], c.units[joint], 3)
-        out.add(
-            names[k],
-            numbers.length(float(now[k])),
-            f"± {numbers.length(float(later[k]))}",
-            f"joint {joint + 1}: {size}",
-        )
+        largest = f"joint {joint + 1}: {numbers.joint_value(turn[joint], c.units[joint], 3)}"
+        was, left = (numbers.length(float(x[k])) for x in (now, later))
+        out.add(names[k], was, f"± {left}", largest)
     yield ""
     yield out
     for o in c.turned_on:
         yield (
             f"{o.of.variable}: in {int(o.points.sum())} of {len(names)} points whole turns from "
-            f"what was measured, {_degrees(o.of.low)} to {_degrees(o.of.high)}. The model is the "
-            "same there; what cables do is not in it."
+            f"what was measured, {np.degrees(o.of.low):.1f}° to {np.degrees(o.of.high):.1f}°. The "
+            "model is the same there; what cables do is not in it."
         )
     if len(names) > LISTED:
         yield f"The {LISTED} of {len(names)} points with the largest error before are listed."
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _parts(calibration: Calibration, untold: Sequence[str]) -> list[str]:
@@ -391,7 +357,6 @@ def waypoints_table(found: Sequence[Fate]) -> Iterator[Block]:
     for f in found:
         passed = f"the arm passes its place within {numbers.length(f.blend_m)} and does not stop"
         out.add(str(f.line), f.done, f.why or (passed if f.blend_m > 0 else ""))
-    yield ""
-    yield out
+    yield from ("", out)
     if any(f.blend_m > 0 and f.done == "corrected" for f in found):
         yield "Of a blended waypoint the corner of the path is corrected; the radius stays."

@@ -1,7 +1,6 @@
 """What a campaign holds, and two of its revisions side by side."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -22,13 +21,7 @@ MOST_EVENTS = 30
 
 
 def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
-    """Yield what a campaign holds, for people.
-
-    Args:
-        o: the campaign.
-        name: of its file.
-        covariance: what the covariances consist of, in words.
-    """
+    """Yield what the campaign of a file name holds; `covariance` says what its covariances are."""
     count = 0 if o.readings is None else len(o.readings)
     yield heading(f"{name}: {count} readings of {o.poses} poses, {o.config.robot.model}")
     yield pairs(_head(o, covariance))
@@ -53,7 +46,10 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
         f"fit, left out: rms of the {what}, of the fitted poses and of poses left out, "
         "there in σ of the noise as well; v.f.: variance factor."
     )
-    yield _used(o)
+    used = "→ used by every command: the latest one; hilcal accept RUN N chooses another."
+    if o.accepted is not None:
+        used = f"→ revision {o.accepted} is accepted: every command uses it."
+    yield used
 
 
 def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
@@ -61,12 +57,12 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     yield "made", f"{_time(o.created)} UTC{by}; {o.source}"
     if o.planned is not None:
         sessions = sum(e["kind"] == "start" for e in o.events)
-        plans = f", {o.plans} plans" if o.plans > 1 else ""
-        yield (
-            "measured",
-            f"{o.measured} of {o.planned} planned steps in {sessions} "
-            f"session{'s' * (sessions != 1)}{plans}{_duration(o)}",
-        )
+        words = f"{sessions} session{'s' * (sessions != 1)}"
+        words += f", {o.plans} plans" if o.plans > 1 else ""
+        time = None if o.readings is None else o.readings.states.time
+        if time is not None:
+            words += f", {np.ptp(time) / 60:.0f} min from first to last reading"
+        yield "measured", f"{o.measured} of {o.planned} planned steps in {words}"
     if o.readings is None:
         yield "readings", "none yet"
         return
@@ -79,25 +75,16 @@ def _head(o: Overview, covariance: str) -> Iterator[tuple[str, str]]:
     yield "readings", f"{kind}; {covariance}"
 
 
-def _duration(o: Overview) -> str:
-    if o.readings is None or o.readings.states.time is None:
-        return ""
-    return f", {np.ptp(o.readings.states.time) / 60:.0f} min from first to last reading"
-
-
 def _instrument(name: str, serial: str | None) -> str:
     return name if serial is None or serial in name else f"{name}, serial number {serial}"
 
 
 def _checks(o: Overview) -> Iterator[tuple[str, str]]:
     if o.tares:
-        moved = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
-        force, moment = (np.linalg.norm(m, axis=1).max() for m in (moved[:, :3], moved[:, 3:]))
-        yield (
-            "tares",
-            f"{len(o.tares)}; the zero moved by up to {numbers.digits(force, 2)} N and "
-            f"{numbers.digits(moment, 2)} N·m",
-        )
+        change = np.array([t.wrench for t in o.tares]) - o.tares[0].wrench
+        sizes = (np.linalg.norm(m, axis=1).max() for m in np.split(change, 2, axis=1))
+        force, moment = (numbers.digits(size, 2) for size in sizes)
+        yield "tares", f"{len(o.tares)}; the zero moved by up to {force} N and {moment} N·m"
     else:
         yield "tares", "none: no force sensor, or nothing measured yet"
     yield "drift", _drift(o)
@@ -106,13 +93,12 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
         yield "tool", f"{o.tool['mass_kg']:.3f} kg, its centre at {com} mm in flange axes"
     if o.repeatability is not None:
         r = RepeatabilityEstimate(**o.repeatability)
-        joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
-        yield (
-            "repeatability",
-            f"{r.dof} returns to {r.poses} poses scatter by {numbers.length(r.scatter)}, the "
-            f"instrument alone by {numbers.length(r.instrument)}; "
-            f"{joints if r.shown else 'the joints do not show beside it'}",
-        )
+        scatter, alone = numbers.length(r.scatter), numbers.length(r.instrument)
+        joints = "the joints do not show beside it"
+        if r.shown:
+            joints = f"joints {numbers.digits(1e6 * r.joint_std, 2)} µrad"
+        returns = f"{r.dof} returns to {r.poses} poses scatter by {scatter}"
+        yield "repeatability", f"{returns}, the instrument alone by {alone}; {joints}"
 
 
 def _drift(o: Overview) -> str:
@@ -201,12 +187,6 @@ def model_words(r: RevisionRecord) -> str:
     return f"{found}; {cell_words(r.cell)}" if r.cell else found
 
 
-def _used(o: Overview) -> str:
-    if o.accepted is not None:
-        return f"→ revision {o.accepted} is accepted: every command uses it."
-    return "→ used by every command: the latest one; hilcal accept RUN N chooses another."
-
-
 def _time(utc: str) -> str:
     """Return a time without what every time here has: T, seconds' zone."""
     return utc[:19].replace("T", " ")
@@ -215,49 +195,34 @@ def _time(utc: str) -> str:
 NONE = "–"
 
 
-@dataclass(frozen=True, slots=True)
-class RevisionDifference:
-    """What two revisions say of one thing.
+def two_revisions(a: RevisionRecord, b: RevisionRecord) -> Table:
+    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored.
 
-    Attributes:
-        what: it is about, with its unit.
-        first: what the one says.
-        second: what the other says.
-        difference: second minus first; empty where they agree.
+    The difference, second minus first, is empty where they agree.
     """
+    heads = ("", f"revision {a.number}", f"revision {b.number}", "difference")
+    out = table(*heads, left=(0, 1, 2, 3))
 
-    what: str
-    first: str
-    second: str
-    difference: str
+    def add(what: str, first: str, second: str, difference: str = "differs") -> None:
+        out.add(what, first, second, difference if first != second else "")
 
-
-def two_revisions(a: RevisionRecord, b: RevisionRecord) -> tuple[RevisionDifference, ...]:
-    """Return model, cell, verdict, errors and parameters of two revisions, as they were stored."""
-    added = [f"+ {name}" for name in b.effects if name not in a.effects]
-    removed = [f"− {name}" for name in a.effects if name not in b.effects]
-    rows = [_row("model", model_name(a.effects), model_name(b.effects))]
-    if added or removed:
-        rows = [
-            RevisionDifference("model", rows[0].first, rows[0].second, " ".join([*added, *removed]))
-        ]
+    names = [f"+ {name}" for name in b.effects if name not in a.effects]
+    names += [f"− {name}" for name in a.effects if name not in b.effects]
+    add("model", model_name(a.effects), model_name(b.effects), " ".join(names) or "differs")
     if a.cell or b.cell:
-        cells = [cell_words(r.cell) or "as told at first" for r in (a, b)]
-        rows.append(_row("cell", *cells))
-    rows.append(_row("verdict", verdict_of(a), verdict_of(b)))
+        add("cell", *(cell_words(r.cell) or "as told at first" for r in (a, b)))
+    add("verdict", verdict_of(a), verdict_of(b))
+    fits = [r.result_json["identify"] for r in (a, b)]
     for what, of in (("error on poses left out", "holdout"), ("error on fitted poses", "fit")):
-        errors = [float(r.result_json["identify"]["error"][of]["rms_m"]) for r in (a, b)]
-        by = errors[1] - errors[0]
-        share = f" ({100 * by / errors[0]:+.0f} %)" if errors[0] else ""
-        sign = "+" if by > 0 else ""
-        first, second = (numbers.length(x) for x in errors)
-        differs = f"{sign}{numbers.length(by)}{share}".replace("-", "−")
-        rows.append(RevisionDifference(what, first, second, differs if first != second else ""))
-    factors = [float(r.result_json["identify"]["variance_factor"]) for r in (a, b)]
-    rows.append(_row("variance factor", *(numbers.digits(x) for x in factors)))
-    count = [str(r.result_json["identify"]["n_readings"]) for r in (a, b)]
-    rows.append(_row("readings", *count))
-    return (*rows, *_parameters(a, b))
+        before, after = (float(f["error"][of]["rms_m"]) for f in fits)
+        share = f" ({100 * (after - before) / before:+.0f} %)" if before else ""
+        by = f"{'+' * (after > before)}{numbers.length(after - before)}{share}".replace("-", "−")
+        add(what, numbers.length(before), numbers.length(after), by)
+    add("variance factor", *(numbers.digits(float(f["variance_factor"])) for f in fits))
+    add("readings", *(str(f["n_readings"]) for f in fits))
+    for row in _parameters(*fits):
+        add(*row)
+    return out
 
 
 def verdict_of(record: RevisionRecord) -> str:
@@ -289,13 +254,9 @@ def refitted(before: Fit, after: Fit) -> str:
     )
 
 
-def _row(what: str, first: str, second: str) -> RevisionDifference:
-    return RevisionDifference(what, first, second, "differs" if first != second else "")
-
-
-def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[RevisionDifference]:
+def _parameters(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
     known: list[dict[str, Mapping[str, Any]]] = [
-        {p["name"]: p for p in r.result_json["identify"]["parameters"]} for r in (a, b)
+        {p["name"]: p for p in f["parameters"]} for f in (a, b)
     ]
     for name in dict.fromkeys([*known[0], *known[1]]):
         found = [of.get(name) for of in known]
@@ -305,11 +266,11 @@ def _parameters(a: RevisionRecord, b: RevisionRecord) -> Iterator[RevisionDiffer
         first, second = (_value(p, factor) for p in found)
         if {first, second} <= {NONE, UNSEEN}:
             continue
-        difference = ""
-        if first != second and not {first, second} & {NONE, UNSEEN}:
-            by = factor * (values[1] - values[0])
-            difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
-        yield RevisionDifference(f"{name} [{unit}]" if unit else name, first, second, difference)
+        by = factor * (values[1] - values[0])
+        difference = ("+" * (by > 0) + numbers.digits(by, 2)).replace("-", "−")
+        if {first, second} & {NONE, UNSEEN}:
+            difference = ""
+        yield f"{name} [{unit}]" if unit else name, first, second, difference
 
 
 UNSEEN = "not determined"

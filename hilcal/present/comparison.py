@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from hilcal import numbers
 from hilcal.diagnosis.change import LEVEL, POWER
 from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.diagnosis.change_found import Change, ChangeSize, Limit
+from hilcal.diagnosis.change_found import Change, Limit
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.parameter_differences import Differences
 from hilcal.names import quoted
@@ -30,13 +30,7 @@ def words_of(c: Candidate) -> str:
 
 
 def comparison_report(c: Comparison, earlier: str, later: str) -> Iterator[Block]:
-    """Yield everything that is said.
-
-    Args:
-        c: the comparison.
-        earlier: name of the earlier file.
-        later: name of the later file.
-    """
+    """Yield everything that is said, with the names of the two files."""
     yield from _setup(c, earlier, later)
     yield ""
     yield from _today(c, earlier)
@@ -87,12 +81,10 @@ def _today(c: Comparison, earlier: str) -> Iterator[Block]:
     row = (f"calibration of {earlier}", *map(numbers.length, sizes), drawing)
     heads = (error_words(t.prediction.readings), "rms", "mean", "largest", "expected", "as drawn")
     yield table(*heads, rows=[row])
-    chance = numbers.p_equals(t.p_value)
-    share = f"{numbers.digits(t.z, 2)} times what it states, all correlations counted ({chance})"
-    if t.p_value < LEVEL:
-        yield f"The error is {share}: more than its uncertainty."
-    else:
-        yield f"The error is {share}: no more than its uncertainty."
+    yield (
+        f"The error is {numbers.digits(t.z, 2)} times what it states, all correlations counted "
+        f"({numbers.p_equals(t.p_value)}): {'no ' * (t.p_value >= LEVEL)}more than its uncertainty."
+    )
     beyond = t.beyond
     # How far the poses are from the measured ones, the expected error counts.
     ranges = [f"{v.variable} ({v.count})" for v in beyond.variables if v.variable != "leverage"]
@@ -168,24 +160,18 @@ def sentence(change: Change) -> str:
 def _table(found: Sequence[Change]) -> Table:
     out = table("change", "by", "±", "unit", "σ", "p", "at target", left=(0, 3))
     for change in found:
-        first = True
-        shown = [s for s in change.sizes if len(change.sizes) == 1 or abs(s.z) >= CLEAR]
-        for s in shown[:MOST_PARAMETERS]:
+        more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
+        alone = len(change.sizes) == 1
+        shown = [s for s in change.sizes if alone or abs(s.z) >= CLEAR]
+        if not shown:
+            out.add(change.candidate.name, *[""] * 4, *more)
+        for k, s in enumerate(shown[:MOST_PARAMETERS]):
             value, std, unit = numbers.measured(s.unit, s.value, s.std, [s.value, s.std])
-            name = change.candidate.name if len(change.sizes) == 1 else _name(change, s)
-            more = (numbers.chance(change.p_value), numbers.length(change.moved_m))
-            out.add(name, value, std, unit, f"{abs(s.z):.1f}", *(more if first else ("", "")))
-            first = False
-        if first:
-            row = ("", "", "", "", numbers.chance(change.p_value), numbers.length(change.moved_m))
-            out.add(change.candidate.name, *row)
-        elif len(shown) > MOST_PARAMETERS:
+            name = change.candidate.name if alone else f"{change.candidate.effect}.{s.parameter}"
+            out.add(name, value, std, unit, f"{abs(s.z):.1f}", *(("", "") if k else more))
+        if len(shown) > MOST_PARAMETERS:
             out.add(f"  … {len(shown) - MOST_PARAMETERS} more", *[""] * 6)
     return out
-
-
-def _name(change: Change, size: ChangeSize) -> str:
-    return f"{change.candidate.effect}.{size.parameter}"
 
 
 def _left(c: Comparison) -> str:

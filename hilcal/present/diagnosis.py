@@ -38,17 +38,12 @@ def verdict_line(d: Diagnosis) -> Words:
 def suspects_table(d: Diagnosis, most: int = SUSPECTS) -> Table:
     """Return the ranked suspects that chance alone does not explain."""
     heads = ("missing effect?", "explains", "on poses left out", "p-value", "inseparable from")
-    rows = (
-        (
-            s.effect,
-            numbers.percent(s.share),
-            numbers.percent(max(s.holdout_share, 0.0)),
-            numbers.chance(s.score.p_value),
-            numbers.few(s.same_as) if s.passes else "",
-        )
-        for s in shown_suspects(d)[:most]
-    )
-    return table(*heads, rows=rows, left=(0, 4))
+    out = table(*heads, left=(0, 4))
+    for s in shown_suspects(d)[:most]:
+        shares = (numbers.percent(s.share), numbers.percent(max(s.holdout_share, 0.0)))
+        same = numbers.few(s.same_as) if s.passes else ""
+        out.add(s.effect, *shares, numbers.chance(s.score.p_value), same)
+    return out
 
 
 def shown_suspects(d: Diagnosis) -> list[Suspect]:
@@ -152,26 +147,26 @@ def key(readings: Readings) -> Words:
 
 def fell(before: Fit, after: Fit, effect: str) -> str:
     """Say what adding an effect did to the error on poses left out."""
-    a, b = before.holdout, after.holdout
-    if b.rms_sigma < a.rms_sigma:
-        return f"With {effect} the error on poses left out falls {_from_to(before, after)}."
+    change = _from_to(before, after)
+    if after.holdout.rms_sigma < before.holdout.rms_sigma:
+        return f"With {effect} the error on poses left out falls {change}."
     return (
-        f"With {effect} the error on poses left out does not fall ({_from_to(before, after)}): "
-        "these readings do not show this effect. The revisions before it are still there."
+        f"With {effect} the error on poses left out does not fall ({change}): these readings do "
+        "not show this effect. The revisions before it are still there."
     )
 
 
 def rose(before: Fit, after: Fit, effect: str) -> str:
     """Say what taking an effect out did to the error on poses left out."""
-    change = _from_to(before, after)
+    change = f"the error on poses left out {{}} {_from_to(before, after)}"
     if predicts_better(after, before):
-        return f"Without {effect} the error on poses left out rises {change}: it belongs there."
-    return f"Without {effect} the error on poses left out goes {change}: it is not needed."
+        return f"Without {effect} {change.format('rises')}: it belongs there."
+    return f"Without {effect} {change.format('goes')}: it is not needed."
 
 
 def _from_to(before: Fit, after: Fit) -> str:
-    a, b = before.holdout, after.holdout
-    return f"from {numbers.length(a.rms_m)} to {numbers.length(b.rms_m)}"
+    a, b = (numbers.length(f.holdout.rms_m) for f in (before, after))
+    return f"from {a} to {b}"
 
 
 def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
@@ -180,19 +175,12 @@ def could_have_been_seen(d: Diagnosis) -> Iterator[Block]:
     seen = sorted((s for s in rest if s.shown), key=lambda s: s.least.displacement_m)
     hidden = d.not_shown
     if seen:
-        yield ""
-        yield table(
-            *("not found", "would be seen from", "its parameters, rms"),
-            rows=(
-                (
-                    s.effect,
-                    numbers.length(s.least.displacement_m),
-                    numbers.sizes(s.least.parameters),
-                )
-                for s in seen
-            ),
-            left=(0, 2),
-        )
+        rows = [
+            (s.effect, numbers.length(s.least.displacement_m), numbers.sizes(s.least.parameters))
+            for s in seen
+        ]
+        heads = ("not found", "would be seen from", "its parameters, rms")
+        yield from ("", table(*heads, rows=rows, left=(0, 2)))
         yield note(
             "would be seen from: rms displacement of the target at which nine campaigns like this "
             "one in ten would name the effect; rms of the parameters that make it.\n"
@@ -294,7 +282,7 @@ def binned_table(
     names: Sequence[str] = (),
     law: Floats | None = None,
 ) -> Table:
-    """Return means over bins of a variable, drawn as bars in the heading.
+    """Return means over K bins of a variable, drawn as bars in the heading.
 
     Args:
         heads: the variable, and what the means are of.

@@ -11,7 +11,6 @@ from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
 from hilcal.identification.carried import DriftGroup as CarriedGroup
-from hilcal.identification.drift import Conflict
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
@@ -73,8 +72,7 @@ def fit_report(fit: Fit, details: bool = True) -> Iterator[Block]:
 def _short(fit: Fit) -> Iterator[str]:
     """Yield the remarks of the first screen."""
     yield _variance_factor(fit)
-    null = [str(d) for d in fit.uncertainty.null]
-    if null:
+    if null := [str(d) for d in fit.uncertainty.null]:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
     yield from set_aside(fit, details=False)
@@ -99,12 +97,9 @@ def set_aside(fit: Fit, details: bool) -> Iterator[str]:
 
 
 def parameters(fit: Fit, most: int = ALL_ROWS, where: str = "--details") -> Iterator[Block]:
-    """Yield a table of parameters, and a summary of each large family.
+    """Yield a table of at most so many parameters, and a summary of each large family.
 
-    Args:
-        fit: the fit.
-        most: rows of the table; where there are more, those of frames come last.
-        where: the others are to be had, in words.
+    Of more, those of frames come last; `where` says how the others are to be had.
     """
     rows: list[tuple[str, ...]] = []
     frames: list[tuple[str, ...]] = []
@@ -140,16 +135,14 @@ def _which(names: Sequence[str], count: int) -> str:
 
 
 def _parameter_rows(fit: Fit, effect: Effect, index: Ints) -> Iterator[tuple[str, ...]]:
-    seen = fit.uncertainty.identifiable
-    for k, p in zip(index, effect.parameters, strict=True):
-        alike = [
-            i for i, o in zip(index, effect.parameters, strict=True) if o.unit == p.unit and seen[i]
-        ]
-        if not seen[k]:
-            continue
-        std_si, of = float(fit.uncertainty.std[k]), [float(fit.theta[i]) for i in alike]
-        value, std, unit = numbers.measured(p.unit, float(fit.theta[k]), std_si, of)
-        yield f"{effect.name}.{p.name}", value, std, unit, p.meaning
+    seen, theta = fit.uncertainty.identifiable[index], fit.theta[index]
+    units = np.array([p.unit for p in effect.parameters])
+    for k, p in enumerate(effect.parameters):
+        if seen[k]:
+            alike = theta[seen & (units == p.unit)].tolist()
+            std = float(fit.uncertainty.std[index[k]])
+            shown = numbers.measured(p.unit, float(theta[k]), std, alike)
+            yield f"{effect.name}.{p.name}", *shown, p.meaning
 
 
 def family(fit: Fit, effect: Effect, index: Ints) -> str:
@@ -157,22 +150,20 @@ def family(fit: Fit, effect: Effect, index: Ints) -> str:
     theta, live = fit.theta[index], fit.solution.estimated[index]
     units = {p.unit for p in effect.parameters}
     unit, factor = numbers.unit_for(units.pop(), list(theta)) if len(units) == 1 else ("", 1.0)
-    lines = [
-        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept"
-        + ("." if live.all() else ", the rest are zero.")
-    ]
+    rest = "." if live.all() else ", the rest are zero."
     joints: dict[str, float] = {}
     for value, p in zip(theta, effect.parameters, strict=True):
         head = p.name.split(".")[0]
         joints[head] = joints.get(head, 0.0) + float(value) ** 2 / 2
     rms = ", ".join(f"{j} {numbers.digits(factor * v**0.5)}" for j, v in joints.items())
-    lines.append(f"  rms over a turn [{unit}]: {rms}")
     strongest = np.argsort(-np.abs(theta), kind="stable")[:STRONGEST]
     named = ", ".join(
         f"{effect.parameters[k].name} {numbers.digits(factor * float(theta[k]))}" for k in strongest
     )
-    lines.append(f"  strongest [{unit}]: {named}\n")
-    return "\n".join(lines)
+    return (
+        f"{effect.name}: {int(live.sum())} of {len(index)} parameters kept{rest}\n"
+        f"  rms over a turn [{unit}]: {rms}\n  strongest [{unit}]: {named}\n"
+    )
 
 
 def errors(fit: Fit) -> Table:
@@ -220,15 +211,12 @@ def remarks(fit: Fit) -> Iterator[Block]:
     """Yield a sentence for each thing that the numbers alone do not say."""
     yield _variance_factor(fit)
     yield from background_line(fit)
-    scatter = fit.readings.arm_scatter
-    if scatter is not None:
+    if (scatter := fit.readings.arm_scatter) is not None:
         yield f"The covariance has the arm's scatter as estimated: {sigmas(scatter)}."
-    serial = fit.readings.serial
-    if serial is not None:
-        yield f"{numbers.sentence(correlated(serial))}"
+    if (serial := fit.readings.serial) is not None:
+        yield numbers.sentence(correlated(serial))
     yield scaling_remark(fit)
-    null = fit.uncertainty.null
-    if null:
+    if null := fit.uncertainty.null:
         what = "directions, parameters that move together," if len(null) > 1 else "direction"
         yield f"{len(null)} {what} cannot be seen in these readings:"
         yield from (f"  {d}" for d in null[:DIRECTIONS])
@@ -264,14 +252,11 @@ def scaling_remark(fit: Fit) -> str:
     before, after = basis.condition_unscaled, basis.condition_scaled
     if not (np.isfinite(before) and np.isfinite(after)):
         return "Condition numbers: none, the model has no free parameter."
-    need = (
-        "parameter scaling was needed"
-        if before > 1e3 and before > 10 * after
-        else "parameter scaling made no difference that matters"
-    )
+    needed = before > 1e3 and before > 10 * after
+    need = "was needed" if needed else "made no difference that matters"
     return (
         f"Condition number {numbers.condition(before)} in physical units, "
-        f"{numbers.condition(after)} after parameter scaling: {need}."
+        f"{numbers.condition(after)} after parameter scaling: parameter scaling {need}."
     )
 
 
@@ -303,11 +288,7 @@ def follows(places: Sequence[MisfitShare]) -> str:
             "The misfit follows none of the variables: neither joints nor load, time or direction."
         )
     named = [f"{p.variable} ({numbers.percent(p.share)})" for p in causes]
-    told = (
-        f"The misfit follows {numbers.names(named)}"
-        if named
-        else "The misfit follows none of the variables"
-    )
+    told = f"The misfit follows {numbers.names(named) if named else 'none of the variables'}"
     if sides:
         side = sides[0].variable.removeprefix("direction ")
         told += f"; {numbers.percent(sides[0].share)} of it is {side}"
@@ -328,20 +309,16 @@ def where_table(places: Sequence[MisfitShare]) -> Iterator[Block]:
             out.add(words.format(name), numbers.percent(p.share), numbers.chance(p.p_value))
     if shown:
         yield out
+    tested = [p for p in places if p.group not in ("pose", "direction")]
+    tests = numbers.many_tests(len(tested), FALSE_ALARM, "variables")
     least = numbers.percent(LEAST_SHARE)
     rest = len([p for p in places if p.share < LEAST_SHARE])
     more = f"; {rest} more {'is' if rest == 1 else 'are'} below {least}" if rest else ""
     yield note(
         "share of the misfit: what a smooth law of the variable predicts on poses left out (these "
         "overlap); what is the same in all readings of a pose; what points along a direction"
-        f"{more}. p-value: chance of that share in noise; {numbers.many_tests(*tests_of(places))}"
+        f"{more}. p-value: chance of that share in noise; {tests}"
     )
-
-
-def tests_of(places: Sequence[MisfitShare]) -> tuple[int, float, str]:
-    """Return how many variables were looked at, and the level that they share."""
-    kinds = [p for p in places if p.group not in ("pose", "direction")]
-    return len(kinds), FALSE_ALARM, "variables"
 
 
 @dataclass(frozen=True, slots=True)
@@ -385,37 +362,38 @@ def worst_table(worst: Sequence[Worst], left_out: bool = False) -> Table:
 def scalings_table(fits: Mapping[Scaling, Fit]) -> Iterator[Block]:
     """Yield a table: parameters with standard uncertainties, errors, condition numbers."""
     yield heading("The same readings with every scaling")
+    columns = list(fits.values())
     out = table("", *fits, "unit", left=(0, len(fits) + 1))
-    first = next(iter(fits.values()))
+    first = columns[0]
     for effect, s in zip(first.model.effects, first.model.slices(), strict=True):
         if effect.groups() is not None or s.stop - s.start > ALL_ROWS:
             continue
         for k, p in zip(range(s.start, s.stop), effect.parameters, strict=True):
-            values = [float(f.theta[k]) for f in fits.values() if f.uncertainty.identifiable[k]]
-            if values:
+            if values := [float(f.theta[k]) for f in columns if f.uncertainty.identifiable[k]]:
                 unit, factor = numbers.unit_for(p.unit, values)
-                out.add(
-                    f"{effect.name}.{p.name}",
-                    *(_entry(f, k, factor) for f in fits.values()),
-                    unit,
-                )
+                entries = (_entry(f, k, factor) for f in columns)
+                out.add(f"{effect.name}.{p.name}", *entries, unit)
     out.rule()
-    for name, entries in _summary(tuple(fits.values())):
-        out.add(name, *entries, "")
+    bases = [f.solution.equations.basis for f in columns]
+    for name, of in (
+        ("rms error, poses fitted", [numbers.length(f.error.rms_m) for f in columns]),
+        ("rms error, poses left out", [numbers.length(f.holdout.rms_m) for f in columns]),
+        ("variance factor (of gc)", [numbers.digits(f.variance_factor) for f in columns]),
+        (
+            "condition, physical units",
+            [numbers.condition(b.condition_unscaled) for b in bases],
+        ),
+        (
+            "condition, parameters scaled",
+            [numbers.condition(b.condition_scaled) for b in bases],
+        ),
+    ):
+        out.add(name, *of, "")
     yield out
     yield note(
         "none: least squares as is; gu: weighted by standard deviations; gc: whitened by the full "
         "covariance, pose by pose. The revision that is kept is that of gc."
     )
-
-
-def _summary(fits: Sequence[Fit]) -> Iterator[tuple[str, list[str]]]:
-    bases = [f.solution.equations.basis for f in fits]
-    yield "rms error, poses fitted", [numbers.length(f.error.rms_m) for f in fits]
-    yield "rms error, poses left out", [numbers.length(f.holdout.rms_m) for f in fits]
-    yield "variance factor (of gc)", [numbers.digits(f.variance_factor) for f in fits]
-    yield "condition, physical units", [numbers.condition(b.condition_unscaled) for b in bases]
-    yield "condition, parameters scaled", [numbers.condition(b.condition_scaled) for b in bases]
 
 
 def _entry(fit: Fit, k: int, factor: float) -> str:
@@ -432,13 +410,13 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
     yield heading(f"Model: {model_name(fit.model.names)}")
     yield f"Fitted to {fit.readings} absolute readings of a stream, in {fit.passes} passes.\n"
     meaning = {f"{e.name}.{p.name}": p.meaning for e in fit.model.effects for p in e.parameters}
-    rows, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
+    out, unseen = table(*PARAMETER_COLUMNS, left=(0, 3, 4)), []
     for p in fit.parameters:
         if p.value is None or p.std is None:
             unseen.append(p.name)
         else:
-            rows.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
-    yield rows
+            out.add(p.name, *numbers.measured(p.unit, p.value, p.std), meaning[p.name])
+    yield out
     yield note("±: standard uncertainty.\n")
     if unseen:
         yield f"Not determined by these readings: {', '.join(unseen)}.\n"
@@ -452,14 +430,11 @@ def stream_report(fit: StreamFit) -> Iterator[Block]:
             "what leaving out tenths of the stream shows."
         )
     if fit.outliers:
-        many = f"; the worst: {_rows(fit)}" if fit.named else ""
+        rows = ", ".join(f"row {row} ({sigma:.3g} σ)" for row, sigma in fit.named)
+        many = f"; the worst: {rows}" if fit.named else ""
         yield f"{fit.outliers} readings were set aside as gross errors{many}."
     if not fit.converged:
         yield "Not converged: do not trust the parameters."
-
-
-def _rows(fit: StreamFit) -> str:
-    return ", ".join(f"row {row} ({sigma:.3g} σ)" for row, sigma in fit.named)
 
 
 TELL_P = 1e-3
@@ -475,17 +450,16 @@ def prior_lines(found: Fit) -> list[str]:
     source = prior.posterior.source
     of = {"arm": " of this arm", "type": " of another arm of the type"}[prior.relation]
     fleet = source.campaign and not source.revision  # it says itself of which arms
-    lines = [
-        f"Prior: {source.campaign or 'a posterior'}"
-        + (f", revision {source.revision}" if source.revision else "")
-        + f" ({source.n_readings} readings{'' if fleet else of})."
+    name = source.campaign or "a posterior"
+    name += f", revision {source.revision}" if source.revision else ""
+    lines = [f"Prior: {name} ({source.n_readings} readings{'' if fleet else of})."]
+    # the groups about which prior and readings disagree beyond chance, worst first
+    told = [c for c in found.conflicts if c.p_value * len(found.conflicts) < TELL_P]
+    lines += [
+        f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the prior allows: "
+        "wear, a crash or a repair?"
+        for c in told[:MOST_TOLD]
     ]
-    told = disagreements(found)
-    for c in told[:MOST_TOLD]:
-        lines.append(
-            f"  {_of(c.group)} has moved by {min(c.moved_sigma, 37):.1f} σ of what the "
-            "prior allows: wear, a crash or a repair?"
-        )
     if len(told) > MOST_TOLD:
         lines.append(f"  … and {len(told) - MOST_TOLD} more (--json lists them)")
     known = {e.name for e in prior.posterior.effects}
@@ -498,12 +472,6 @@ def prior_lines(found: Fit) -> list[str]:
     elif not told:
         lines.append("  The readings agree with it.")
     return lines
-
-
-def disagreements(found: Fit) -> list[Conflict]:
-    """Return the groups about which prior and readings disagree beyond chance, worst first."""
-    all_of = found.conflicts
-    return [c for c in all_of if c.p_value * len(all_of) < TELL_P]
 
 
 def _of(group: CarriedGroup) -> str:

@@ -8,7 +8,7 @@ from hilcal.present.document import Block, heading, note, table
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
-    from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled, Spread
+    from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
 
 FAR = 3.0
 """Standard deviations between which most arms lie; a choice."""
@@ -42,14 +42,24 @@ def closing(fleet: "Fleet") -> Iterator[Block]:
 def type_report(t: "Pooled") -> Iterator[Block]:
     """Yield what is known of one type."""
     yield heading(f"{t.type}: {len(t.arms)} arms, {len(t.campaigns)} campaigns")
-    columns = ["parameter", "mean", "±", "between arms", "±", "between campaigns", "unit"]
     repeated = any(p.within is not None for p in t.parameters)
-    if not repeated:
-        columns.remove("between campaigns")
-    rows = table(*columns, left=(0, len(columns) - 1))
+    heads = (
+        "parameter",
+        "mean",
+        "±",
+        "between arms",
+        "±",
+        *["between campaigns"] * repeated,
+        "unit",
+    )
+    out = table(*heads, left=(0, len(heads) - 1))
     for p in t.parameters:
-        rows.add(*_row(p, repeated))
-    yield rows
+        unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
+        mean = numbers.with_std(factor * p.mean, factor * p.mean_std)
+        between = numbers.with_std(factor * p.between, factor * p.between_std)
+        within = [numbers.digits(factor * (p.within or 0.0))] * repeated
+        out.add(p.parameter, *mean, *between, *within, unit)
+    yield out
     yield note(
         "±: standard uncertainty; between arms, and campaigns of an arm: standard deviations.\n"
     )
@@ -71,24 +81,11 @@ def type_lines(t: "Pooled") -> Iterator[str]:
         yield "Common drift with time (wear):"
         for name in t.wear:
             p = drifts[name]
-            value = _with_unit(p.per_year or 0.0, p.per_year_std or 0.0, p.unit)
-            yield f"  {name}: {value} a year"
+            value, std, unit = numbers.measured(p.unit, p.per_year or 0.0, p.per_year_std or 0.0)
+            yield f"  {name}: {value} ± {std} {unit} a year"
     if t.seen:
         yield "Effects that the diagnoses added:"
         yield from (f"  {_seen(s)}" for s in t.seen)
-
-
-def _row(p: "Spread", repeated: bool) -> list[str]:
-    unit, factor = numbers.unit_for(p.unit, [p.mean, p.between])
-    mean, std = numbers.with_std(factor * p.mean, factor * p.mean_std)
-    between, error = numbers.with_std(factor * p.between, factor * p.between_std)
-    within = [numbers.digits(factor * (p.within or 0.0))] if repeated else []
-    return [p.parameter, mean, std, between, error, *within, unit]
-
-
-def _with_unit(value: float, std: float, of: str) -> str:
-    number, error, unit = numbers.measured(of, value, std)
-    return f"{number} ± {error} {unit}"
 
 
 def unlike_words(o: "Odd") -> str:

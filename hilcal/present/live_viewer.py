@@ -4,7 +4,9 @@
 
 Whatever becomes of viewer, recording or process, the command goes on: a full queue drops what is
 told, a dead process is reported once. The process ends when its pipe does, so that the recording
-is complete however the command ends.
+is complete however the command ends. It is `python -m hilcal.present.live_viewer RECORD.rrd PORT`:
+it reads pickled messages from standard input and writes a JSON object per line to standard output,
+"url" once it serves, "problem" for people.
 """
 
 import contextlib
@@ -12,6 +14,7 @@ import json
 import os
 import pickle
 import queue
+import signal
 import subprocess
 import sys
 import threading
@@ -54,11 +57,7 @@ class Measuring:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Revised:
-    """A revision has been fitted and judged.
-
-    Attributes:
-        story: the readings, and this revision alone.
-    """
+    """A revision has been fitted and judged: the story has the readings, and it alone."""
 
     story: Story
 
@@ -69,10 +68,11 @@ MOST = 2000
 """Messages that wait for the process at most, some 500 bytes each; a choice."""
 ARM_S = 0.2
 """Between two places of the arm that are told, s; a choice: motion is seen, files stay small."""
-START_S = 20.0
-"""How long the process may take to start, s: it loads the viewer's library; a choice."""
-END_S = 10.0
-"""How long it may take to finish the recording, s; a choice."""
+START_S, END_S = 20.0, 10.0
+"""How long the process may take to start, for it loads the viewer's library, and to finish the
+recording, s; choices."""
+NICE = 15
+"""Behind everything else, so that the arm's watchdog never waits for a picture; a choice."""
 _ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -109,24 +109,17 @@ class LiveViewer:
 
     def start(self) -> None:
         """Start the process and wait until it serves; where it does not, problems are told."""
-        path = os.environ.get("PYTHONPATH")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
-            "OMP_NUM_THREADS": "1",
-            "RUST_LOG": "off",
-        }
+        path = filter(None, (str(_ROOT), os.environ.get("PYTHONPATH")))
+        more = {"PYTHONPATH": os.pathsep.join(path), "OMP_NUM_THREADS": "1", "RUST_LOG": "off"}
+        command = (sys.executable, "-P", "-m", "hilcal.present.live_viewer")
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-                (
-                    *(sys.executable, "-P", "-m", "hilcal.present.live_process"),
-                    *(str(self.record.absolute()), str(self._port)),
-                ),
+                [*command, str(self.record.absolute()), str(self._port)],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 bufsize=0,
-                env=environment,
+                env=os.environ | more,
                 start_new_session=True,  # Ctrl-C is for the command
             )
         except OSError as error:
@@ -155,17 +148,11 @@ class LiveViewer:
 
     def measuring(self, name: str, cell: Cell, log: RunLog) -> None:
         """Tell that a campaign is measured, and what it holds already."""
-        earlier = tuple(
-            (float(told["wall_s"]), Step(**told["step"]))
-            for told in log.details()
-            if "wall_s" in told
-        )
-        self._tell(
-            time.time(),
-            Measuring(
-                name, cell.arm, cell.all_targets[:, :3, 3], log.plan, earlier, cell.target_names
-            ),
-        )
+        known = (d for d in log.details() if "wall_s" in d)
+        earlier = tuple((float(d["wall_s"]), Step(**d["step"])) for d in known)
+        targets = cell.all_targets[:, :3, 3]
+        told = Measuring(name, cell.arm, targets, log.plan, earlier, cell.target_names)
+        self._tell(time.time(), told)
 
     def revised(self, chapter: Chapter) -> None:
         """Tell a revision; what cannot be drawn is said, and nothing is raised."""
@@ -235,3 +222,26 @@ class Several:
         """Pass on."""
         for watcher in self._watchers:
             watcher.notify(event)
+
+
+def main() -> None:
+    """Be the process: serve and record until standard input ends."""
+    if hasattr(os, "nice"):
+        os.nice(NICE)  # before the viewer's library starts its threads, which inherit it
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    if hasattr(signal, "SIGXFSZ"):
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # a file that may not grow is an error
+    replies = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a library prints is no reply
+
+    def reply(**told: object) -> None:
+        print(json.dumps(told), file=replies, flush=True)
+
+    from hilcal.present.viewer.live import follow  # loads the viewer's library
+
+    follow(sys.stdin.buffer, reply, Path(sys.argv[1]), int(sys.argv[2]))
+    os._exit(0)  # a viewer that does not answer could hold the end up
+
+
+if __name__ == "__main__":
+    main()

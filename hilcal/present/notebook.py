@@ -10,7 +10,6 @@ from hilcal.discovery.discovery import Discovery
 from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.fit import Fit
-from hilcal.present.bootstrap import bootstrap_report
 from hilcal.present.comparison import comparison_report
 from hilcal.present.diagnosis import diagnosis_report, key, revisions_table, verdict_line
 from hilcal.present.discovery import discovery_report
@@ -18,7 +17,7 @@ from hilcal.present.document import Block
 from hilcal.present.fit import fit_report, stream_report
 from hilcal.present.html.page import fragment
 from hilcal.present.plan import plan_report
-from hilcal.present.validation import opening, shares_report, validation_report
+from hilcal.present.validation import bootstrap_report, opening, shares_report, validation_report
 from hilcal.refinement import Refinement
 from hilcal.store.revision import change
 from hilcal.stream.fit import StreamFit

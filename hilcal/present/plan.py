@@ -31,14 +31,10 @@ A choice."""
 
 def plan_facts(s: PlanSummary) -> Iterator[Block]:
     """Yield what a plan costs and reaches, and what more poses would give."""
-    yield from _facts(s)
+    yield from (heading("Plan"), pairs(cost_rows(s)), "")
     if larger := [c for c in s.curve if c.poses > s.poses]:
         told = [f"{c.poses} poses ± {numbers.length(c.position_std_m)}" for c in larger[::2]]
         yield f"More would give, predicted for the {s.quantity}: {', '.join(told)}."
-
-
-def _facts(s: PlanSummary) -> Iterator[Block]:
-    yield from (heading("Plan"), pairs(cost_rows(s)), "")
 
 
 def plan_screen(s: PlanSummary) -> Iterator[Block]:
@@ -65,9 +61,8 @@ def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str,
         groups.setdefault((_effect(p.name), p.unit), []).append(p)
     for (effect, si), all_of in groups.items():
         known = [p for p in all_of if math.isfinite(p.std)]
-        count = str(len(all_of))
-        if len(known) < len(all_of):
-            count = f"{len(known)} of {len(all_of)}"
+        some = f"{len(known)} of " if len(known) < len(all_of) else ""
+        count = f"{some}{len(all_of)}"
         if not known:
             yield effect, count, "not determined", "", ""
             continue
@@ -81,19 +76,30 @@ def effect_rows(parameters: Sequence[PredictedParameter]) -> Iterator[tuple[str,
 
 def plan_report(s: PlanSummary) -> Iterator[Block]:
     """Yield the tables and remarks of a plan."""
-    yield from _facts(s)
+    yield from (heading("Plan"), pairs(cost_rows(s)), "")
     if s.confounding is not None:
         yield f"{order_remark(s)}\n"
     if s.parameters:
         yield heading("Predicted standard uncertainty")
-        yield from parameters_table(s)
+        heads = ("parameter", "±", "magnitude", "unit", "± in %")
+        yield table(*heads, rows=_parameter_rows(s.parameters), left=(0, 3))
+        yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
     if s.criteria:
         yield heading("Comparison of criteria, for the same number of readings")
         yield from criteria_table(s)
     if s.curve:
-        yield from _curve(s.curve, s.poses)
+        yield heading("Sample-size curve: how many poses are enough")
+        yield _curve(s)
+        yield f"{enough(s.curve)}\n"
     if s.detectable:
-        yield from _detectable(s)
+        yield heading("Minimum detectable effects outside of the model")
+        if found := detectable(s):
+            yield table("effect", "from", rows=found)
+            yield note(
+                "from: rms displacement of the target that is one sigma of these readings.\n"
+            )
+        if words := undetectable(s):
+            yield f"{words}\n"
     for remark in s.remarks:
         yield f"note: {remark}"
 
@@ -109,9 +115,9 @@ def _floor(efficiency: float) -> str:
     return f"{int(min(max(efficiency, 0.0), 1.0) * 1000 + 1e-6) / 10:.1f} %"
 
 
-def load_name(name: str) -> str:
-    """Return a load's name for people."""
-    return "unloaded" if name == UNLOADED else name
+def load_name(name: str, under: str = "") -> str:
+    """Return a load's name for people, e.g. after "under "."""
+    return "unloaded" if name == UNLOADED else under + name
 
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
@@ -120,13 +126,10 @@ def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:
     loads = ", ".join(f"{load_name(name)} {count}" for name, count in s.loads.items())
     yield "readings", f"{s.readings}: {loads}"
     time = s.duration
-    changes = f"{s.load_changes} load change{'s' if s.load_changes != 1 else ''}"
+    changes = f"{s.load_changes} load change{'s' * (s.load_changes != 1)}"
+    parts = f"motion {spoken(time.motion)}, readings {spoken(time.readings)}"
     yield "takes about", spoken(time.total)
-    yield (
-        "",
-        f"motion {spoken(time.motion)}, readings {spoken(time.readings)}, "
-        f"{changes} by hand {spoken(time.load_changes)}",
-    )
+    yield "", f"{parts}, {changes} by hand {spoken(time.load_changes)}"
     meaning = CRITERIA.get(s.criterion)
     yield "criterion", f"{s.criterion}: {meaning}" if meaning else s.criterion
     if s.efficiency is not None:
@@ -192,40 +195,18 @@ def _effect(name: str) -> str:
     return name.split(".")[0]
 
 
-def parameters_table(s: PlanSummary) -> Iterator[Block]:
-    """Yield the table of predicted standard uncertainties."""
-    yield table(
-        *("parameter", "±", "magnitude", "unit", "± in %"),
-        rows=_parameter_rows(s.parameters),
-        left=(0, 3),
-    )
-    yield note("magnitude: estimated so far, else the effect's ordinary magnitude.\n")
-
-
 def criteria_table(s: PlanSummary) -> Iterator[Block]:
     """Yield what plans by other criteria would reach with as many readings."""
-    out = table(
-        *(
-            "criterion",
-            "predicted ±",
-            "open ±",
-            "joint ±",
-            "O1 (D)",
-            "O2 (K)",
-            "O3 (E)",
-            "certified",
-        )
-    )
+    heads = ("criterion", "predicted ±", "open ±", "joint ±", "O1 (D)", "O2 (K)", "O3 (E)")
+    out = table(*heads, "certified")
     for c in s.criteria:
         this = c.criterion == s.criterion
+        sizes = (c.position_std_m, c.position_open_m)
         out.add(
             f"{c.criterion} (this)" if this else c.criterion,
-            "-" if c.position_std_m is None else numbers.length(c.position_std_m),
-            "-" if c.position_open_m is None else numbers.length(c.position_open_m),
+            *("-" if x is None else numbers.length(x) for x in sizes),
             "-" if c.joint_share is None else f"{numbers.digits(100 * c.joint_share, 2)} %",
-            numbers.digits(c.o1),
-            numbers.digits(c.o2, 2),
-            numbers.digits(c.o3),
+            *(numbers.digits(c.o1), numbers.digits(c.o2, 2), numbers.digits(c.o3)),
             "-" if c.efficiency is None else _floor(c.efficiency),
             tone="strong" if this else "text",
         )
@@ -239,18 +220,15 @@ def criteria_table(s: PlanSummary) -> Iterator[Block]:
     )
 
 
-def _curve(curve: Sequence[CurvePoint], poses: int) -> Iterator[Block]:
-    yield heading("Sample-size curve: how many poses are enough")
+def _curve(s: PlanSummary) -> Table:
     out = table("poses", "predicted ±", "", left=(2,))
-    top = max(point.position_std_m for point in curve)
-    for point in curve:
+    top = max(point.position_std_m for point in s.curve)
+    for point in s.curve:
         size = max(1, round(BAR * point.position_std_m / top)) if top > 0 else 1
-        this = point.poses == poses
-        bar = "█" * size + "  this plan" * this
-        length = numbers.length(point.position_std_m)
+        this = point.poses == s.poses
+        bar, length = "█" * size + "  this plan" * this, numbers.length(point.position_std_m)
         out.add(str(point.poses), length, bar, tone="strong" if this else "text")
-    yield out
-    yield f"{enough(curve)}\n"
+    return out
 
 
 def enough(curve: Sequence[CurvePoint]) -> str:
@@ -278,15 +256,6 @@ def undetectable(s: PlanSummary) -> str:
     return f"These readings cannot detect {numbers.names(names, 'or')}." if names else ""
 
 
-def _detectable(s: PlanSummary) -> Iterator[Block]:
-    yield heading("Minimum detectable effects outside of the model")
-    if found := detectable(s):
-        yield table("effect", "from", rows=found)
-        yield note("from: rms displacement of the target that is one sigma of these readings.\n")
-    if words := undetectable(s):
-        yield f"{words}\n"
-
-
 _STRETCHED = 1.15
 _MOST_LOADS = 2
 _LEAST_SHARE = 0.1
@@ -295,11 +264,8 @@ _LEAST_SHARE = 0.1
 def next_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
     """Yield the powers of the pairs, now and then, and what makes the difference.
 
-    Args:
-        found: the plan and what it tells.
-        poses: of the plan, beside the reference.
-        readings: of the plan.
-        details: all pairs, not the one of each suspect that is separated least.
+    `poses` beside the reference and `readings` are the plan's; without `details` of each suspect
+    only the pair that is separated least.
     """
     yield heading("Telling the suspects apart")
     yield power_table(found.powers if details else weakest(found.powers))
@@ -332,14 +298,7 @@ def brief_plan(s: PlanSummary) -> str:
 
 
 def poses_report(found: Next, poses: int, readings: int, details: bool = True) -> Iterator[Block]:
-    """Yield what further poses tell of a misfit that depends on the pose alone.
-
-    Args:
-        found: the plan and the powers.
-        poses: of the plan, beside the reference.
-        readings: of the plan.
-        details: all pairs, not the one of each suspect that is told least.
-    """
+    """Yield what further poses tell of a misfit of the pose alone; arguments of `next_report`."""
     yield heading("Poses where nothing was read yet")
     yield (
         f"The misfit is the same under every load of a pose, so that loads tell nothing of it: "

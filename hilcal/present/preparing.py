@@ -87,13 +87,7 @@ LISTED = 12
 
 
 def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block]:
-    """Yield what was understood, what is unsure and what was not used.
-
-    Args:
-        proposal: the mapping in the making.
-        rows: of the table.
-        source: the file's name.
-    """
+    """Yield what was understood, unsure and not used of a table of so many rows, from a file."""
     yield heading(f"{source}: {rows} rows")
     file = proposal.sections.get("file", {})
     if file:
@@ -103,21 +97,17 @@ def import_preview(proposal: Proposal, rows: int, source: str) -> Iterator[Block
             (u.what, _short(u.columns), u.meaning, _short(u.example)) for u in proposal.understood
         )
         yield table("what", "columns", "meaning", "first row", rows=understood, left=(0, 1, 2, 3))
-    yield from _sentences("missing:", proposal.lacking)
-    yield from _sentences("unsure:", [f"{what}: {words}" for what, words in proposal.unsure])
+    unsure = [f"{what}: {words}" for what, words in proposal.unsure]
+    for title, sentences in (("missing:", proposal.lacking), ("unsure:", unsure)):
+        if sentences:
+            yield heading(title)
+        yield from (Words(sentence, indent=2) for sentence in sentences)
     unused = [f"{name} ({why})" for name, why in proposal.unused]
     if len(unused) > LISTED:
         unused = [*unused[:LISTED], f"and {len(unused) - LISTED} more"]
     if unused:
         yield heading("not used:")
         yield Words(", ".join(unused), indent=2)
-
-
-def _sentences(title: str, sentences: Sequence[str]) -> Iterator[Block]:
-    if sentences:
-        yield heading(title)
-    for sentence in sentences:
-        yield Words(sentence, indent=2)
 
 
 def _short(cells: Sequence[str]) -> str:

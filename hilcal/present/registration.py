@@ -1,4 +1,4 @@
-"""Where base and target are, what the poses could not tell, and what a covariance consists of."""
+"""Where base and target are, what the poses and torques tell of a cell, what covariances hold."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,6 +13,7 @@ from hilcal.identification.misdescription import OtherArm
 from hilcal.identification.noise_estimate import NoiseEstimate
 from hilcal.identification.registration import Registration, Undetermined, register
 from hilcal.identification.robot_frames import RobotFrames
+from hilcal.identification.torques import ARM, TOOL, TorqueCheck, TorqueFactor
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
@@ -29,7 +30,7 @@ def registration_lines(found: Registration) -> Iterator[str]:
     if found.estimated:
         turn = "" if found.turn_rms is None else f" and {np.degrees(found.turn_rms):.3g}°"
         cell = found.cell
-        base = _base(cell.registration)
+        base = f"the base is {_at(cell.registration)}"
         if cell.observers and np.array_equal(cell.registration, np.eye(4)):
             base = "positions are in the axes of the base, which nothing else fixes"
         places = "".join(f"; {_observer(o)}" for o in cell.observers if o.free)
@@ -81,11 +82,7 @@ def fitted_lines(fit: Fit) -> Iterator[str]:
 def base_line(cell: Cell, found: RobotFrames, mode: Mode = "absolute") -> str:
     """Return where the robot's base is, which poses, exports and errors are counted from.
 
-    Args:
-        cell: the cell.
-        found: its frames.
-        mode: kind of readings that they were fitted to; of deflections the base is that of the
-            nominal arm, and is written to 1 mm.
+    Of deflections (`mode`) it is that of the nominal arm, and is written to 1 mm.
     """
     if np.array_equal(found.base, np.eye(4)) and found.base_stated:
         return "The robot's base: the axes that the positions are given in."
@@ -109,40 +106,31 @@ def undetermined_lines(found: Registration) -> Iterator[str]:
 
 def _told(u: Undetermined, names: tuple[str, ...]) -> str:
     own = "" if u.target is None or not names else f" {names[u.target]}"
-    moved = " and ".join(u.observers)
-    if moved:
-        others = _told(replace(u, observers=()), names)
-        alone = not np.any(u.base_shift) and not np.any(u.base_turn) and u.target is None
-        return f"the place of {moved}" if alone else f"the place of {moved} from {others}"
+    if u.observers:
+        place = f"the place of {' and '.join(u.observers)}"
+        if not np.any(u.base_shift) and not np.any(u.base_turn) and u.target is None:
+            return place
+        return f"{place} from {_told(replace(u, observers=()), names)}"
     moved = _moves(u.target_shift, u.target_turn, f"the target{own}'s", "the flange's")
     base = _moves(u.base_shift, u.base_turn, "the base's", "its")
-    if not moved:
-        return base or "a combination of base and target"
-    return f"{moved} from {base}" if base else moved
+    return " from ".join(filter(None, (moved, base))) or "a combination of base and target"
 
 
 def _moves(shift: Floats, turn: Floats, whose: str, axes: str) -> str:
     parts = []
     if np.any(shift):
         height = whose.startswith("the base") and _axis(shift) == "z"
-        parts.append(
-            "the height of the base" if height else f"{whose} offset {_along(shift, axes)}"
-        )
+        offset = f"{whose} offset along {_axis_words(shift, axes)}"
+        parts.append("the height of the base" if height else offset)
     if np.any(turn):
         parts.append(f"{whose} turn about {_axis_words(turn, axes)}")
     return " with ".join(parts)
 
 
-def _along(v: Floats, axes: str) -> str:
-    return f"along {_axis_words(v, axes)}"
-
-
 def _axis_words(v: Floats, axes: str) -> str:
-    name = _axis(v)
-    if name:
+    if name := _axis(v):
         return f"{axes} {name}"
-    unit = v / np.linalg.norm(v)
-    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in unit)})"
+    return f"{axes} direction ({', '.join(f'{x:.2f}' for x in v / np.linalg.norm(v))})"
 
 
 def _axis(v: Floats) -> str | None:
@@ -160,10 +148,6 @@ def _why(still: Bools) -> str:
     if which == list(range(which[0], which[-1] + 1)):
         return f": joints {which[0]} to {which[-1]} never turned"
     return f": joints {', '.join(map(str, which[:-1]))} and {which[-1]} never turned"
-
-
-def _base(t: Floats) -> str:
-    return f"the base is {_at(t)}"
 
 
 def _at(t: Floats, places: tuple[int, int] = PLACES) -> str:
@@ -205,12 +189,7 @@ WORDS: dict[CovarianceParts, str] = {
 
 
 def covariance_words(parts: CovarianceParts, noise: NoiseEstimate | None = None) -> str:
-    """Return a sentence without its full stop.
-
-    Args:
-        parts: what the covariance consists of.
-        noise: the estimate of the noise, where nothing states it.
-    """
+    """Return a sentence without its full stop; `noise` is the estimate, where nothing states it."""
     if noise is not None:
         return _estimated(noise)
     return f"each covariance is that of {WORDS[parts]}"
@@ -231,3 +210,43 @@ def _estimated(n: NoiseEstimate) -> str:
         f"{numbers.length(n.along_m)} along the beam, "
         f"{numbers.length(n.across_m)} across it at {n.distance_m:.2g} m{turn}{arm}"
     )
+
+
+def torque_lines(found: TorqueCheck | None) -> Iterator[str]:
+    """Yield a sentence for each described mass that the torques contradict, else one for all."""
+    if found is None:
+        return
+    left = ", ".join(numbers.digits(x, 2) for x in found.std_Nm)
+    if not found.factors:
+        yield "Measured joint torques: the poses tell neither a load nor a mass by them."
+    for f in found.factors:
+        if f.differs:
+            yield f"Measured joint torques: {_differs(f)}."
+    right = [_size(f) for f in found.factors if not f.differs]
+    if right:
+        yield f"Measured joint torques agree with the description: {'; '.join(right)}."
+    yield f"Measured joint torques scatter about that by {left} N·m, joint by joint (friction)."
+
+
+def _differs(f: TorqueFactor) -> str:
+    what = f.of if f.of in (ARM, TOOL) else f"load {f.of}"
+    if f.factor < 0:
+        return (
+            f"{what} acts with the other sign ({numbers.digits(f.factor)} times the described "
+            "torques); tau1_Nm, ... are the torques that the drives exert, against the load's"
+        )
+    if f.stated_kg is None:
+        return f"{what} acts {numbers.digits(f.factor)} times as strongly as described{_band(f)}"
+    return f"{what} is {numbers.digits(f.factor * f.stated_kg)} kg, not {f.stated_kg:.4g}{_band(f)}"
+
+
+def _size(f: TorqueFactor) -> str:
+    if f.stated_kg is None:
+        return f"{f.of} {numbers.digits(f.factor)} times as described{_band(f)}"
+    return f"{f.of} {numbers.digits(f.factor * f.stated_kg)} kg{_band(f)}"
+
+
+def _band(f: TorqueFactor) -> str:
+    unit = 1.0 if f.stated_kg is None else f.stated_kg
+    low, high = numbers.digits(unit * f.low), numbers.digits(unit * f.high)
+    return f" (95 %: {low} to {high}{'' if f.stated_kg is None else ' kg'})"

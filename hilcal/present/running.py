@@ -4,7 +4,6 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from math import isfinite
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +12,6 @@ from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
-    ProgressColumn,
     TaskID,
     TextColumn,
 )
@@ -50,9 +48,9 @@ def check_report(answers: "tuple[ConnectionResult, ...]", dry: "DryRun | None") 
     """Yield who answered, in which state, and every problem."""
     out = table("device", "driver", "", "who answers, and what it says", left=(0, 1, 2, 3))
     for a in answers:
-        name = "no answer" if a.report is None else a.report.name
+        name, facts = ("no answer", ()) if a.report is None else (a.report.name, a.report.facts)
         out.add(a.device, a.driver, "✗" if a.problems else "✓", name)
-        for what, value in () if a.report is None else a.report.facts:
+        for what, value in facts:
             out.add("", "", "", f"{what}: {value}")
         for problem in a.problems:
             out.add("", "", "!", problem)
@@ -170,47 +168,55 @@ def missed_words(status: GoalStatus, count: int) -> str:
     return f"{words}, {status.ratio:.2g} times what is asked for"
 
 
-@dataclass(slots=True)
-class _Lines:
-    """Tells everything line by line, with the seconds since the start."""
+class _Watcher:
+    """Tells a campaign line by line, with the seconds since the start; see `_Bar`."""
 
-    console: Console
-    begun: float = field(default_factory=time.monotonic)
+    def __init__(self, console: Console) -> None:
+        """Begin to count the seconds."""
+        self.console, self.begun = console, time.monotonic()
 
     def notify(self, event: object) -> None:
         """Take note."""
         if isinstance(event, Phase):
-            self._print(event.text)
-        elif isinstance(event, Remark):
-            self._print(f"note: {event.text}")
-        elif isinstance(event, GoalMet):
-            self._print(f"note: {met_words(event)}")
+            self.tell(phase=event.text)
+        elif isinstance(event, Remark | GoalMet):
+            self.tell(note=f"note: {event.text if isinstance(event, Remark) else met_words(event)}")
         elif isinstance(event, ReadingStored):
-            left = f", {spoken(event.left_real)} left" if event.left_real > 0 else ""
-            self._print(f"{event.done}/{event.total} {event.step}{figures(event)}{left}")
+            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
+            reading = f"{event.step}{figures(event)}"
+            self.tell(left=left, last=reading, done=event.done, total=event.total)
 
-    def _print(self, words: str) -> None:
+    def tell(self, **what: Any) -> None:
+        """Print what goes on, what is to be noted, or the last reading."""
+        words = what.get("phase") or what.get("note") or "{done}/{total} {last}".format(**what)
+        left = f", {what['left']}" if what.get("left") else ""
         seconds = f"[{time.monotonic() - self.begun:6.1f} s]"
-        self.console.print(f"{seconds} {words}", markup=False, highlight=False, soft_wrap=True)
+        line = f"{seconds} {words}{left}"
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-class _Bar:
-    """Keeps two lines up to date; remarks scroll by above them.
+class _Bar(_Watcher):
+    """Keeps two lines up to date on a terminal; notes scroll by above them.
 
     While somebody is asked a question they are gone, for their refresh would wipe it away.
     """
 
     def __init__(self, console: Console, total: int) -> None:
         """Show nothing before `begin`."""
-        self._console = console
-        self._total, self._done = total, 0
-        self._fields: dict[str, Any] = {"left": "", "last": "", "phase": ""}
+        super().__init__(console)
+        self._now: dict[str, Any] = {"left": "", "last": "", "phase": "", "done": 0, "total": total}
         self._shown: tuple[_TwoLines, TaskID] | None = None
 
     def begin(self) -> None:
         """Show the lines."""
-        progress = _TwoLines(*_columns(), console=self._console, transient=True)
-        task = progress.add_task("", total=self._total, completed=self._done, **self._fields)
+        columns = (
+            BarColumn(bar_width=20),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[left]}", style="bold", markup=False),
+            TextColumn("{task.fields[phase]}", style="dim", markup=False),
+        )
+        progress = _TwoLines(*columns, console=self.console, transient=True)
+        task = progress.add_task("", completed=self._now["done"], **self._now)
         progress.start()
         self._shown = (progress, task)
 
@@ -222,29 +228,26 @@ class _Bar:
 
     def notify(self, event: object) -> None:
         """Take note."""
-        if isinstance(event, Phase):
-            self._update(phase=event.text)
-        elif isinstance(event, Question):
+        if isinstance(event, Question):
             self.end()
-            if self._done:
-                words = f"{self._done} of {self._total} readings are stored"
-                left = f", {self._fields['left']}" if self._fields["left"] else ""
-                self._console.print(f"\n{words}{left}.", style="dim", markup=False)
+            if self._now["done"]:
+                left = f", {self._now['left']}" if self._now["left"] else ""
+                words = f"\n{self._now['done']} of {self._now['total']} readings are stored{left}."
+                self.console.print(words, style="dim", markup=False)
         elif isinstance(event, Answered):
             self.begin()
-        elif isinstance(event, Remark | GoalMet):
-            text = event.text if isinstance(event, Remark) else met_words(event)
-            self._console.print(f"note: {text}", markup=False, highlight=False)
-        elif isinstance(event, ReadingStored):
-            self._done = event.done
-            left = f"{spoken(event.left_real)} left" if event.left_real > 0 else ""
-            self._update(left=left, last=f"{event.step}{figures(event)}")
+        else:
+            super().notify(event)
 
-    def _update(self, **fields: str) -> None:
-        self._fields |= fields
+    def tell(self, **what: Any) -> None:
+        """Show what goes on and the last reading; print what is to be noted."""
+        if "note" in what:
+            self.console.print(what["note"], markup=False, highlight=False)
+            return
+        self._now |= what
         if self._shown is not None:
             progress, task = self._shown
-            progress.update(task, completed=self._done, **self._fields)
+            progress.update(task, completed=self._now["done"], **self._now)
 
 
 class _TwoLines(Progress):
@@ -258,10 +261,10 @@ class _TwoLines(Progress):
 
 
 @contextmanager
-def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
+def watching(console: Console, total: int) -> Iterator[_Watcher]:
     """Yield a watcher that shows a campaign of so many readings."""
     if not console.is_terminal:
-        yield _Lines(console)
+        yield _Watcher(console)
         return
     bar = _Bar(console, total)
     bar.begin()
@@ -269,15 +272,6 @@ def watching(console: Console, total: int) -> Iterator[_Lines | _Bar]:
         yield bar
     finally:
         bar.end()
-
-
-def _columns() -> tuple[ProgressColumn, ...]:
-    return (
-        BarColumn(bar_width=20),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[left]}", style="bold", markup=False),
-        TextColumn("{task.fields[phase]}", style="dim", markup=False),
-    )
 
 
 def figures(event: ReadingStored) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 from scipy import stats
 
 from hilcal import numbers
-from hilcal.cell import Cell
 from hilcal.diagnosis.added_variable import added_variable
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import Suspect
@@ -31,7 +30,7 @@ from hilcal.present.diagnosis import (
     suspects_table,
 )
 from hilcal.present.discovery import coefficient
-from hilcal.present.document import Block
+from hilcal.present.document import Block, Table, pairs, table
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
@@ -98,23 +97,19 @@ class StoryRevision:
         revision: its number, growing along the story.
         change: what it changed, e.g. "+ hysteresis"; empty for the first.
         verdict: one of the verdicts of `diagnose`, or `UNDIAGNOSED`.
-        message: the verdict in words.
         residual: (N, 3) measured - predicted, base axes, m.
         predicted: (N, 3) position in absolute mode, deflection vector in deflection mode, m.
         whitened_norm2: (N,) squared Mahalanobis distance of each reading, 3 degrees of freedom.
         error: of the fitted readings.
         holdout: of whole poses left out.
         cells: of its row in a table of revisions.
-        panels: "verdict", "details" and "parameters" in words and tables.
-        follows: what the residual follows: the variable that carries most of it, where the first
-            suspect explains little of that, else the first suspect; None where there is neither.
-        laws: of the model, which the catalogue does not have; one entry per curve.
+        panels: "verdict", "details", "parameters", "follows" (what the residual follows) and "law"
+            (beyond the catalogue, empty without one) in words and tables.
     """
 
     revision: int
     change: str
     verdict: str
-    message: str
     residual: Floats
     predicted: Floats
     whitened_norm2: Floats
@@ -122,8 +117,6 @@ class StoryRevision:
     holdout: ErrorBlock
     cells: tuple[str, ...] = ()
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
-    follows: DependenceCurve | None = None
-    laws: tuple[DependenceCurve, ...] = ()
 
     @property
     def size_m(self) -> Floats:
@@ -185,23 +178,19 @@ class Story:
     growing: bool = False
 
     @cached_property
-    def _of_poses(self) -> tuple[Ints, Ints, Ints]:
-        return np.unique(self.pose, return_index=True, return_inverse=True)
-
-    @property
     def poses(self) -> Ints:
         """(P,) the numbers of its poses, growing."""
-        return self._of_poses[0]
+        return np.unique(self.pose)
 
-    @property
+    @cached_property
     def first(self) -> Ints:
         """(P,) the first reading of each pose."""
-        return self._of_poses[1]
+        return np.unique(self.pose, return_index=True)[1]
 
-    @property
+    @cached_property
     def row(self) -> Ints:
         """(N,) index into `poses` of each reading."""
-        return self._of_poses[2]
+        return np.searchsorted(self.poses, self.pose)
 
     @cached_property
     def bodies(self) -> Floats:
@@ -223,9 +212,7 @@ class Story:
     def last_of_poses(self, badness: Floats) -> Ints:
         """(P,) the reading of each pose that has the largest of (N,)."""
         order = np.lexsort((badness, self.row))
-        return np.asarray(
-            order[np.append(np.flatnonzero(np.diff(self.row[order])), len(order) - 1)]
-        )
+        return np.asarray(order[np.flatnonzero(np.diff(self.row[order], append=-1))])
 
     def pose_name(self, i: int) -> str:
         """Return the name of reading i's pose, as everywhere else."""
@@ -243,7 +230,7 @@ LITTLE = 0.2
 shown, not those of the variables; a guess."""
 LEAST_CARRIED = 0.02
 """Share of the misfit below which a variable is not shown; a guess."""
-MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
+MOST_SUSPECTS, MOST_PARAMETERS, BINS = 3, 40, 12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,11 +253,10 @@ class Chapter:
 
 
 def build_story(chapters: Sequence[Chapter]) -> Story:
-    """Build the story of successive revisions of one campaign, in base axes.
+    """Build the story of successive revisions of one campaign, in axes of the last one's base.
 
-    All readings are shown, also those that were set aside as gross errors. The base is that of
-    the last revision. An arrow starts where the rigid
-    nominal arm would hold the target.
+    All readings are shown, also those that were set aside as gross errors. An arrow starts where
+    the rigid nominal arm would hold the target.
 
     Raises:
         InputError: no revision, or revisions of different readings.
@@ -288,7 +274,9 @@ def build_story(chapters: Sequence[Chapter]) -> Story:
     readings, rows = last.readings, last.whitening.reading
     frames = chapters[-1].fit.frames
     axes = np.broadcast_to(frames.base[:3, :3].T, (len(rows), 3, 3))
-    nominal = _nominal(chapters[-1].fit.model.cell.with_targets(frames.declared), last)
+    cell = chapters[-1].fit.model.cell.with_targets(frames.declared)
+    rigid = Model(cell, ()).predict(readings.states, np.zeros(0))
+    nominal = rigid.observation.base_position
     if mode == "absolute":
         chain, predicted = frames.chain, last.prediction.observation.base_position
         measured = chain[:3, 3] + predicted @ chain[:3, :3].T + _turn(axes, last.raw[:, :3])
@@ -342,12 +330,6 @@ def pose_numbers(names: Sequence[str]) -> Ints:
     return np.array(numbers, dtype=np.int64)
 
 
-def _nominal(cell: Cell, e: FullPrediction) -> Floats:
-    """Target positions (N, 3) of the rigid nominal arm, base axes."""
-    prediction = Model(cell, ()).predict(e.readings.states, np.zeros(0))
-    return prediction.observation.base_position
-
-
 def _turn(axes: Floats, vectors: Floats) -> Floats:
     return np.asarray(np.einsum("dij,dj->di", axes, vectors))
 
@@ -360,7 +342,6 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         revision=c.number,
         change=changed,
         verdict=verdict,
-        message="run hilcal diagnose for a verdict" if d is None else message(d),
         residual=residual,
         predicted=measured - residual,
         whitened_norm2=mahalanobis2(e.raw[:, :3], e.whitening.covariance[:, :3, :3]),
@@ -368,8 +349,6 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         holdout=c.fit.holdout,
         cells=revision_cells(c.number, changed, c.fit, verdict),
         panels=_panels(c),
-        follows=None if d is None else _follows(d),
-        laws=laws(c.fit),
     )
 
 
@@ -382,16 +361,24 @@ def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
         if d.significant:
             verdict.append(suspects_table(d, MOST_SUSPECTS))
         details = list(diagnosis_report(d))
-        if (drawn := _follows(d)) is not None:
-            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
+    found = None if d is None else follows(d)
+    drawn: tuple[Block, ...] = ("Nothing is found that the residual follows.",)
+    if found is not None:
+        drawn = (found.says, curve_table(found))
     return {
         "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
         "details": (*details, errors(c.fit)),
         "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
+        "follows": drawn,
+        "law": tuple(b for x in laws(c.fit)[:1] for b in (pairs(x.facts), curve_table(x))),
     }
 
 
-def _follows(d: Diagnosis) -> DependenceCurve | None:
+def follows(d: Diagnosis) -> DependenceCurve | None:
+    """Return what the residual follows: the first suspect, or the variable that carries most of it.
+
+    It is the variable where the suspect explains little of that; None where there is neither.
+    """
     known = 0.0 if d.lead is None else d.lead.holdout_share
     explained = d.insufficiency is None and known >= LITTLE * d.predictable_share
     carried = [v for v in d.dependences if v.share >= LEAST_CARRIED and v.determined]
@@ -399,6 +386,21 @@ def _follows(d: Diagnosis) -> DependenceCurve | None:
         return curve(carried[0])
     suspects = [] if d.lead is None else shown_suspects(d)
     return regressor(d.fit, suspects[0]) if suspects else None
+
+
+def curve_table(c: DependenceCurve) -> Table:
+    """Return a curve as a table; single readings by their means in bins of equal count."""
+    x, y, error = c.x, c.y, c.error
+    if error is None:
+        bins = np.array_split(np.argsort(x, kind="stable"), min(BINS, max(1, len(x) // 4)))
+        x, y = (np.array([v[b].mean() for b in bins]) for v in (c.x, c.y))
+        error = np.array([c.y[b].std() / max(len(b) - 1, 1) ** 0.5 for b in bins])
+    out = table(c.x_label, c.y_label, "±", *(() if c.line is None else ("law",)))
+    for k in range(len(x)):
+        value, spread = numbers.with_std(float(y[k]), float(error[k]))
+        law = () if c.line is None else (numbers.digits(float(np.interp(x[k], *c.line))),)
+        out.add(c.names[k] if c.names else numbers.digits(float(x[k])), value, spread, *law)
+    return out
 
 
 def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
@@ -413,29 +415,25 @@ def laws(fit: Fit) -> tuple[DependenceCurve, ...]:
         ]
         acts, coefficients = ", ".join(law.acts_on), ", ".join(told)
         facts = (("law", law.formula), ("acts on", acts), ("coefficients", coefficients))
+        says = f"{law.formula}: where it is right, the readings lie on it."
         for c in law.curves:
             x, y, error, _ = c.binned
             x_unit, x_factor = numbers.angle_or(c.quantity_unit)
             y_unit, factor = numbers.unit_for(c.unit, list(c.line[1]))
-            out.append(
-                DependenceCurve(
-                    law.name,
-                    f"{law.formula}: where it is right, the readings lie on it.",
-                    x_factor * x,
-                    factor * y,
-                    c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]",
-                    f"{c.of} of {c.site} [{y_unit}]",
-                    factor * error,
-                    line=np.vstack([x_factor * c.line[0], factor * c.line[1]]),
-                    facts=facts,
-                )
-            )
+            over = c.quantity if x_unit in ("", "1") else f"{c.quantity} [{x_unit}]"
+            of, line = f"{c.of} of {c.site} [{y_unit}]", c.line * [[x_factor], [factor]]
+            drawn = (x_factor * x, factor * y, over, of, factor * error)
+            out.append(DependenceCurve(law.name, says, *drawn, line=line, facts=facts))
     return tuple(out)
 
 
 def curve(d: Dependence) -> DependenceCurve:
     """Return a dependence in units for people."""
-    x_unit, x_factor = _unit_of(d)
+    x_unit, x_factor = d.unit, 1.0
+    if d.unit in ("rad", "m"):
+        x_unit, x_factor = numbers.of_joint(d.unit)
+    elif d.unit == "s" and (span := float(np.ptp(d.x))) > 120:
+        x_unit, x_factor = ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60)
     y_unit, y_factor = numbers.unit_for(d.y_unit, list(d.y))
     return DependenceCurve(
         d.variable,
@@ -449,28 +447,12 @@ def curve(d: Dependence) -> DependenceCurve:
     )
 
 
-def _unit_of(d: Dependence) -> tuple[str, float]:
-    """Unit for people, and its factor, of the variable."""
-    if d.unit in ("rad", "m"):
-        return numbers.of_joint(d.unit)
-    if d.unit == "s":
-        span = float(np.ptp(d.x))
-        return ("h", 1 / 3600) if span > 7200 else ("min", 1 / 60) if span > 120 else ("s", 1.0)
-    return d.unit, 1.0
-
-
 def regressor(fit: Fit, suspect: Suspect) -> DependenceCurve | None:
     """Return the added variable of a suspect, see `added_variable`; None where it has none."""
     found = added_variable(fit, suspect)
-    return (
-        None
-        if found is None
-        else DependenceCurve(
-            suspect.effect,
-            f"Where {suspect.effect} is right, the readings lie on the line of slope 1.",
-            1e6 * found[0],
-            1e6 * found[1],
-            f"what {suspect.effect} would explain [µm]",
-            "residual along it [µm]",
-        )
-    )
+    if found is None:
+        return None
+    says = f"Where {suspect.effect} is right, the readings lie on the line of slope 1."
+    x, y = (1e6 * v for v in found)
+    what = f"what {suspect.effect} would explain [µm]"
+    return DependenceCurve(suspect.effect, says, x, y, what, "residual along it [µm]")

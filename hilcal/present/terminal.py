@@ -114,17 +114,11 @@ def shared(least: Sequence[int], wanted: Sequence[int], room: int) -> list[int]:
         wanted: width that it has use for.
         room: sum of the widths, at least that of `least`.
     """
-    out = list(least)
-    left = room - sum(out)
-    waiting = [k for k in range(len(out)) if wanted[k] > out[k]]
-    while left > 0 and waiting:
-        for k in list(waiting):
-            if left == 0:
-                break
+    level = max(t for t in range(room + 1) if sum(map(min, wanted, (x + t for x in least))) <= room)
+    out = [max(x, min(w, x + level)) for x, w in zip(least, wanted, strict=True)]
+    for k, most in enumerate(wanted):
+        if out[k] < most and sum(out) < room:
             out[k] += 1
-            left -= 1
-            if out[k] == wanted[k]:
-                waiting.remove(k)
     return out
 
 

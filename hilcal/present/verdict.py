@@ -51,8 +51,9 @@ def message(d: Diagnosis) -> str:
 
 
 def _verdict(d: Diagnosis) -> str:
-    if d.wrong_figures:
-        return _wrong(d.wrong_figures)
+    if d.wrong_figures:  # any one of several explains the misfit
+        told = "; or, as well: ".join(_figure(f) for f in d.wrong_figures)
+        return f"{told}. Until that is settled no effect is looked for"
     if d.reason == "one_suspect":
         return _missing(d.suspects[0])
     if d.reason == "inseparable_suspects":
@@ -81,12 +82,6 @@ def _verdict(d: Diagnosis) -> str:
         return adequate
     doubts = "; ".join(_alternative(a) for a in d.alternatives if a.inseparable)
     return f"{adequate}; but {doubts}: measure what separates them"
-
-
-def _wrong(found: tuple[WrongFigure, ...]) -> str:
-    """Say which figure is to be checked first; any one of several explains the misfit."""
-    told = "; or, as well: ".join(_figure(f) for f in found)
-    return f"{told}. Until that is settled no effect is looked for"
 
 
 def _figure(f: WrongFigure) -> str:
@@ -239,14 +234,12 @@ def _no_suspect(d: Diagnosis) -> str:
         )
     if repeats:
         repeats = f"{repeats}: {100 * d.repeated_share:.0f} % of the misfit is the same in them"
+    share = d.predictable_share
+    percent = f"{100 * share:.0f} %" if share >= 0.005 else f"{100 * share:.1g} %"
     return (
-        f"Residuals are {_spread(d)}, {_percent(d.predictable_share)} of the misfit is predicted "
-        f"on poses left out, and {none}{follows}{repeats}"
+        f"Residuals are {_spread(d)}, {percent} of the misfit is predicted on poses left out, and "
+        f"{none}{follows}{repeats}"
     )
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.005 else f"{100 * share:.1g} %"
 
 
 def _pose_alone(d: Diagnosis, a: PoseAlone) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -11,9 +11,7 @@ from nicegui import background_tasks, run, ui
 from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal import numbers
-from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.distinguish import Difference
-from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
 from hilcal.present.charts.comparisons import error_per_revision
 from hilcal.present.charts.evidence import added_variable, curve_chart, misfit_shares
@@ -23,19 +21,32 @@ from hilcal.present.charts.readings import (
     residual_by_pose,
     residual_over,
 )
-from hilcal.present.fit import CERTAIN, follows, misses, model_name
+from hilcal.present.diagnosis import shown_suspects, suspects_table
+from hilcal.present.document import table as block
+from hilcal.present.fit import follows, misses, model_name
+from hilcal.present.plan import load_name
+from hilcal.present.story import DependenceCurve
+from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message
 from hilcal.store.plan import UNLOADED
 from hilcal.store.revision import RevisionRecord
-from hilcal.workbench.elements import answer, button, chart, number, plain, point, title
+from hilcal.workbench.elements import (
+    answer,
+    button,
+    chart,
+    drawn,
+    number,
+    plain,
+    point,
+    soft,
+    title,
+)
 from hilcal.workbench.next_card import next_measurement
 from hilcal.workbench.snapshot import Figure, Snapshot
 
 if TYPE_CHECKING:
     from hilcal.workbench.page import View
 
-CERTAIN = CERTAIN
-SUSPECTS = 6
 FURTHEST = 8
 FURTHEST_SHARE = 0.05
 """Share of the readings that are compared with the others as those furthest off; a choice."""
@@ -50,10 +61,10 @@ def waiting(view: View) -> None:
     with ui.column().classes("part").style("margin-top: 16px"):
         ui.html(f"<h2>{plain(view.session.path.name)}</h2>", sanitize=False)
         if view.work.failure():
-            ui.label("There is nothing to show: see above.").classes("soft")
+            soft("There is nothing to show: see above.")
             button(view, "Read it again", view.again, "outline")
         else:
-            ui.label("The readings are fitted and judged; this takes some seconds.").classes("soft")
+            soft("The readings are fitted and judged; this takes some seconds.")
 
 
 def snapshot(view: View, d: Snapshot) -> None:
@@ -75,9 +86,9 @@ def snapshot(view: View, d: Snapshot) -> None:
                 fell(view, d)
             with ui.column().classes("part"):
                 compared(view, d)
-            if d.revision.laws:
+            if found := curves_of_laws(d.fit):
                 with ui.column().classes("part"):
-                    laws(view, d)
+                    laws(view, found)
         with ui.column().classes("stack"):
             with ui.column().classes("part"):
                 revisions(view, d)
@@ -98,9 +109,7 @@ def head(d: Snapshot) -> None:
     kind = "deflections" if d.fit.mode == "deflection" else "absolute readings"
     with ui.row().classes("items-baseline").style("gap: 4px 16px; padding-top: 16px"):
         ui.html(f"<h1 class='verdict'>{plain(d.name)}</h1>", sanitize=False)
-        ui.label(f"{d.arm} · {d.n_readings} readings, judged as {kind} · from {d.source}").classes(
-            "soft"
-        )
+        soft(f"{d.arm} · {d.n_readings} readings, judged as {kind} · from {d.source}")
 
 
 def verdict(view: View, d: Snapshot) -> None:
@@ -129,7 +138,7 @@ def model(view: View, d: Snapshot) -> None:
     """Draw the effects of the model, each with a button that takes it out."""
     called = "Baseline, not kept yet" if d.number is None else f"Revision {d.number}"
     with ui.row().classes("items-center").style("gap: 6px 10px"):
-        ui.label(f"{called}: {model_name(d.fit.model.named)}").classes("soft")
+        soft(f"{called}: {model_name(d.fit.model.named)}")
         for name in d.removable:
             button(view, f"Remove {name}", partial(view.remove, name), "outline dense")
     answer(view, "model")
@@ -139,13 +148,13 @@ def fails(view: View, d: Snapshot) -> None:
     """Draw where the model fails."""
     title("Where it fails")
     if d.diagnosis.residual_is_noise:
-        ui.label("Nowhere beyond the noise: what is left is what it explains.").classes("soft")
+        soft("Nowhere beyond the noise: what is left is what it explains.")
         return
-    ui.label(follows(d.diagnosis.misfit_breakdown)).classes("soft")
+    soft(follows(d.diagnosis.misfit_breakdown))
     shown = chart(view, misfit_shares(d.diagnosis))
     shown.props("data-part=fails")
     shown.on("plotly_click", lambda e: _picked_bar(view, d, e))
-    ui.label("Click a bar: the readings over that variable.").classes("soft")
+    soft("Click a bar: the readings over that variable.")
 
 
 def _picked_bar(view: View, d: Snapshot, e: GenericEventArguments) -> None:
@@ -158,55 +167,35 @@ def _picked_bar(view: View, d: Snapshot, e: GenericEventArguments) -> None:
 def missing(view: View, d: Snapshot) -> None:
     """Draw the ranked missing effects."""
     title("What is missing")
-    rows = suspects(d.diagnosis)
+    rows = shown_suspects(d.diagnosis) if d.diagnosis.significant else []
     if not rows:
-        ui.label(NONE_PASSES).classes("soft")
+        soft(NONE_PASSES)
     else:
-        columns = [
-            {"name": "effect", "label": "effect", "field": "effect", "align": "left"},
-            {"name": "share", "label": "explains", "field": "share"},
-            {"name": "left_out", "label": "left out", "field": "left_out"},
-            {"name": "p", "label": "p-value", "field": "p"},
-        ]
-        table = ui.table(
-            columns=columns,
-            rows=[
-                {
-                    "effect": s.effect,
-                    "share": numbers.percent(s.share),
-                    "left_out": numbers.percent(max(s.holdout_share, 0.0)),
-                    "p": numbers.chance(s.score.p_value),
-                }
-                for s in rows
-            ],
-            row_key="effect",
-            selection="single",
-        )
-        table.props("flat dense hide-selected-banner data-part=missing")
-        table.classes("choice").style("width: 100%")
-        table.selected = [row for row in table.rows if row["effect"] == view.tab.suspect]
+        found = suspects_table(d.diagnosis)  # what it is inseparable from is said below
+        found = replace(found, heads=found.heads[:4], rows=[row[:4] for row in found.rows])
+        table = drawn(found, selection="single")
+        table.props("hide-selected-banner data-part=missing").classes("choice")
+        table.selected = [row for row in table.rows if row["0"] == view.tab.suspect]
 
         def clicked(e: GenericEventArguments) -> None:
             row = e.args[1]
             table.selected = [row]
-            view.choose(row["effect"])
+            view.choose(row["0"])
 
         table.on("row-click", clicked)
 
         def ticked(e: TableSelectionEventArguments) -> None:
             for row in e.selection:
-                view.choose(row["effect"])
+                view.choose(row["0"])
 
         table.on_select(ticked)
         same = rows[0].same_as if rows[0].passes else ()
         if same:
-            ui.label(
-                f"These readings do not separate {rows[0].effect} from {numbers.few(same)}."
-            ).classes("soft")
-        ui.label(
-            "explains: share of the misfit that adding it would remove; left out: the same on "
-            "poses left out; p-value: chance of that much if it were not there."
-        ).classes("soft")
+            soft(f"These readings do not separate {rows[0].effect} from {numbers.few(same)}.")
+        soft(
+            "explains: share of the misfit that adding it would remove; p-value: chance of that "
+            "much if it were not there."
+        )
     others = [s.effect for s in d.diagnosis.suspects]
     view.adder = None
     if not others:
@@ -224,22 +213,15 @@ def missing(view: View, d: Snapshot) -> None:
         ).props("dense outlined options-dense").style("width: 100%")
 
 
-def suspects(d: Diagnosis) -> list[Suspect]:
-    """Return the suspects that chance alone does not explain, as the commands list them."""
-    if not d.significant:
-        return []
-    return [s for s in d.suspects if s.passes or s.score.p_value < CERTAIN][:SUSPECTS]
-
-
 def evidence(view: View, d: Snapshot) -> None:
     """Draw the evidence of the chosen suspect."""
     effect = view.tab.suspect
     title("The evidence" if effect is None else f"The evidence for {effect}")
     if effect is None:
-        ui.label("Choose an effect above to see what the readings say of it.").classes("soft")
+        soft("Choose an effect above to see what the readings say of it.")
         return
     with ui.column().style("width: 100%; gap: 8px") as place:
-        ui.label("…").classes("soft")
+        soft("…")
 
     async def draw() -> None:
         found = await run.io_bound(view.session.evidence, d, effect)
@@ -248,7 +230,7 @@ def evidence(view: View, d: Snapshot) -> None:
         place.clear()
         with place:
             if found is None:
-                ui.label("These readings say nothing of it.").classes("soft")
+                soft("These readings say nothing of it.")
             else:
                 chart(view, added_variable(found, effect)).props("data-part=evidence")
 
@@ -271,9 +253,7 @@ def readings(view: View, d: Snapshot) -> None:
     shown.on("plotly_click", lambda e: view.pick_pose(int(point(e).get("customdata", -1))))
     picked = view.tab.picked
     if picked is None:
-        ui.label("Click a point: the readings of its pose, and what sets them apart.").classes(
-            "soft"
-        )
+        soft("Click a point: the readings of its pose, and what sets them apart.")
         return
     ui.label(f"{view.tab.told}:").style("font-weight: 500")
     differences = [x for x in view.session.differences(d, np.array(picked)) if x.clear]
@@ -290,24 +270,13 @@ def picked_table(d: Snapshot, picked: list[int]) -> None:
     """Draw the picked readings, the furthest off first."""
     sigma, size = d.revision.sigma, d.revision.size_m
     order = sorted(picked, key=lambda k: -sigma[k])[:FURTHEST]
-    rows = [
-        {
-            "at": k,
-            "pose": d.story.pose_name(k),
-            "load": "unloaded" if d.story.load_names[k] == UNLOADED else d.story.load_names[k],
-            "error": numbers.length(float(size[k])),
-            "sigma": f"{sigma[k]:.1f} σ",
-        }
-        for k in order
-    ]
-    columns = [
-        {"name": n, "label": n.replace("sigma", "in noise"), "field": n, "align": "left"}
-        for n in ("pose", "load", "error", "sigma")
-    ]
-    table = ui.table(columns=columns, rows=rows, row_key="at").props("flat dense data-part=picked")
-    table.style("width: 100%")
+    told = block("pose", "load", "error", "in noise", left=(0, 1, 2, 3))
+    for k in order:
+        size_of, load = numbers.length(float(size[k])), load_name(d.story.load_names[k])
+        told.add(d.story.pose_name(k), load, size_of, f"{sigma[k]:.1f} σ")
+    drawn(told).props("data-part=picked")
     if len(picked) > len(order):
-        ui.label(f"and {len(picked) - len(order)} more").classes("soft")
+        soft(f"and {len(picked) - len(order)} more")
 
 
 def difference(x: Difference) -> str:
@@ -338,13 +307,13 @@ def revisions(view: View, d: Snapshot) -> None:
     """Draw all revisions, each with the way back to it."""
     title("Revisions")
     if not d.records:
-        ui.label("None yet: the baseline is kept when something is added to it.").classes("soft")
+        soft("None yet: the baseline is kept when something is added to it.")
     for record in reversed(d.records):
         one_revision(view, d, record)
     if d.accepted is not None:
-        ui.label(f"Revision {d.accepted} is accepted: every command uses it.").classes("soft")
+        soft(f"Revision {d.accepted} is accepted: every command uses it.")
     answer(view, "revisions")
-    ui.label("Revisions are only appended: nothing that was tried is lost.").classes("soft")
+    soft("Revisions are only appended: nothing that was tried is lost.")
 
 
 def one_revision(view: View, d: Snapshot, r: RevisionRecord) -> None:
@@ -356,7 +325,7 @@ def one_revision(view: View, d: Snapshot, r: RevisionRecord) -> None:
         with ui.column().style("gap: 0"):
             ui.label(f"{r.number}: {model_words(r)}").style("font-weight: 500")
             said = [f"{numbers.length(left_out_m(r))} on poses left out", verdict_of(r), *marks]
-            ui.label(" · ".join(said)).classes("soft")
+            soft(" · ".join(said))
         if r.number != d.number:
             button(view, "Look", lambda: view.show(r.number), "flat dense")
         if r.number not in (d.number, d.in_use) or d.number != d.in_use:
@@ -368,9 +337,7 @@ def side_by_side(view: View, d: Snapshot) -> None:
     """Draw two revisions side by side."""
     title("Two revisions side by side")
     if len(d.records) < 2:
-        ui.label("There are two to compare once something was added, removed or changed.").classes(
-            "soft"
-        )
+        soft("There are two to compare once something was added, removed or changed.")
         return
     by_number = {r.number: r for r in d.records}
     shown = d.number or d.records[-1].number
@@ -387,42 +354,28 @@ def side_by_side(view: View, d: Snapshot) -> None:
         view.tab.pair = first, second = chosen[0].value, chosen[1].value
         place.clear()
         with place:
-            pair_table(by_number[first], by_number[second])
+            drawn(two_revisions(by_number[first], by_number[second])).props("wrap-cells")
 
     for one in chosen:
         one.on_value_change(draw)
     if {first, second} <= by_number.keys():
         with place:
-            pair_table(by_number[first], by_number[second])
-
-
-def pair_table(a: RevisionRecord, b: RevisionRecord) -> None:
-    """Draw what two revisions say of each thing."""
-    columns = [
-        {"name": n, "label": label, "field": n, "align": "left"}
-        for n, label in (
-            *(("what", ""), ("first", f"revision {a.number}")),
-            *(("second", f"revision {b.number}"), ("difference", "difference")),
-        )
-    ]
-    rows = [asdict(row) for row in two_revisions(a, b)]
-    table = ui.table(columns=columns, rows=rows, row_key="what").props("flat dense wrap-cells")
-    table.style("width: 100%")
+            drawn(two_revisions(by_number[first], by_number[second])).props("wrap-cells")
 
 
 def compared(view: View, d: Snapshot) -> None:
     """Draw what was measured against what is predicted."""
     title("Model and measurement")
-    ui.label(misses(d.fit)).classes("soft")
+    soft(misses(d.fit))
     chart(view, measured_predicted(d.story, d.revision))
 
 
-def laws(view: View, d: Snapshot) -> None:
+def laws(view: View, found: tuple[DependenceCurve, ...]) -> None:
     """Draw the laws of the model that the catalogue does not have."""
     title("Laws beyond the catalogue")
-    for one in d.revision.laws:
+    for one in found:
         told = "; ".join(f"{what}: {said}" for what, said in one.facts)
-        ui.label(f"{one.title}: {told}").classes("soft")
+        soft(f"{one.title}: {told}")
         chart(view, curve_chart(one)).props("data-part=law")
 
 
@@ -441,14 +394,14 @@ def viewer(view: View) -> None:
 def cell(view: View, d: Snapshot) -> None:
     """Draw what can be changed in the cell; what is typed stays until it is used."""
     title("Noise and cell")
-    ui.label(
+    soft(
         "Change values, written as in CELL.toml; an empty field leaves the key out. The shown "
         "model is then fitted anew, as a revision; what was measured stays as it is."
-    ).classes("soft")
-    ui.label(f"Now: {d.covariance}.").classes("soft")
+    )
+    soft(f"Now: {d.covariance}.")
     for why in dict.fromkeys(f.fixed for f in d.figures if f.fixed):
         keys = [f.key for f in d.figures if f.fixed == why]
-        ui.label(f"Not to be changed here: {', '.join(keys)}: {why}.").classes("soft")
+        soft(f"Not to be changed here: {', '.join(keys)}: {why}.")
     with ui.element("div").classes("figures").props("data-part=cell"):
         for f in d.figures:
             if not f.fixed:
@@ -472,10 +425,10 @@ def figure_field(view: View, f: Figure) -> None:
 def downloads(view: View, d: Snapshot) -> None:
     """Draw what can be had as a file."""
     title("Downloads")
-    ui.label(
+    soft(
         f"Of {'the baseline' if d.number is None else f'revision {d.number}'}: the story as one "
         "page, the calibration for hilcal compensate, and the readings as an exchange table."
-    ).classes("soft")
+    )
     with ui.row().style("gap: 8px"):
         for kind, name in DOWNLOADS.items():
             button(view, name, partial(view.download, kind), "outline")

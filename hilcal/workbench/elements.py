@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import plotly.graph_objects as go
 from nicegui import ui
@@ -12,6 +12,7 @@ from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
 from hilcal.present.charts import style
+from hilcal.present.document import Table
 from hilcal.workbench.work import Work
 
 if TYPE_CHECKING:
@@ -60,6 +61,25 @@ def number(what: str, value: str) -> None:
 def title(words: str) -> None:
     """Draw the title of a part."""
     ui.html(f"<h2>{plain(words)}</h2>", sanitize=False)
+
+
+def soft(words: str) -> ui.label:
+    """Draw words that explain."""
+    return ui.label(words).classes("soft")
+
+
+def drawn(of: Table, selection: Literal["single"] | None = None) -> ui.table:
+    """Draw a table of a document; a row has its cells by the number of the column."""
+    sides = {k: "left" if k in of.left else "right" for k in range(len(of.heads))}
+    columns = [
+        {"name": str(k), "label": head, "field": str(k), "align": sides[k]}
+        for k, head in enumerate(of.heads)
+    ]
+    rows = [
+        {"at": i, **{str(k): cell for k, cell in enumerate(row)}} for i, row in enumerate(of.rows)
+    ]
+    made = ui.table(columns=columns, rows=rows, row_key="at", selection=selection)
+    return made.props("flat dense").style("width: 100%")
 
 
 def button(view: View, words: str, act: Callable[[], object], props: str) -> ui.button:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from nicegui import ui
 
 from hilcal.present.plan import power_rows, powers_summary
-from hilcal.workbench.elements import answer, button, title
+from hilcal.workbench.elements import answer, button, soft, title
 from hilcal.workbench.session import WorkbenchSession
 from hilcal.workbench.snapshot import Snapshot
 
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 def next_measurement(view: View, d: Snapshot) -> None:
     """Draw what asks for the next measurement."""
     title("Measure next")
-    ui.label("Plan the poses and loads that tell apart what these readings leave open.").classes(
-        "soft"
-    )
+    soft("Plan the poses and loads that tell apart what these readings leave open.")
     stem = view.session.path.stem
     with ui.row().classes("items-center").style("gap: 12px; width: 100%"):
         poses = ui.number("poses (as needed)", min=1, precision=0).props("dense outlined")
@@ -46,9 +44,7 @@ def planned(session: WorkbenchSession) -> None:
         "data-part=planned"
     )
     for effect, rival, now, then in power_rows(found.found.powers):
-        ui.label(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.").classes(
-            "soft"
-        )
+        soft(f"If {effect} is there, {rival} is ruled out: {now} now, {then} then.")
     ui.label(f"The plan is in {path.name}. Measure it into the same campaign with:")
     ui.label(session.run_line()).classes("code")
-    ui.label("Then read the file again here.").classes("soft")
+    soft("Then read the file again here.")

@@ -8,7 +8,7 @@ import pytest
 from playwright.sync_api import CDPSession
 
 from hilcal.present.charts.readings import MOST
-from hilcal.present.html.content import ReportContent
+from hilcal.present.html.certificate import ReportContent
 from hilcal.present.html.sections import page as page_of
 from tests.benchmarks.conftest import Claim
 from tests.support.browser import DESKTOP, needs_chromium, open_browser

@@ -317,8 +317,10 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
     "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
-    "present/html/certificate": {"report --limit": f"{RARE}the_page_says_how_to_be_judged"},
-    "present/html/first_screen": {"--scaling gc": f"{RARE}the_page_says_how_to_be_judged"},
+    "present/html/certificate": {
+        "report --limit": f"{RARE}the_page_says_how_to_be_judged",
+        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged",
+    },
     "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
     "present/html/sections": {
         "hilcal report --appendix": f"{HERE}what_a_report_names",

@@ -177,12 +177,13 @@ def test_what_a_recording_names(run: Path, tmp_path: Path, capsys: Capsys) -> No
     ok(capsys, "identify", run, "--scaling", "gu")
     with Campaign.open(run) as o:
         assert (
-            build_story(o.chapters()).revisions[-1].message == "run hilcal diagnose for a verdict"
+            "run hilcal diagnose for a verdict"
+            in build_story(o.chapters()).revisions[-1].panels["verdict"][0]
         )
     ok(capsys, "identify", run)
     ok(capsys, "diagnose", run)
     with Campaign.open(run) as o:
-        assert "run hilcal" not in build_story(o.chapters()).revisions[-1].message
+        assert "run hilcal" not in build_story(o.chapters()).revisions[-1].panels["verdict"][0]
     assert "hysteresis" in ok(capsys, "refine", run).out
     ok(capsys, "view", run, "--record", tmp_path / "run.rrd")
 

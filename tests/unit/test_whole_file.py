@@ -18,7 +18,7 @@ STRAIGHT = {
     "hilcal/doctor/computer.py": "a file in a temporary folder",
     "hilcal/workbench/server.py": "a file in a temporary folder",
     "hilcal/cli/__init__.py": "the null device",
-    "hilcal/present/live_process.py": "a pipe",
+    "hilcal/present/live_viewer.py": "a pipe",
     "hilcal/tables/matfile.py": "a buffer in memory",
     "hilcal/present/viewer/live.py": "a recording that grows while it is looked at",
     "hilcal/store/schema.py": "SQLite has a journal of its own",

@@ -35,7 +35,7 @@ URL = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
 def live_process(run: Run) -> psutil.Process:
     """The process that serves and records."""
     children = psutil.Process(run.process.pid).children(recursive=True)
-    return next(p for p in children if "hilcal.present.live_process" in p.cmdline())
+    return next(p for p in children if "hilcal.present.live_viewer" in p.cmdline())
 
 
 def drawn(recording: Path) -> int:

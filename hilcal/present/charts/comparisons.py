@@ -1,5 +1,6 @@
-"""Charts that compare: revisions of a model, two campaigns of an arm, arms of a type."""
+"""Charts that compare: revisions, two campaigns of an arm, arms of a type, families of effects."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -7,47 +8,39 @@ import plotly.graph_objects as go
 
 from hilcal import numbers
 from hilcal.diagnosis.comparison import Comparison
+from hilcal.identification.family_sizes import FamilySize
 from hilcal.present.charts import style
 from hilcal.present.comparison import words_of
 from hilcal.present.fleet import FAR
-from hilcal.present.story import Story, StoryRevision
-from hilcal.store.plan import UNLOADED
+from hilcal.present.plan import load_name
+from hilcal.present.story import Story
 
 if TYPE_CHECKING:
     from hilcal.transfer.pooled import Pooled
 
-SERIES = (
-    ("error", "fitted poses", style.MEASURED),
-    ("holdout", "poses left out", style.HOLDOUT),
-)
+MOST = 16
+"""Families that are drawn, those that move the target most."""
 
 
 def error_per_revision(story: Story) -> go.Figure:
     """Draw the rms error of each revision, the first on top, and what noise alone would leave."""
-    first, *later = story.revisions
-    names = [label(r, k == 0) for k, r in enumerate(story.revisions)]
+    told = story.revisions
+    names = [
+        style.label(f"{r.revision}: {(r.change if k else '') or 'start'}")
+        for k, r in enumerate(told)
+    ]
     traces: list[object] = []
-    for key, name, color in SERIES:
-        rms = [1e6 * float(getattr(r, key).rms_m) for r in story.revisions]
-        traces.append(
-            go.Bar(
-                x=rms,
-                y=names,
-                orientation="h",
-                name=name,
-                marker={"color": color},
-                text=[numbers.digits(v) for v in rms],
-                textposition="auto",
-                hovertemplate="%{y}: %{text} µm, " + name + "<extra></extra>",
-            )
-        )
+    for key, name, color in (
+        ("error", "fitted poses", style.MEASURED),
+        ("holdout", "poses left out", style.HOLDOUT),
+    ):
+        rms = [1e6 * float(getattr(r, key).rms_m) for r in told]
+        template = "%{y}: %{text} µm, " + name + "<extra></extra>"
+        text = [numbers.digits(v) for v in rms]
+        traces.append(style.bar(rms, names, color, text, name=name, hovertemplate=template))
     floor = 1e6 * story.noise_floor_m
-    out = style.figure(
-        _words(story, first, later),
-        x="error, rms [µm]",
-        traces=traces,
-        height=130 + 26 * len(names),
-    )
+    says = _fell(story)
+    out = style.figure(says, x="error, rms [µm]", traces=traces, height=130 + 26 * len(names))
     line = {"color": style.NOISE, "dash": "dash", "width": 2}
     out.add_vline(floor, line=line, layer="below")
     # for the legend alone: a shape has no entry there
@@ -58,26 +51,17 @@ def error_per_revision(story: Story) -> go.Figure:
     return out
 
 
-def label(revision: StoryRevision, first: bool) -> str:
-    """Return the name of a revision on the axis: what it changed."""
-    change = "" if first else revision.change
-    return style.label(f"{revision.revision}: {change or 'start'}")
-
-
-def _words(story: Story, first: StoryRevision, later: list[StoryRevision]) -> str:
+def _fell(story: Story) -> str:
+    first, last = story.revisions[0], story.revisions[-1]
     floor = f"noise alone would leave {numbers.length(story.noise_floor_m)}."
-    before = numbers.length(first.holdout.rms_m)
-    if not later:
+    before, after = (numbers.length(r.holdout.rms_m) for r in (first, last))
+    if first is last:
         return f"One revision: {before} rms error on poses left out; {floor}"
-    after = numbers.length(later[-1].holdout.rms_m)
-    fitted = (
-        numbers.length(first.error.rms_m),
-        numbers.length(later[-1].error.rms_m),
-    )
-    went = "fell" if later[-1].holdout.rms_m < first.holdout.rms_m else "went"
+    fitted = " to ".join(numbers.length(r.error.rms_m) for r in (first, last))
+    went = "fell" if last.holdout.rms_m < first.holdout.rms_m else "went"
     return (
-        f"The rms error {went} from {before} to {after} on poses left out, and from {fitted[0]} to "
-        f"{fitted[1]} on the fitted ones, over {len(story.revisions)} revisions; {floor}"
+        f"The rms error {went} from {before} to {after} on poses left out, and from {fitted} on "
+        f"the fitted ones, over {len(story.revisions)} revisions; {floor}"
     )
 
 
@@ -88,18 +72,16 @@ def error_by_pose(c: Comparison) -> go.Figure:
     error = 1e6 * np.linalg.norm(found.raw[:, :3], axis=1)
     stated = 1e6 * c.today.beyond.stated_m
     names = [r.pose_names[k] for k in r.pose[rows]]
-    loads = ["unloaded" if n == UNLOADED else n for n in (r.load_names[k] for k in r.load[rows])]
-    poses = [style.label(n) for n in names]
+    loads = [load_name(r.load_names[k]) for k in r.load[rows]]
     hover = [
         style.label(f"{n}, {load}: {e:.0f} µm, stated {s:.0f} µm")
         for n, load, e, s in zip(names, loads, error, stated, strict=True)
     ]
+    poses, told = [style.label(n) for n in names], {"hovertext": hover, "hoverinfo": "text"}
+    states = "standard deviation that the calibration states"
     traces = [
-        style.marks(poses, values, color, symbol, 7, name=name, hovertext=hover, hoverinfo="text")
-        for values, name, color, symbol in (
-            (error, "error today", style.MEASURED, "circle"),
-            (stated, "standard deviation that the calibration states", style.NOISE, "line-ew-open"),
-        )
+        style.marks(poses, error, style.MEASURED, "circle", 7, name="error today", **told),
+        style.marks(poses, stated, style.NOISE, "line-ew-open", 7, name=states, **told),
     ]
     worst = int(np.argmax(error))
     says = (
@@ -125,8 +107,8 @@ def arms_chart(t: "Pooled") -> go.Figure:
     """Draw each arm's parameters by their distance from the type, over what most arms have."""
     names, off = [p.parameter for p in t.parameters], t.distance
     odd = {(o.arm, o.parameter) for o in t.odd if not o.campaign}
-    told = [
-        (off[a, k], n, arm, (arm, n) in odd)
+    of = [
+        (off[a, k], style.label(n), style.label(f"{arm}, {n}: {off[a, k]:+.1f} σ"), (arm, n) in odd)
         for k, n in enumerate(names)
         for a, arm in enumerate(t.arms)
         if np.isfinite(off[a, k])
@@ -136,29 +118,70 @@ def arms_chart(t: "Pooled") -> go.Figure:
         (False, "like its type", style.MEASURED, "circle"),
         (True, "unlike its type", style.RED, "x"),
     ):
-        if chosen := [one for one in told if one[-1] == unlike]:
-            at, names_of = np.array([x for x, *_ in chosen]), [n for _, n, *_ in chosen]
-            hover = [style.label(f"{arm}, {n}: {x:+.1f} σ") for x, n, arm, _ in chosen]
-            drawn = (at, [style.label(n) for n in names_of], color, symbol, 9)
-            traces.append(
-                style.marks(*drawn, name=name, opacity=0.8, hovertext=hover, hoverinfo="text")
-            )
+        if chosen := [one for one in of if one[-1] == unlike]:
+            x, y, hover, _ = zip(*chosen, strict=True)
+            more = {"name": name, "opacity": 0.8, "hovertext": hover, "hoverinfo": "text"}
+            traces.append(style.marks(np.array(x), list(y), color, symbol, 9, **more))
     arms = sorted({arm for arm, _ in odd})
-    says = (
-        f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."
-        if arms
-        else f"The {len(t.arms)} arms of the type are alike within what they scatter by."
-    )
+    says = f"The {len(t.arms)} arms of the type are alike within what they scatter by."
+    if arms:
+        says = (
+            f"{', '.join(arms)} {'is' if len(arms) == 1 else 'are'} unlike the others of the type."
+        )
+    band = {"type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper"}
+    look = {"fillcolor": style.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below"}
     return style.figure(
         says,
         x="distance from the mean of the type [σ]",
         height=140 + 24 * len(names),
         traces=traces,
         yaxis={"autorange": "reversed", "title": {"text": ""}},
-        shapes=[
-            {
-                "type": "rect", "x0": -FAR, "x1": FAR, "y0": 0, "y1": 1, "yref": "paper",
-                "fillcolor": style.NOISE, "opacity": 0.12, "line": {"width": 0}, "layer": "below",
-            }
-        ],
-    )  # fmt: skip
+        shapes=[{**band, **look}],
+    )
+
+
+def made_of(sizes: Sequence[FamilySize]) -> go.Figure:
+    """Draw the size of each family by that of an ordinary arm, over its 95 % interval."""
+    shown = sizes[:MOST]
+    traces = []
+    for named, words, color, symbol in (
+        (True, "named", style.MEASURED, "circle"),
+        (False, "predicted with, not named", style.GREY, "diamond"),
+    ):
+        own = [s for s in shown if s.named == named]
+        if not own:
+            continue
+        low, at, high = np.array([(s.low, s.std, s.high) for s in own]).T / [
+            s.ordinary for s in own
+        ]
+        error = {"type": "data", "symmetric": False, "array": high - at, "arrayminus": at - low}
+        told = {"hovertext": [style.label(_size(s)) for s in own], "hoverinfo": "text"}
+        error_x = {**error, "color": color}
+        families = [style.label(s.name) for s in own]
+        traces.append(
+            style.marks(at, families, color, symbol, 9, name=words, error_x=error_x, **told)
+        )
+    first = shown[0]
+    says = (
+        f"{first.name} moves the target most, by {numbers.length(first.moves_m)} rms. Sizes are "
+        "standard deviations of the parameters, with 95 % intervals; 1 is an ordinary arm, and "
+        "[k] of waves are those from 2^k times a turn on."
+    )
+    if len(shown) < len(sizes):
+        says += f" The {len(shown)} of {len(sizes)} families are drawn that move the target most."
+    ordinary = {"type": "line", "x0": 1, "x1": 1, "y0": 0, "y1": 1, "yref": "paper"}
+    order = [style.label(s.name) for s in reversed(shown)]
+    return style.figure(
+        says,
+        height=130 + 22 * len(shown),
+        traces=traces,
+        # 1, 2 and 5 of each decade
+        xaxis={"type": "log", "dtick": "D2", "title": {"text": "size, by that of an ordinary arm"}},
+        yaxis={"categoryorder": "array", "categoryarray": order, "title": {"text": ""}},
+        shapes=[{**ordinary, "line": {"color": style.NOISE, "width": 1, "dash": "dash"}}],
+    )
+
+
+def _size(s: FamilySize) -> str:
+    low, std, high = (numbers.sizes([(s.unit, v)]) for v in (s.low, s.std, s.high))
+    return f"{s.name}: {std} ({low} to {high}), moves the target by {numbers.length(s.moves_m)} rms"

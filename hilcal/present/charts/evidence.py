@@ -25,14 +25,9 @@ def added_variable(r: DependenceCurve, effect: str) -> go.Figure:
     at = worst_and_even(np.abs(r.y), MOST_POINTS)
     ends = np.array([r.x.min(), r.x.max()])
     slope = float(r.x @ r.y / max(float(r.x @ r.x), 1e-300))
+    told = "would explain %{x:.1f}, residual %{y:.1f}<extra></extra>"
     traces = [
-        style.marks(
-            r.x[at],
-            r.y[at],
-            name="readings",
-            size=5,
-            hovertemplate="would explain %{x:.1f}, residual %{y:.1f}<extra></extra>",
-        ),
+        style.marks(r.x[at], r.y[at], name="readings", size=5, hovertemplate=told),
         style.line(ends, ends, "if it is right: slope 1", dash="dash"),
         style.line(ends, slope * ends, f"found: slope {slope:.2f}", style.RED),
     ]
@@ -52,12 +47,8 @@ def misfit_shares(d: Diagnosis) -> go.Figure:
     rows = [v for v in d.misfit_breakdown if v.share >= LEAST_SHARE][:MOST_VARIABLES]
     if not rows:
         return style.empty("The misfit follows no recorded variable.")
-    shares = [100 * v.share for v in rows]
-    names = [v.variable for v in rows]
-    hover = [
-        f"{n}: {s:.0f} %, {numbers.p_equals(v.p_value)}"
-        for n, s, v in zip(names, shares, rows, strict=True)
-    ]
+    shares, names = [100 * v.share for v in rows], [v.variable for v in rows]
+    hover = [f"{v.variable}: {100 * v.share:.0f} %, {numbers.p_equals(v.p_value)}" for v in rows]
     colors = [style.MEASURED if v.p_value < CERTAIN else style.GREY for v in rows]
     says = f"{follows(d.misfit_breakdown)} Grey bars are within chance."
     return style.bars(names, shares, hover, says, "share of the misfit [%]", colors)
@@ -148,32 +139,22 @@ def noise_check(fit: Fit) -> go.Figure:
     centres = 0.5 * (edges[1:] + edges[:-1])
     expected = np.sqrt(min(fit.dof / max(len(white), 1), 1.0))
     fine = np.linspace(-reach, reach, 401)
+    look = {"width": 0.9 * width, "name": "measured", "marker": {"color": style.MEASURED}}
+    told = "%{x:.2f} σ: %{y} elements<extra></extra>"
+    density = len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9))
     traces = [
-        go.Bar(
-            x=centres,
-            y=counts,
-            width=0.9 * width,
-            name="measured",
-            marker={"color": style.MEASURED},
-            hovertemplate="%{x:.2f} σ: %{y} elements<extra></extra>",
-        ),
-        style.line(
-            fine,
-            len(white) * width * norm.pdf(fine, scale=max(expected, 1e-9)),
-            "the stated noise",
-        ),
+        go.Bar(x=centres, y=counts, hovertemplate=told, **look),
+        style.line(fine, density, "the stated noise"),
     ]
     low, high = fit.variance_factor_interval
     factor = fit.variance_factor
-    fits = "the stated noise explains the residual" if low <= 1 <= high else (
-        "the residual is larger than the stated noise" if factor > 1 else
-        "the residual is smaller than the stated noise"
-    )  # fmt: skip
+    fits = f"the residual is {'larger' if factor > 1 else 'smaller'} than the stated noise"
+    if low <= 1 <= high:
+        fits = "the stated noise explains the residual"
     beyond = int(np.sum(np.abs(white) > RANGE))
     says = (
         f"Variance factor {factor:.2f}, 95 % interval {low:.2f} to {high:.2f}: {fits}. "
         f"{beyond} of {len(white)} elements are beyond {RANGE:.0f} σ."
     )
-    return style.figure(
-        says, x="whitened residual [σ]", y="number of elements", traces=traces, height=320
-    )
+    titles = {"x": "whitened residual [σ]", "y": "number of elements"}
+    return style.figure(says, **titles, traces=traces, height=320)

@@ -9,6 +9,7 @@ import plotly.graph_objects as go
 
 from hilcal import numbers
 from hilcal.present.charts import style
+from hilcal.present.plan import load_name
 from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, worst_and_even
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
@@ -19,13 +20,7 @@ MOST = 1500
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChartReadings:
-    """The readings that a chart draws of one revision.
-
-    Attributes:
-        story: N readings.
-        revision: of the model.
-        index: (K,) readings, growing.
-    """
+    """The readings that a chart draws of a revision of a story: `index` (K,), growing."""
 
     story: Story
     revision: StoryRevision
@@ -71,8 +66,7 @@ def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadi
 
 def place(story: Story, i: int) -> str:
     """Return pose and load of a reading, and its target where there are several."""
-    load = story.load_names[i]
-    words = f"{story.pose_name(i)}, {'unloaded' if load == UNLOADED else load}"
+    words = f"{story.pose_name(i)}, {load_name(story.load_names[i])}"
     if story.target is not None and len(story.target_names) > 1:
         words += f", {story.target_names[int(story.target[i])]}"
     return style.label(words)
@@ -105,7 +99,7 @@ def residual_by_load(story: Story, revision: StoryRevision) -> go.Figure:
     # beside each other within a load, so that points do not hide each other
     beside = np.random.default_rng(0).uniform(-0.3, 0.3, len(of))
     out = chart(d, (of + beside)[d.index], "load", _by(story, revision, "load"))
-    names = ["unloaded" if name == UNLOADED else style.label(name) for name in loads]
+    names = [style.label(load_name(name)) for name in loads]
     out.update_xaxes(tickvals=list(range(len(names))), ticktext=names)
     return out
 
@@ -115,12 +109,7 @@ def residual_over(
 ) -> go.Figure:
     """Draw the residual of each reading in σ over a variable.
 
-    Args:
-        story: N readings.
-        revision: of the model.
-        values: (N,) of the variable, in units for people; NaN where it is not known.
-        name: of the variable.
-        unit: of the values; "" for a pure number.
+    `values` (N,) are in units for people, NaN where not known; `unit` is "" for a pure number.
     """
     d = drawn(story, revision)
     known = np.isfinite(values)
@@ -145,22 +134,18 @@ def residual_by_time(story: Story, revision: StoryRevision) -> go.Figure:
     return residual_over(story, revision, minutes, "time since the first reading", "min")
 
 
-def worst_of(names: Sequence[str], sigma: Floats) -> list[tuple[str, float, int]]:
-    """Return (name, rms σ, readings) of each name, the worst first."""
-    found = {name: k for k, name in enumerate(dict.fromkeys(names))}
-    which = np.array([found[name] for name in names])
-    count = np.bincount(which)
-    rms = np.sqrt(np.bincount(which, sigma**2) / count)
-    rows = zip(found, rms.tolist(), count.tolist(), strict=True)
-    return sorted(rows, key=lambda row: -row[1])
+def worst_of(names: Sequence[str], sigma: Floats) -> list[tuple[str, float]]:
+    """Return (name, rms σ) of each name, the worst first."""
+    found, which = np.unique(names, return_inverse=True)
+    rms = np.sqrt(np.bincount(which, sigma**2) / np.bincount(which))
+    return sorted(zip(found.tolist(), rms.tolist(), strict=True), key=lambda row: -row[1])
 
 
 def _by(story: Story, revision: StoryRevision, what: str) -> str:
-    names = story.load_names
+    names: Sequence[str] = story.load_names
     if what == "pose":
-        names = tuple(story.pose_name(i) for i in range(len(story)))
-    sigma = revision.sigma / 3**0.5
-    (name, rms, _), *rest = worst_of(names, sigma)
+        names = [story.pose_name(i) for i in range(len(story))]
+    (name, rms), *rest = worst_of(names, revision.sigma / 3**0.5)
     name = "the unloaded readings" if name == UNLOADED else f"{what} {name}"
     if not rest:
         return f"All readings are of {name}: {rms:.2g} times the noise rms."
@@ -200,9 +185,6 @@ def chart(d: ChartReadings, x: Floats, title: str, words: str) -> go.Figure:
     return out
 
 
-AXES = ("x", "y", "z")
-
-
 def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     """Draw what was measured over what is predicted, along the three base axes.
 
@@ -215,19 +197,13 @@ def measured_predicted(story: Story, revision: StoryRevision) -> go.Figure:
     x = 1e6 * (revision.predicted - offset)
     ends = np.array([min(x.min(), y.min()), max(x.max(), y.max())])
     traces: list[object] = [style.line(ends, ends, "exact", dash="dash")]
-    at = d.index
-    for k, axis in enumerate(AXES):
-        traces.append(
-            style.marks(
-                x[at, k],
-                y[at, k],
-                *((style.MEASURED, style.HOLDOUT, style.AMBER)[k], style.SYMBOLS[k]),
-                name=f"base {axis}",
-                text=d.named(),
-                hovertemplate=f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} "
-                "µm<extra></extra>",
-            )
-        )  # fmt: skip
+    colors = (style.MEASURED, style.HOLDOUT, style.AMBER)
+    for k, (axis, color) in enumerate(zip("xyz", colors, strict=True)):
+        told = (
+            f"%{{text}}<br>{axis}: measured %{{y:.1f}} µm, predicted %{{x:.1f}} µm<extra></extra>"
+        )
+        at, text = (x[d.index, k], y[d.index, k], color, style.SYMBOLS[k]), d.named()
+        traces.append(style.marks(*at, name=f"base {axis}", text=text, hovertemplate=told))
     what = "deflection" if story.mode == "deflection" else "deviation from the nominal arm"
     total = np.sum((y - y.mean(axis=0)) ** 2)
     left = np.sum((y - x) ** 2)
@@ -252,10 +228,7 @@ def workspace(
 ) -> go.Figure:
     """Draw the target of each reading in base axes, marked by its level, with its residual.
 
-    Args:
-        story: N readings.
-        revision: of the model.
-        plane: of the base's axes; "xy" is seen from above.
+    `plane` is of the base's axes; "xy" is seen from above.
     """
     d = drawn(story, revision, most=1000)
     axes = ["xyz".index(a) for a in plane]

@@ -71,8 +71,8 @@ def figure(
 
     Args:
         says: the sentence that the chart shows.
-        x: title of the horizontal axis, with its unit.
-        y: title of the vertical axis, with its unit.
+        x: title of the horizontal axis, with its unit; `y` of the vertical one.
+        y: see x.
         height: CSS pixels; the width is that of the page.
         traces: what is drawn.
         layout: more of plotly's layout.
@@ -108,6 +108,14 @@ def marks(
     return go.Scatter(**{"x": x, "y": y, "mode": "markers", "marker": marker, **more})
 
 
+def bar(
+    values: Sequence[float], names: Sequence[str], color: object, text: Sequence[str], **more: Any
+) -> go.Bar:
+    """Return horizontal bars with a text each."""
+    look = {"orientation": "h", "textposition": "auto", "marker": {"color": color}}
+    return go.Bar(x=list(values), y=list(names), text=list(text), **look, **more)
+
+
 def bars(
     names: Sequence[str],
     values: Sequence[float],
@@ -117,19 +125,10 @@ def bars(
     colors: Sequence[str] | str = MEASURED,
 ) -> go.Figure:
     """Draw horizontal bars, the first on top."""
-    trace = go.Bar(
-        x=list(values),
-        y=[label(n) for n in names],
-        orientation="h",
-        marker={"color": colors},
-        text=[_short(v) for v in values],
-        textposition="auto",
-        hovertext=[label(h) for h in hover],
-        hoverinfo="text",
-        showlegend=False,
-    )
-    height = 90 + 28 * len(names)
-    out = figure(says, x=x, traces=[trace], height=height)
+    more = {"hovertext": [label(h) for h in hover], "hoverinfo": "text", "showlegend": False}
+    text = [_short(v) for v in values]
+    trace = bar(values, [label(n) for n in names], colors, text, **more)
+    out = figure(says, x=x, traces=[trace], height=90 + 28 * len(names))
     out.update_yaxes(autorange="reversed")
     return out
 

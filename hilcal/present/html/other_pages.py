@@ -10,6 +10,7 @@ from hilcal.present.charts.comparisons import arms_chart, changes_chart, error_b
 from hilcal.present.comparison import comparison_report, headline, next_step, sentence
 from hilcal.present.document import Block, Chart, PageSection, Words, captioned, heading, table
 from hilcal.present.fleet import closing, type_report, unlike_words
+from hilcal.present.html.certificate import identity, utc
 from hilcal.present.html.page import Card, FirstScreen, render
 
 if TYPE_CHECKING:
@@ -36,18 +37,13 @@ def comparison_page(
     charts: list[Block] = [Chart("Error today, by pose", error_by_pose(c), wide=True, height=0)]
     if c.changes.found:
         charts.append(Chart("What each change moves", changes_chart(c), wide=True, height=0))
-    rows = [(which, name, sha) for which, (name, sha) in zip(("earlier", "later"), files,
-                                                             strict=True)]  # fmt: skip
+    shas = [(which, *file) for which, file in zip(("earlier", "later"), files, strict=True)]
     provenance = (
-        table("campaign", "name", "SHA-256", rows=rows, caption="Files"),
-        table(
-            *("", ""),
-            caption="Identity of this report",
-            rows=(
-                ("Robot", arm),
-                ("Operator", operator or "not stated"),
-                ("Report made", f"{made[:19].replace('T', ' ')} UTC by hilcal {version}"),
-            ),
+        table("campaign", "name", "SHA-256", rows=shas, caption="Files"),
+        identity(
+            ("Robot", arm),
+            ("Operator", operator or "not stated"),
+            ("Report made", f"{utc(made)} UTC by hilcal {version}"),
         ),
         heading("Commands that show the same"),
         Words(f"hilcal compare {quoted(earlier)} {quoted(later)}", "code"),
@@ -57,27 +53,23 @@ def comparison_page(
         PageSection("today", "The earlier calibration today", tuple(charts)),
         PageSection("provenance", "Provenance", provenance),
     )
-    return render("Comparison of two campaigns", f"{arm}, {earlier} and {later}, {made[:10]}",
-                  comparison_screen(c, earlier), sections)  # fmt: skip
+    about = f"{arm}, {earlier} and {later}, {made[:10]}"
+    return render("Comparison of two campaigns", about, comparison_screen(c, earlier), sections)
 
 
 def comparison_screen(c: Comparison, earlier: str) -> FirstScreen:
     """Return what the first screen says."""
     found, t, told = c.changes, c.today, headline(c)
     error = t.prediction.error
-    worse = t.p_value < LEVEL
+    beyond = "more" if t.p_value < LEVEL else "no more"
     good = (
         f"The calibration of {earlier} is off by {numbers.length(error.rms_m)} rms today, "
-        f"{numbers.digits(t.z, 2)} times what it states: "
-        + ("more than its uncertainty." if worse else "no more than its uncertainty.")
+        f"{numbers.digits(t.z, 2)} times what it states: {beyond} than its uncertainty."
     )
     what = " ".join(sentence(x) for x in found.found) or f"{told}."
+    largest = f"rms; largest {numbers.length(error.max_m)}"
     cards = [
-        Card(
-            "Error today",
-            numbers.length(error.rms_m),
-            f"rms; largest {numbers.length(error.max_m)}",
-        ),
+        Card("Error today", numbers.length(error.rms_m), largest),
         Card("Expected", numbers.length(t.stated_m), "rms that the calibration states"),
     ]
     if t.drawing_m is not None:
@@ -107,13 +99,8 @@ def fleet_page(fleet: "Fleet", directory: str, made: str, version: str) -> str:
         sections.append(PageSection(f"type{k}", f"{t.type}: {len(t.arms)} arms", drawn + told))
     rows = [(m.name, m.arm, m.date[:10], m.verdict, numbers.length(m.rms_m)) for m in fleet.members]
     heads = ("campaign", "arm", "date", "verdict", "rms on poses left out")
-    sections.append(
-        PageSection(
-            "campaigns",
-            "Campaigns",
-            (table(*heads, rows=rows, caption="Campaigns"), *closing(fleet)),
-        )
-    )
+    campaigns = table(*heads, rows=rows, caption="Campaigns")
+    sections.append(PageSection("campaigns", "Campaigns", (campaigns, *closing(fleet))))
     about = f"{directory}, {made[:10]}, hilcal {version}"
     return render("A fleet of arms", about, _fleet_screen(fleet), tuple(sections))
 
@@ -127,14 +114,12 @@ def _fleet_screen(fleet: "Fleet") -> FirstScreen:
         Card("Arms", str(sum(len(t.arms) for t in fleet.types)), "that were pooled"),
         Card("Campaigns", str(len(fleet.members)), f"used; not used: {len(fleet.failures)}"),
     )
+    todo = "Nothing; the prior serves the next arm."
+    if arms:
+        todo = "Measure these arms again, and look at these joints."
     answers = (
         ("Which arms are unlike, and by how much?", "; ".join(map(unlike_words, odd)) or "None."),
         ("What wears?", ", ".join(wear) or "No drift that the arms have in common."),
-        (
-            "What to do?",
-            "Measure these arms again, and look at these joints."
-            if arms
-            else "Nothing; the prior serves the next arm.",
-        ),
+        ("What to do?", todo),
     )
     return FirstScreen(headline, "bad" if arms else "good", answers, cards, "", None)

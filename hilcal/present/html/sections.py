@@ -10,24 +10,9 @@ from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
 from hilcal.identification.family_sizes import family_sizes
-from hilcal.identification.fit import Fit
 from hilcal.present.campaign import info_report
-from hilcal.present.charts.comparisons import error_per_revision
-from hilcal.present.charts.evidence import (
-    added_variable,
-    correlations,
-    curve_chart,
-    noise_check,
-)
-from hilcal.present.charts.made_of import made_of
-from hilcal.present.charts.readings import (
-    measured_predicted,
-    residual_by_joint,
-    residual_by_load,
-    residual_by_pose,
-    residual_by_time,
-    workspace,
-)
+from hilcal.present.charts import evidence, readings
+from hilcal.present.charts.comparisons import error_per_revision, made_of
 from hilcal.present.diagnosis import REVISION_HEADS, could_have_been_seen, doubtful, redundant_line
 from hilcal.present.document import (
     Block,
@@ -41,12 +26,10 @@ from hilcal.present.document import (
     table,
 )
 from hilcal.present.fit import background_line, parameters, remarks, scalings_table, where_table
-from hilcal.present.html.certificate import certificate
-from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import first_screen
+from hilcal.present.html.certificate import ReportContent, certificate, first_screen, utc
 from hilcal.present.html.page import render
 from hilcal.present.registration import covariance_words
-from hilcal.present.story import curve, regressor
+from hilcal.present.story import curve, laws, regressor
 from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
 from hilcal.store.command_line import COMMAND
@@ -76,22 +59,22 @@ def _where(m: ReportContent) -> PageSection:
     parts: list[Block] = [
         "Errors are those of poses left out: each is predicted by a fit to the others."
         + (" Readings set aside as gross errors are drawn, too." * bool(m.fit.outlier.any())),
-        Chart("By pose", residual_by_pose(story, last), wide=True),
-        Chart("Measured against predicted", measured_predicted(story, last)),
+        Chart("By pose", readings.residual_by_pose(story, last), wide=True),
+        Chart("Measured against predicted", readings.measured_predicted(story, last)),
     ]
     if len(set(story.load_names)) > 1:
-        parts.append(Chart("By load", residual_by_load(story, last)))
+        parts.append(Chart("By load", readings.residual_by_load(story, last)))
     if story.time_s is not None:
-        parts.append(Chart("Over time", residual_by_time(story, last)))
+        parts.append(Chart("Over time", readings.residual_by_time(story, last)))
     parts += [
-        Chart("From above", workspace(story, last, "xy")),
-        Chart("From the side", workspace(story, last, "xz")),
-        Chart("Noise check: fitted poses", noise_check(m.fit)),
+        Chart("From above", readings.workspace(story, last, "xy")),
+        Chart("From the side", readings.workspace(story, last, "xz")),
+        Chart("Noise check: fitted poses", evidence.noise_check(m.fit)),
     ]
     if d is not None:
         if d.verdict != "adequate":
             curves = [curve(v) for v in d.dependences if v.determined][:MOST_CURVES]
-            parts += [Chart(c.title, curve_chart(c)) for c in curves]
+            parts += [Chart(c.title, evidence.curve_chart(c)) for c in curves]
         told = captioned(where_table(d.misfit_breakdown), "What the error follows")
         parts += [replace(p, narrow=True) if isinstance(p, Table) else p for p in told]
     parts.append(_noise(m))
@@ -117,17 +100,19 @@ def added_variables(d: Diagnosis, of: Sequence[Suspect]) -> Iterator[Chart]:
     for s in of:
         found = regressor(d.fit, s)
         if found is not None:
-            yield Chart(f"Added variable: {s.effect}", added_variable(found, s.effect))
+            yield Chart(f"Added variable: {s.effect}", evidence.added_variable(found, s.effect))
 
 
 def _laws(m: ReportContent) -> PageSection | None:
-    found = m.story.revisions[-1].laws
+    found = laws(m.fit)
     if not found:
         return None
     parts: list[Block] = []
     for name, facts in {one.title: one.facts for one in found}.items():
         parts.append(table("", "", rows=facts, caption=f"{name}, an effect of a file"))
-    parts += [Chart(f"{one.title}: {one.y_label}", curve_chart(one)) for one in found[:MOST_LAWS]]
+    parts += [
+        Chart(f"{one.title}: {one.y_label}", evidence.curve_chart(one)) for one in found[:MOST_LAWS]
+    ]
     parts.append(
         note(
             "Each point is the mean over readings of the law's value plus what it leaves of them. "
@@ -140,22 +125,15 @@ def _laws(m: ReportContent) -> PageSection | None:
 def suspects_table(rows: Sequence[Suspect], caption: str) -> Table:
     """Return a table of suspects."""
     heads = ("effect", "explains", "on poses left out", "log evidence", "p-value", "passes")
-    return table(
-        *(*heads, "not separable from"),
-        caption=caption,
-        rows=(
-            (
-                s.effect,
-                numbers.percent(s.share),
-                numbers.percent(max(s.holdout_share, 0.0)),
-                f"{s.score.log_evidence:z.1f}",
-                numbers.chance(s.score.p_value),
-                "yes" if s.passes else "no",
-                ", ".join(s.same_as) or "-",
-            )
-            for s in rows
-        ),
+    cells = (
+        (
+            *(s.effect, numbers.percent(s.share), numbers.percent(max(s.holdout_share, 0.0))),
+            *(f"{s.score.log_evidence:z.1f}", numbers.chance(s.score.p_value)),
+            *("yes" if s.passes else "no", ", ".join(s.same_as) or "-"),
+        )
+        for s in rows
     )
+    return table(*heads, "not separable from", caption=caption, rows=cells)
 
 
 def _revisions(m: ReportContent) -> PageSection:
@@ -199,22 +177,18 @@ def _halves(t: Table) -> Iterator[Table]:
 def _noise(m: ReportContent) -> str:
     """Say what the repeats tell of the noise."""
     e = None if m.diagnosis is None else m.diagnosis.pure_error
-    if e is None:
-        return _too_few_repeats(m.fit)
-    low, high = e.interval
-    return (
-        f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance factor "
-        f"{e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of freedom)."
-    )
-
-
-def _too_few_repeats(fit: Fit) -> str:
-    """Say that repeats do not judge the noise of what was fitted."""
-    kept = fit.readings[~fit.outlier]
+    if e is not None:
+        low, high = e.interval
+        return (
+            f"Repeated readings scatter {e.factor**0.5:.2f} times as much as stated (variance "
+            f"factor {e.factor:.2f}, 95 % interval {low:.2f} to {high:.2f}, {e.dof:.0f} degrees of "
+            "freedom)."
+        )
+    kept = m.fit.readings[~m.fit.outlier]
     again = len(kept) - len(np.unique(classes(kept)))
     if not again:
         return "No reading was repeated: the noise is judged by the model alone."
-    what = "deflection" if fit.mode == "deflection" else "reading"
+    what = "deflection" if m.fit.mode == "deflection" else "reading"
     return (
         f"{again} of {len(kept)} readings repeat an earlier one, too few to judge the noise of a "
         f"{what} by them: the model alone does."
@@ -242,7 +216,7 @@ def appendix(m: ReportContent) -> tuple[PageSection, ...]:
 
 def _joints(m: ReportContent) -> Iterator[Block]:
     for j in range(m.story.arm.n):
-        yield Chart(f"Over joint {j + 1}", residual_by_joint(m.story, m.left_out, j))
+        yield Chart(f"Over joint {j + 1}", readings.residual_by_joint(m.story, m.left_out, j))
     if m.tested is not None:
         yield replace(worst_table(m.tested.found.shares), caption="Worst poses")
 
@@ -261,7 +235,7 @@ def _rejected(m: ReportContent) -> Iterator[Block]:
 def _all_parameters(m: ReportContent) -> Iterator[Block]:
     yield from captioned(parameters(m.fit), "Parameters with standard uncertainties")
     yield from captioned(remarks(m.fit))
-    yield Chart("Correlations", correlations(m.fit), wide=True, height=0)
+    yield Chart("Correlations", evidence.correlations(m.fit), wide=True, height=0)
 
 
 def _scalings(m: ReportContent) -> Iterator[Block]:
@@ -273,27 +247,20 @@ def _planned(m: ReportContent) -> Iterator[Block]:
     predicted = None if m.plan is None else m.plan.about.get("predicted_std")
     if not isinstance(predicted, dict):
         return
-    reached = {p.name: p for p in m.fit.parameters if p.std is not None}
-    rows = [
-        (n, numbers.sizes([(reached[n].unit, s)]),
-         numbers.sizes([(reached[n].unit, float(reached[n].std or 0.0))]))
-        for n, s in predicted.items() if isinstance(s, int | float) and n in reached
-    ]  # fmt: skip
-    if rows:
-        heads = ("parameter", "planned", "reached")
-        yield table(*heads, rows=rows, caption="Standard uncertainties")
+    out = table("parameter", "planned", "reached", caption="Standard uncertainties")
+    for p in m.fit.parameters:
+        planned = predicted.get(p.name)
+        if p.std is not None and isinstance(planned, int | float):
+            out.add(p.name, *(numbers.sizes([(p.unit, float(s))]) for s in (planned, p.std)))
+    if out.rows:
+        yield out
 
 
 def _provenance(m: ReportContent) -> Iterator[Block]:
     o = m.overview
-    yield table(
-        *("revision", "made (UTC)", "hilcal", "SHA-256 of its readings"),
-        rows=(
-            (str(r.number), r.created[:19].replace("T", " "), r.program_version, r.data_hash)
-            for r in o.revisions
-        ),
-        caption="Revisions by time and program",
-    )
+    heads = ("revision", "made (UTC)", "hilcal", "SHA-256 of its readings")
+    rows = [(str(r.number), utc(r.created), r.program_version, r.data_hash) for r in o.revisions]
+    yield table(*heads, rows=rows, caption="Revisions by time and program")
     made = [("the campaign", o.command or NOT_KEPT)]
     made += [(f"revision {r.number}", str(r.options.get(COMMAND, NOT_KEPT))) for r in o.revisions]
     yield table("made", "by", rows=made, caption="Commands as they were typed")

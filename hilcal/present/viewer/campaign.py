@@ -15,8 +15,16 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.present.diagnosis import REVISION_HEADS
 from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
-from hilcal.present.story import LEVEL_NAMES, DependenceCurve, Story, StoryRevision, levels
-from hilcal.present.viewer import campaign_scene, layout, recording, style
+from hilcal.present.story import (
+    LEVEL_NAMES,
+    Story,
+    StoryRevision,
+    levels,
+    worst_and_even,
+)
+from hilcal.present.viewer import arm_shapes, recording, style
+from hilcal.present.viewer.recording import along, fixed
+from hilcal.robot.body import capsules
 from hilcal.types import Floats, Ints
 
 
@@ -29,10 +37,6 @@ class Served:
 
 def record(story: Story, *sinks: recording.Sink) -> rr.RecordingStream:
     """Send a story to sinks, flushed after each revision; equal stories give equal recordings.
-
-    Args:
-        story: what is told.
-        sinks: where it goes.
 
     Returns:
         The open stream; it closes, and ends its sinks, when it is dropped.
@@ -71,17 +75,16 @@ def serve(story: Story, ip: str = "127.0.0.1", port: int = PORT) -> Iterator[Ser
         InputError: the port is taken.
         HilcalError: the port cannot be served.
     """
+    at = f"viewer server {ip}:{port}"
     recording.disable_analytics()
     try:
         recording.bind(ip, port)
     except (OSError, OverflowError) as error:
-        raise InputError(
-            f"viewer server {ip}:{port}: {error}; choose a free port of this machine"
-        ) from error
+        raise InputError(f"{at}: {error}; choose a free port of this machine") from error
     try:
         rec = record(story, rr.GrpcServerSink(bind_ip=ip, port=port))
     except (OSError, RuntimeError) as error:
-        raise HilcalError(f"viewer server {ip}:{port}: {error}") from error
+        raise HilcalError(f"{at}: {error}") from error
     try:
         yield Served(f"rerun+http://{ip}:{port}/proxy")
     finally:
@@ -110,17 +113,22 @@ def tell(rec: rr.RecordingStream, story: Story) -> None:
 
 def begin(rec: rr.RecordingStream, story: Story) -> None:
     """Log what is the same in every revision."""
-    campaign_scene.static_scene(rec, story)
-    error_series(rec)
-    rec.log("words/guide", style.document(GUIDE), static=True)
+    static_scene(rec, story)
+    for entity, name, color in SERIES:
+        fixed(rec, f"errors/{entity}", *style.series(name, color, 1.5, 4.0))
+    fixed(rec, "words/guide", style.document(GUIDE))
 
 
 def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
-    campaign_scene.revision_scene(rec, story, r)
-    revision_charts(rec, story, r)
+    revision_scene(rec, story, r)
+    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m, story.noise_floor_m)
+    for (entity, *_), size in zip(SERIES, sizes, strict=True):
+        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
+    pose_bars(rec, story, r)
     rec.log("words/verdict", style.document(verdict(story, r)))
-    rec.log("words/parameters", style.document(style.markdown(r.panels.get("parameters", ()))))
+    for panel in PANELS:
+        rec.log(f"words/{panel}", style.document(style.markdown(r.panels.get(panel, ()))))
     rec.log("words/revisions", style.document(revisions(story, r.revision)))
     rec.log("words/details", style.document(details(story, r)))
     rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
@@ -128,23 +136,21 @@ def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> No
 
 def _poses(rec: rr.RecordingStream, story: Story) -> None:
     """Tell the last revision on the timeline `pose`, and move the arm along it."""
-    last = story.revisions[-1]
     rec.set_time("pose", sequence=int(story.poses[0]))
-    tell_revision(rec, story, last)
+    tell_revision(rec, story, story.revisions[-1])
     rec.reset_time()
-    campaign_scene.pose_scene(rec, story)
-    time = [rr.TimeColumn("pose", sequence=story.poses)]
-    cards = pose_cards(story)
-    rec.send_columns(
-        "words/verdict",
-        indexes=time,
-        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
-    )
-    pose_charts(rec, story)
+    pose_scene(rec, story)
+    time = rr.TimeColumn("pose", sequence=story.poses)
+    along(rec, "words/verdict", time, style.documents(pose_cards(story)))
+    # the bar of the current pose; its name puts it in front of the others
+    for pose, left, width, height in zip(*_bar_places(story, story.revisions[-1]), strict=True):
+        rec.set_time("pose", sequence=int(pose))
+        bar = rr.BarChart([height], abscissa=[left], widths=[width], color=style.MEASURED)
+        rec.log("bars/zcurrent", bar)
+    rec.reset_time()
 
 
-FOLLOWS = "What the residual follows"
-LAW = "Law beyond the catalogue"
+PANELS = {"follows": "What the residual follows", "law": "Law", "parameters": "Parameters ± σ"}
 ERRORS = "Error of each revision [µm]"
 
 
@@ -153,69 +159,51 @@ def blueprint(story: Story) -> rrb.Blueprint:
 
     It opens at the first revision and stands there; that of a growing story goes along with it.
     """
+    residual, deflection, bars = titles(story)
+    errors = rrb.TimeSeriesView(origin="errors", name=ERRORS)
+    quiet = rrb.PlotLegend(visible=False)
     left = rrb.Vertical(
-        rrb.Tabs(
-            _view3d(story, residual_title(story), "deflection"),
-            _view3d(story, deflection_title(story), "residual"),
-        ),
-        rrb.Tabs(
-            rrb.TimeSeriesView(origin="errors", name=ERRORS),
-            _bars("bars", bars_title(story)),
-        ),
+        rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
+        rrb.Tabs(errors, rrb.BarChartView(origin="bars", name=bars, plot_legend=quiet)),
         row_shares=[11, 4],
     )
-    laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
+    law = any(r.panels.get("law") for r in story.revisions)
+    panels = [panel for panel in PANELS if law or panel != "law"]
+    words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
+        rrb.Tabs(*(style.text(of, name) for of, name in words)),
         rrb.Tabs(
-            rrb.TextDocumentView(origin="words/verdict", name="Verdict"),
-            rrb.TextDocumentView(origin="words/details", name="Details"),
-            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
-        ),
-        rrb.Tabs(
-            _bars("follows", FOLLOWS),
-            *laws,
-            rrb.TextDocumentView(origin="words/parameters", name="Parameters ± σ"),
-            rrb.TextDocumentView(origin="words/revisions", name="Table"),
+            *(style.text(panel, PANELS[panel]) for panel in panels),
+            style.text("revisions", "Table"),
             rrb.TextLogView(origin="log", name="Log"),
         ),
         row_shares=[5, 4],
     )
     play: Literal["following", "paused"] = "following" if story.growing else "paused"
     both = rrb.Horizontal(left, right, column_shares=[3, 2])
-    return layout.whole(both, "revision", play, fps=1.0)
+    return style.whole(both, "revision", play, fps=1.0)
 
 
-def residual_title(story: Story) -> str:
-    """Return the title of the residual view, with its scale and how much it shows."""
-    shown, n = len(campaign_scene.shown(story, story.revisions[0])), len(story)
-    part = f" (about {shown} of {n} readings)" if shown < n else ""
-    scale = f"{campaign_scene.residual_scale(story):g}"
-    return f"Residual ×{scale}{part}: an arrow that leaves its noise ball = model wrong"
-
-
-def deflection_title(story: Story) -> str:
-    """Return the title of the deflection view, with its scale."""
+def titles(story: Story) -> tuple[str, str, str]:
+    """Return the titles of residuals, deflections and bars, with their scales and counts."""
+    some, n = len(shown(story, story.revisions[0])), len(story)
+    part = f" (about {some} of {n} readings)" if some < n else ""
     what = "Deflection" if story.mode == "deflection" else "Deviation from nominal"
-    scale = f"{campaign_scene.deflection_scale(story):g}"
-    return f"{what} ×{scale}: blue measured, white predicted, red missed"
-
-
-def bars_title(story: Story) -> str:
-    """Return the title of the bars, with what one bar stands for."""
     several = poses_per_bar(story)
-    part = f" ({several} poses per bar)" if several > 1 else ""
-    return f"Worst reading of each pose, in σ{part}: grey noise, amber doubtful, red model wrong"
+    poses = f" ({several} poses per bar)" if several > 1 else ""
+    return (
+        f"Residual ×{residual_scale(story):g}{part}: an arrow that leaves its "
+        "noise ball = model wrong",
+        f"{what} ×{deflection_scale(story):g}: blue measured, white predicted, red missed",
+        f"Worst reading of each pose, in σ{poses}: grey noise, amber doubtful, red model wrong",
+    )
 
 
 def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
-    middle, size = layout.center(story.anchor, story.arm.reach)
-    place = layout.near(middle, layout.EYE * size, campaign_scene.seen(story))
+    middle, size = style.center(story.anchor, story.arm.reach)
+    place = style.near(middle, style.EYE * size, seen(story))
     contents = ["+ $origin/**", f"- $origin/{without}/**", "- $origin/live/**"]
-    return layout.view3d("world", name, place, middle, contents)
-
-
-def _bars(origin: str, name: str) -> rrb.BarChartView:
-    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
+    return style.view3d("world", name, place, middle, contents)
 
 
 SERIES = (
@@ -227,40 +215,6 @@ SERIES = (
 """Of the errors of revisions: entity, name and colour."""
 BARS = 150
 """Bars of poses at most."""
-_BINS = 12
-"""Of single readings over what they may follow, for their mean."""
-_PARTS = ("mean", "law")
-
-
-def error_series(rec: rr.RecordingStream) -> None:
-    """Log what the series of errors are called, and how they look."""
-    for entity, name, color in SERIES:
-        line = rr.SeriesLines(names=[name], colors=[color], widths=[1.5])
-        mark = rr.SeriesPoints(names=[name], colors=[color], markers=["circle"], marker_sizes=[4.0])
-        rec.log(f"errors/{entity}", line, mark, static=True)
-
-
-def revision_charts(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
-    """Log one revision at the recording's current time."""
-    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m)
-    for (entity, *_), size in zip(SERIES, (*sizes, story.noise_floor_m), strict=True):
-        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
-    pose_bars(rec, story, r)
-    curve_bars(rec, "follows", r.follows)
-    if any(one.laws for one in story.revisions):
-        curve_bars(rec, "law", r.laws[0] if r.laws else None)
-
-
-def pose_charts(rec: rr.RecordingStream, story: Story) -> None:
-    """Send the bar of the current pose along `pose`, with the last revision."""
-    sigma = np.sqrt(pose_norm2(story, story.revisions[-1]))
-    starts, left, width = _bar_places(story)
-    for k, height in enumerate(np.maximum.reduceat(sigma, starts)):
-        rec.set_time("pose", sequence=int(story.poses[starts[k]]))
-        one = slice(k, k + 1)
-        bar = rr.BarChart([height], abscissa=left[one], widths=width[one], color=style.MEASURED)
-        rec.log("bars/zcurrent", bar)  # the name puts it in front of the others
-    rec.reset_time()
 
 
 def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -268,26 +222,13 @@ def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
 
     The tallest bar is the worst reading of all. A bar of several poses is that of the worst.
     """
-    starts, left, width = _bar_places(story)
-    norm2 = np.maximum.reduceat(pose_norm2(story, r), starts)
-    height, level = np.sqrt(norm2), levels(norm2)
+    _, left, width, height = _bar_places(story, r)
     for i, name in enumerate(style.LEVEL_NAMES):
-        of = np.flatnonzero(level == i)
-        some = of if len(of) else np.arange(1)
-        rec.log(
-            f"bars/{name}",
-            rr.BarChart(
-                height[some] if len(of) else [0.0],
-                abscissa=left[some],
-                widths=width[some],
-                color=style.LEVEL_COLORS[i].tolist(),
-            ),
-        )
-
-
-def pose_norm2(story: Story, r: StoryRevision) -> Floats:
-    """(P,) largest squared Mahalanobis distance of each pose."""
-    return r.whitened_norm2[story.last_of_poses(r.whitened_norm2)]
+        mine = levels(height**2) == i
+        some = mine if mine.any() else np.arange(len(height)) == 0  # else a bar without a height
+        color, tall = style.LEVEL_COLORS[i].tolist(), np.where(mine, height, 0.0)[some]
+        bar = rr.BarChart(tall, abscissa=left[some], widths=width[some], color=color)
+        rec.log(f"bars/{name}", bar)
 
 
 def poses_per_bar(story: Story) -> int:
@@ -295,53 +236,13 @@ def poses_per_bar(story: Story) -> int:
     return -(-len(story.poses) // BARS)
 
 
-def _bar_places(story: Story) -> tuple[Ints, Floats, Floats]:
-    """First pose (index), left edge and width of every bar, in pose numbers."""
+def _bar_places(story: Story, r: StoryRevision) -> tuple[Ints, Floats, Floats, Floats]:
+    """First pose (its number), left edge, width and height, σ, of every bar."""
     starts = np.arange(0, len(story.poses), poses_per_bar(story))
     edges = np.append(story.poses[starts], story.poses[-1] + 1) - 0.5
-    return starts, edges[:-1], np.diff(edges)
-
-
-def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
-    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
-
-    Single readings are drawn by their mean in bins of equal count.
-    """
-    bars: dict[str, tuple[Floats, Floats]] = {}
-    if c is not None and len(c.x):
-        x, y = (c.x, c.y) if c.error is not None else _means(c)
-        bars["mean"] = np.arange(float(len(x))) if c.names else x, y
-        if c.line is not None:
-            bars["law"] = x, np.interp(x, *c.line)
-    for k, part in enumerate(_PARTS):
-        if part not in bars:
-            rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
-            continue
-        x, y = bars[part]
-        order = np.argsort(x, kind="stable")
-        edges = _edges(x[order])
-        width = np.diff(edges) / len(bars)
-        chart = rr.BarChart(
-            y[order],
-            abscissa=edges[:-1] + k * width,
-            widths=width,
-            color=(style.MEASURED, style.NOISE)[k],
-        )
-        rec.log(f"{entity}/{part}", chart)
-
-
-def _edges(x: Floats) -> Floats:
-    """(K + 1,) of bins about growing centres (K,): half-way between them."""
-    if len(x) == 1:
-        return np.array([x[0] - 0.5, x[0] + 0.5])
-    middle = 0.5 * (x[1:] + x[:-1])
-    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
-
-
-def _means(c: DependenceCurve) -> tuple[Floats, Floats]:
-    order = np.argsort(c.x, kind="stable")
-    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
-    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])
+    worst_of_poses = r.sigma[story.last_of_poses(r.whitened_norm2)]
+    height = np.maximum.reduceat(worst_of_poses, starts)
+    return story.poses[starts], edges[:-1], np.diff(edges), height
 
 
 _MARKS = {"adequate": "✓ ", "missing_effect": "✗ ", "unknown_effect": "✗ "}
@@ -352,7 +253,7 @@ def verdict(story: Story, r: StoryRevision) -> str:
     """Return the verdict of a revision with its suspects; short, since a small window cuts it."""
     mark = _MARKS.get(r.verdict, "")
     head = heading(f"{place(story, r)}: {mark}{r.verdict.replace('_', ' ')}")
-    return style.markdown([head, *(r.panels.get("verdict") or [r.message])])
+    return style.markdown([head, *r.panels.get("verdict", ())])
 
 
 def place(story: Story, r: StoryRevision) -> str:
@@ -361,50 +262,44 @@ def place(story: Story, r: StoryRevision) -> str:
         return f"Revision {r.revision}"
     told = [o.revision for o in story.revisions]
     k, count = told.index(r.revision) + 1, len(told)
-    if told == list(range(1, count + 1)):
-        where = f"Revision {k} of {count}"
-    else:
-        where = f"Revision {r.revision} ({k} of {count})"
-    return f"{where}, the last" if k == count > 1 else where
+    plain = told == list(range(1, count + 1))
+    where = f"of {count}" if plain else f"({k} of {count})"
+    return f"Revision {r.revision} {where}{', the last' * (k == count > 1)}"
 
 
 def details(story: Story, r: StoryRevision) -> str:
     """Return what the verdict rests on, as the terminal has it, and the worst reading."""
     outside = float(np.mean(r.level > 0))
-    i = campaign_scene.worst(r)
-    worst = (
+    i = worst(r)
+    told = (
         f"{numbers.percent(outside)} of readings are outside their 99 % noise ball (noise alone: "
         f"1 %). Worst: pose {story.pose_name(i)}, load {story.load_names[i]}, "
         f"{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)."
     )
     head = heading(f"Revision {r.revision}: {r.name}")
-    return style.markdown([head, worst, *r.panels.get("details", ())])
+    return style.markdown([head, told, *r.panels.get("details", ())])
 
 
 def pose_cards(story: Story) -> list[str]:
     """Return each pose of the last revision in words: residual of each load, and joints."""
-    r = story.revisions[-1]
-    length, sigma, level = r.size_m.tolist(), r.sigma.tolist(), r.level.tolist()
-    rms = np.sqrt(np.bincount(story.row, r.size_m**2) / np.bincount(story.row)).tolist()
-    joints, units = story.q[story.first].tolist(), story.arm.units
+    r, size = story.revisions[-1], story.revisions[-1].size_m
+    sigma, level = r.sigma, r.level
+    rms = np.sqrt(np.bincount(story.row, size**2) / np.bincount(story.row))
     order = np.argsort(story.row, kind="stable")
     ends = np.cumsum(np.bincount(story.row, minlength=len(story.poses)))
     out = []
     for k, rows in enumerate(np.split(order, ends[:-1])):
         cells = (
-            (
-                story.load_names[i],
-                numbers.length(length[i]),
-                f"{sigma[i]:.1f}",
-                LEVEL_NAMES[level[i]],
-            )
+            (story.load_names[i], numbers.length(float(size[i])), f"{sigma[i]:.1f}",
+             LEVEL_NAMES[level[i]])
             for i in rows[:_POSE_LOADS].tolist()
-        )
+        )  # fmt: skip
+        joints = map(numbers.joint_value, story.q[story.first[k]].tolist(), story.arm.units)
         card: list[Block] = [
-            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(rms[k])} rms"),
+            heading(f"Pose {story.pose_name(int(rows[0]))}: {numbers.length(float(rms[k]))} rms"),
             f"With the model of revision {r.revision}: {r.name}.",
             table("load", "residual", "in σ", "", rows=cells, left=(0, 3)),
-            f"Joints {', '.join(map(numbers.joint_value, joints[k], units))}.",
+            f"Joints {', '.join(joints)}.",
         ]
         out.append(style.markdown(card))
     return out
@@ -447,5 +342,176 @@ is the worst reading; the order in µm can be another, where some readings are n
 in µm, against the noise. Left-out error far above the fitted one = too many parameters.
 
 **What the residual follows**: its mean over the leading suspect, or, where that explains little of
-it, over the recorded variable that carries most of it; *Details* names both axes.
+it, over the recorded variable that carries most of it.
 """
+
+
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.40
+"""One σ is drawn this long, and no arrow longer, m."""
+DEFLECTION_LENGTH, DEFLECTION_CAP = 0.25, 0.6
+"""The same of a large measured deflection, m."""
+ARROWS, BALLS, PAIRS = 150, 60, 150
+"""How much is drawn at most, so that a picture stays legible and a file small."""
+_LABEL_ABOVE = np.array([0.0, 0.0, 0.3])
+_DOT = 0.012  # m, half the distance of two dots of a leader
+
+
+def residual_scale(story: Story) -> float:
+    """Return the m that are drawn per m of residual."""
+    sigma = float(np.sqrt(np.median(np.trace(story.covariance, axis1=1, axis2=2)) / 3))
+    return style.nice(SIGMA_LENGTH / sigma) if sigma > 0 else 1.0
+
+
+def deflection_scale(story: Story) -> float:
+    """Return the m that are drawn per m of deflection."""
+    moved = np.linalg.norm(story.deviation(story.measured), axis=1)
+    typical = float(np.quantile(moved, 0.95))
+    return style.nice(DEFLECTION_LENGTH / typical) if typical > 0 else 1.0
+
+
+def noise_balls(story: Story, rows: Ints) -> tuple[Floats, Floats]:
+    """Half axes (K, 3), m, and quaternions (K, 4) of readings' noise balls, as they are drawn.
+
+    C = V diag(w) Vᵀ, V a proper rotation, has half axes of sqrt(w) at one σ.
+    """
+    w, v = np.linalg.eigh(story.covariance[rows])
+    v[:, :, 0] *= np.sign(np.linalg.det(v))[:, None]
+    half = style.BALL_SIGMAS * residual_scale(story) * np.sqrt(np.maximum(w, 0.0))
+    return np.maximum(half, 1e-3), arm_shapes.quaternions_of(v)
+
+
+def worst(r: StoryRevision) -> int:
+    """Return the reading with the largest Mahalanobis distance."""
+    return int(np.argmax(r.whitened_norm2))
+
+
+def balled(story: Story, r: StoryRevision) -> Ints:
+    """Return the readings whose ball is drawn: of each chosen pose, its worst reading."""
+    of_pose = story.last_of_poses(r.whitened_norm2)
+    return np.asarray(of_pose[worst_and_even(r.whitened_norm2[of_pose], BALLS)])
+
+
+def shown(story: Story, r: StoryRevision) -> Ints:
+    """Return the readings whose arrows are drawn: the worst, the balled, an even rest."""
+    return np.union1d(worst_and_even(r.whitened_norm2, ARROWS), balled(story, r))
+
+
+def static_scene(rec: rr.RecordingStream, story: Story) -> None:
+    """Log what never changes: the arm's shapes and the axes of the world."""
+    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    arm_shapes.log_bodies(rec, capsules(story.arm))
+    several = () if story.target is None else np.unique(story.target)
+    names = [style.safe(story.target_names[k]) for k in several]
+    arm_shapes.log_targets(rec, story.arm, story.targets, names)
+
+
+def revision_scene(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+    """Log one revision at the recording's current time: arrows, balls, the arm at its worst."""
+    far, drawn, balls = worst(r), shown(story, r), balled(story, r)
+    arm_shapes.stand(rec, story.bodies[story.row[far]])
+    level = r.level[drawn]
+    found = rr.Arrows3D(
+        origins=story.anchor[drawn],
+        vectors=arrows(story, r, drawn),
+        colors=style.LEVEL_COLORS[level],
+        radii=np.where(level > 0, 0.0055, 0.0035),
+    )
+    rec.log("world/residual/arrows", found)
+    half, quaternions = noise_balls(story, balls)
+    noise = rr.Ellipsoids3D(
+        centers=story.anchor[balls],
+        half_sizes=half,
+        quaternions=quaternions,
+        colors=[(*style.NOISE, 46)],
+        fill_mode="solid",
+    )
+    rec.log("world/residual/noise", noise)
+    at, words = story.anchor[far], f"worst: pose {story.pose_name(far)}, {_words(story, r, far)}"
+    rec.log("world/residual/worst", arm_shapes.labels([at + _LABEL_ABOVE], [words]))
+    dots = list(leader(at, noise_balls(story, np.array([far]))[0]))
+    lines = rr.LineStrips3D(dots, colors=[style.LEADER], radii=rr.Radius.ui_points(0.5))
+    rec.log("world/residual/leader", lines)
+    _deflections(rec, story, r)
+
+
+def pose_scene(rec: rr.RecordingStream, story: Story) -> None:
+    """Send the arm and the highlighted arrow of every pose, as columns on `pose`."""
+    r, time = story.revisions[-1], rr.TimeColumn("pose", sequence=story.poses)
+    arm_shapes.send_stands(rec, time, story.bodies)
+    far = story.last_of_poses(r.whitened_norm2)
+    at, (half, quaternions) = story.anchor[far], noise_balls(story, far)
+    now = rr.Arrows3D.columns(
+        origins=at,
+        vectors=arrows(story, r, far),
+        colors=style.LEVEL_COLORS[r.level[far]],
+        radii=np.full(len(far), 0.012),
+    )
+    along(rec, "world/residual/current", time, now)
+    bright = np.tile(np.array(style.PREDICTED, dtype=np.uint8), (len(far), 1))
+    ball = rr.Ellipsoids3D.columns(
+        centers=at, half_sizes=half, quaternions=quaternions, colors=bright
+    )
+    along(rec, "world/residual/ball", time, ball)
+    dots = [leader(a, h) for a, h in zip(at, half, strict=True)]
+    strips = rr.LineStrips3D.columns(strips=np.concatenate(dots))
+    along(rec, "world/residual/leader", time, strips.partition([len(x) for x in dots]))
+    words = [f"pose {story.pose_name(i)}: {_words(story, r, i)}" for i in far.tolist()]
+    along(rec, "world/residual/worst", time, arm_shapes.label_columns(at + _LABEL_ABOVE, words))
+
+
+def _words(story: Story, r: StoryRevision, i: int) -> str:
+    name = ""
+    if story.target is not None:
+        name = f"{style.safe(story.target_names[story.target[i]])} "
+    return f"{name}{numbers.length(float(r.size_m[i]))} ({r.sigma[i]:.1f} σ)"
+
+
+def leader(at: Floats, ball: Floats) -> Floats:
+    """(K, 2, 3) dots from above a noise ball to the label of its reading, m.
+
+    Thin, dotted and grey, so that nobody takes them for a residual, which is a solid arrow.
+
+    Args:
+        at: (3,) the ball's middle.
+        ball: its half axes.
+    """
+    top = float(_LABEL_ABOVE[2])
+    z = np.arange(min(1.1 * float(ball.max()), top - _DOT), top, 2.0 * _DOT)
+    ends = np.stack([z, np.minimum(z + 0.5 * _DOT, top)], 1)
+    return np.asarray(at + ends[:, :, None] * np.array([0.0, 0.0, 1.0]))
+
+
+def seen(story: Story) -> Floats:
+    """(K, 3) what is to be in the picture: targets, the arm in its worst poses, labels, m."""
+    far = [worst(r) for r in story.revisions]
+    stands = story.bodies[story.row[far], :, :3, 3].reshape(-1, 3)
+    return np.vstack([story.anchor, stands, story.anchor[far] + _LABEL_ABOVE])
+
+
+def arrows(story: Story, r: StoryRevision, rows: Ints) -> Floats:
+    """(K, 3) residuals of readings as drawn: scaled, and capped in length, m."""
+    return capped(r.residual[rows] * residual_scale(story), ARROW_CAP)
+
+
+def capped(vectors: Floats, length: float) -> Floats:
+    """(K, 3) vectors, those longer than `length` shortened to it."""
+    norm = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return np.asarray(vectors * np.minimum(1.0, length / np.maximum(norm, 1e-300)))
+
+
+def _deflections(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
+    """Log a pair of arrows per chosen pose, of its largest deflection, and what is missed."""
+    of_pose = story.last_of_poses(np.linalg.norm(story.deviation(story.measured), axis=1))
+    some = of_pose[worst_and_even(r.whitened_norm2[of_pose], PAIRS)]
+    at, scale, tips = story.anchor[some], deflection_scale(story), []
+    for name, value, color, radius in (
+        ("measured", story.measured, style.MEASURED, 0.0055),
+        ("predicted", r.predicted, style.PREDICTED, 0.0045),
+    ):
+        moved = capped(story.deviation(value)[some] * scale, DEFLECTION_CAP)
+        tips.append(at + moved)
+        drawn = rr.Arrows3D(origins=at, vectors=moved, colors=[color], radii=[radius])
+        rec.log(f"world/deflection/{name}", drawn)
+    colors, thin = style.LEVEL_COLORS[r.level[some]], rr.Radius.ui_points(1.6)
+    missed = rr.LineStrips3D(np.stack(tips, 1), colors=colors, radii=thin)
+    rec.log("world/deflection/missed", missed)

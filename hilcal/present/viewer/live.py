@@ -15,8 +15,9 @@ import rerun as rr
 from hilcal.errors import HilcalError, InputError
 from hilcal.measuring.progress import ArmAt
 from hilcal.present.live_viewer import Measuring, Revised
+from hilcal.present.viewer import recording
 from hilcal.present.viewer.live_scene import LiveScene
-from hilcal.present.viewer.recording import APPLICATION, Sink, disable_analytics, free
+from hilcal.present.viewer.recording import Sink
 
 PORTS = 20
 """Ports that are tried, from the wanted one; a choice."""
@@ -51,8 +52,8 @@ def follow(messages: BinaryIO, reply: ViewerReply, record: Path, port: int) -> N
     name = f"recording {record}"
     outlets = [_Outlet(identifier, reply, name, lambda: rr.FileSink(str(record)), record)]
     with contextlib.suppress(OSError):
-        disable_analytics()
-    found = next((p for p in range(port, port + PORTS) if free("127.0.0.1", p)), None)
+        recording.disable_analytics()
+    found = next((p for p in range(port, port + PORTS) if recording.free("127.0.0.1", p)), None)
     if found is None:
         reply(problem=f"no free port from {port} to {port + PORTS - 1}: no live viewer is served")
         reply(url=None)
@@ -68,14 +69,9 @@ def follow(messages: BinaryIO, reply: ViewerReply, record: Path, port: int) -> N
                 whole = not isinstance(what, ArmAt)  # places of the arm go on in batches
                 now = isinstance(what, Measuring | Revised)
                 outlet.tell(partial(LiveScene.tell, wall=wall, what=what), whole, now=now)
-    guard = threading.Thread(target=_end, args=(outlets,), daemon=True)
+    guard = threading.Thread(target=lambda: list(map(_Outlet.end, outlets)), daemon=True)
     guard.start()
     guard.join(_END_S)
-
-
-def _end(outlets: list["_Outlet"]) -> None:
-    for outlet in outlets:
-        outlet.end()
 
 
 class _Outlet:
@@ -93,14 +89,8 @@ class _Outlet:
         self._reply, self._name, self._file = reply, name, file
         self._scene: LiveScene | None = None
         self._told, self._written = 0, 0
-        self._rec = rr.RecordingStream(
-            APPLICATION,
-            recording_id=identifier,
-            send_properties=False,
-            batcher_config=rr.ChunkBatcherConfig(flush_tick=_NEVER) if file else None,
-        )
-        self._rec.set_log_time_enabled(False)
-        self._rec.set_log_tick_enabled(False)
+        config = rr.ChunkBatcherConfig(flush_tick=_NEVER) if file else None
+        self._rec = recording.stream(identifier, config)
         try:
             self._rec.set_sinks(sink())
             self._scene = LiveScene(self._rec, batches=file is not None)
@@ -127,7 +117,7 @@ class _Outlet:
         try:
             self._rec.flush(timeout_sec=_FLUSH_S)
         except (OSError, RuntimeError, ValueError, HilcalError) as error:
-            if "timeout" not in str(error).lower() and "timed out" not in str(error).lower():
+            if not recording.slow(error):
                 self._fail(error)
             elif self._file and self._size() == size:  # rerun says no more of a write that failed
                 self._fail(f"nothing was written for {_FLUSH_S:.0f} s; is the disk full?")

@@ -16,28 +16,35 @@ from hilcal.present.document import Block, Items, heading, table
 from hilcal.present.live_viewer import Measuring, Revised
 from hilcal.present.running import figures, met_words, spoken, status_words
 from hilcal.present.story import LIMITS, Story, levels
-from hilcal.present.viewer import campaign, layout, style
+from hilcal.present.viewer import campaign, style
 from hilcal.present.viewer.arm_shapes import MovingArm, labels
+from hilcal.present.viewer.recording import along, fixed
 from hilcal.robot.body import body_poses
-from hilcal.store.plan import UNLOADED, Step
+from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-SIGMA_LENGTH = 0.02
-"""One σ of a residual is drawn this long, m; a choice."""
-ARROW_CAP = 0.4
-"""Longest arrow, m; a choice."""
+SIGMA_LENGTH, ARROW_CAP = 0.02, 0.4
+"""One σ of a residual is drawn this long, and no arrow longer than that, m; choices."""
 BALL = SIGMA_LENGTH * style.BALL_SIGMAS
 """Radius of the ball that holds 99 % of the readings where the model is right, m."""
 LIMIT = style.BALL_SIGMAS / 3**0.5
 """The same in the σ of a reading."""
 ALARM = 0.001
 """Chance that noise alone leaves as many readings outside their balls as is called wrong."""
-WORST = 3
+WORST, REMARKS = 3, 3
+"""Readings, and remarks, that are listed."""
+BALLS, MANY = 60, 300
+"""Readings from which a ball, and an arrow, is drawn only where the arrow leaves its ball; choices,
+for legibility."""
 FLUENT = 1000
 """Residuals that a viewer draws one by one. Of 10,000 each of its pictures took 3.5 times the
 processor time of 100 (tests/benchmarks/test_viewer_speed.py); of this many some 1.2 times."""
 GROUPS = 150
 """Groups that more of them are divided into: as many as a finished recording has bars."""
+TIMELINE = "time"
+RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
+IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
+_ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +75,18 @@ class LiveJudgement:
         """0 inside the noise, 1 beyond 99 %, 2 beyond 99.99 %."""
         return int(levels(np.array([self.norm2]))[0])
 
+    def __str__(self) -> str:
+        """Return the residual for people, with its size in σ."""
+        return f"{numbers.length(self.length)} ({self.sigma:.1f} σ)"
+
+
+def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
+    """Return a reading as `LiveJudgement`; None where it was not compared."""
+    if live.vector is None or live.covariance is None:
+        return None
+    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
+    return LiveJudgement(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
+
 
 @dataclass(slots=True, eq=False)
 class LiveTally:
@@ -76,22 +95,22 @@ class LiveTally:
     Attributes:
         told: what is measured.
         bodies: (P, n + 2, 4, 4) poses of the arm's bodies at each pose of the plan.
-        anchor: (P, T, 3) nominal position of each target at each pose, base axes, m.
+        anchor: (T, 3) nominal position of each target by the name of the pose, base axes, m.
         done: readings that are stored.
         left: real seconds that the rest takes.
         phase: what is being done.
         last: the last reading.
         judged: how many readings were compared with a model.
-        outside: of these how many are outside their ball, by load; and all of them.
+        outside: of these how many are outside their ball.
+        loads: both by load.
         worst: those that are farthest from the model.
         remarks: that people should look at, newest last.
-        places: index of each pose by its name; filled when it is first asked for.
         group_worst: largest `LiveJudgement.norm2` of the group that is being measured.
     """
 
     told: Measuring
     bodies: Floats
-    anchor: Floats
+    anchor: dict[str, Floats]
     done: int = 0
     left: float = 0.0
     phase: str = ""
@@ -101,17 +120,16 @@ class LiveTally:
     loads: dict[str, list[int]] = field(default_factory=dict)
     worst: list[LiveJudgement] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
-    places: dict[str, int] = field(default_factory=dict)
     group_worst: float = 0.0
 
     @classmethod
     def of(cls, told: Measuring) -> "LiveTally":
         """Return that of a campaign that begins, or goes on."""
         bodies = body_poses(told.arm, told.plan.q)
-        flange = bodies[:, None, -1]
-        anchor = flange[..., :3, 3] + np.einsum("pkij,tj->pti", flange[..., :3, :3], told.targets)
-        done = len({step for _, step in told.earlier})
-        return cls(told, bodies, anchor, done)
+        flange = bodies[:, -1]
+        at = flange[:, None, :3, 3] + np.einsum("pij,tj->pti", flange[:, :3, :3], told.targets)
+        anchor = dict(zip(told.plan.pose_names, at, strict=True))
+        return cls(told, bodies, anchor, len({step for _, step in told.earlier}))
 
     @property
     def total(self) -> int:
@@ -124,11 +142,14 @@ class LiveTally:
         planned = self.total * len(self.told.targets)
         return 1 if planned <= FLUENT else math.ceil(planned / GROUPS)
 
+    @property
+    def targets(self) -> Floats:
+        """(K, 3) nominal positions of the targets in all poses, m."""
+        return np.concatenate(list(self.anchor.values()))
+
     def place(self, step: Step, target: int = 0) -> Floats:
         """(3,) where the nominal arm holds a target, m."""
-        if not self.places:
-            self.places.update({name: k for k, name in enumerate(self.told.plan.pose_names)})
-        return np.asarray(self.anchor[self.places[step.pose], target])
+        return np.asarray(self.anchor[step.pose][target])
 
     def add(self, event: ReadingStored) -> list[tuple[int, LiveResidual, LiveJudgement | None]]:
         """Take note of a reading.
@@ -144,14 +165,12 @@ class LiveTally:
         found = judged(step, live, self.told.names[target] if self.told.names else "")
         if found is None:
             return None
-        self.judged += 1
-        of_load = self.loads.setdefault(step.load, [0, 0])
-        of_load[0] += 1
-        if found.level > 0:
-            self.outside += 1
-            of_load[1] += 1
+        begins = self.judged % self.group == 0
+        outside = int(found.level > 0)
+        self.judged, self.outside = self.judged + 1, self.outside + outside
+        compared, beyond = self.loads.get(step.load, (0, 0))
+        self.loads[step.load] = [compared + 1, beyond + outside]
         self.worst = sorted([*self.worst, found], key=lambda j: -j.norm2)[:WORST]
-        begins = (self.judged - 1) % self.group == 0
         found = replace(found, stands_out=begins or found.norm2 > self.group_worst)
         self.group_worst = max(found.norm2, 0.0 if begins else self.group_worst)
         return found
@@ -162,27 +181,6 @@ class LiveTally:
         chance = stats.binom.sf(self.outside - 1, self.judged, 1.0 - LIMITS[0])
         return self.outside > 0 and bool(chance < ALARM)
 
-    @property
-    def loaded(self) -> bool:
-        """Whether any load is planned."""
-        return any(step.load != UNLOADED for step in self.told.plan.steps)
-
-
-def judged(step: Step, live: LiveResidual, target: str = "") -> LiveJudgement | None:
-    """Return a reading as `LiveJudgement`; None where it was not compared."""
-    if live.vector is None or live.covariance is None:
-        return None
-    r, v = np.array(live.vector), np.array(live.covariance).reshape(3, 3)
-    return LiveJudgement(step, target, float(np.linalg.norm(r)), float(r @ np.linalg.solve(v, r)))
-
-
-def arrow(live: LiveResidual, found: LiveJudgement) -> Floats:
-    """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
-    length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
-    return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
-
-
-_REMARKS = 3
 
 GUIDE = """### How to read this
 Each reading is compared with a simple model, that of frames and joint compliance, fitted to the
@@ -211,8 +209,20 @@ def status(d: LiveTally) -> str:
 
 
 def _status(d: LiveTally) -> Iterator[Block]:
+    if d.judged == 0:
+        yield heading("Measuring: no judgement yet")
+        yield "The first readings tell where tracker and target are; then each one is compared."
+    else:
+        title = "✓ So far noise explains the readings"
+        told = (
+            f"{d.outside} of {d.judged} ({numbers.percent(d.outside / d.judged)}) compared "
+            "readings are outside their 99 % noise ball (noise alone: 1 %)."
+        )
+        if d.wrong:
+            title = "✗ The simple model fails: look at the red arrows"
+            told += " Something is missing in it: hilcal refine says what, after measuring."
+        yield from (heading(title), told)
     left = f", {spoken(d.left)} left" if d.left > 0 else ""
-    yield from (heading(_heading(d)), _sentence(d))
     yield f"{d.done} of {d.total} readings{left}. {d.phase}"
     goal = None if d.last is None else d.last.goal
     if goal is not None and (told := status_words(goal)):
@@ -222,69 +232,26 @@ def _status(d: LiveTally) -> Iterator[Block]:
         yield table("load", "compared", "outside", "", rows=rows)
     if d.worst and d.worst[0].level > 0:
         worst = (
-            (
-                f"{j.step.pose} {j.target}".rstrip(),
-                j.step.load,
-                numbers.length(j.length),
-                f"{j.sigma:.1f}",
-            )
+            (f"{j.step.pose} {j.target}".rstrip(), j.step.load, numbers.length(j.length),
+             f"{j.sigma:.1f}")
             for j in d.worst
             if j.level > 0
-        )
+        )  # fmt: skip
         yield table("worst so far", "load", "residual", "in σ", rows=worst, left=(0, 1))
-    yield Items(tuple(f"note: {text}" for text in d.remarks[-_REMARKS:]))
-
-
-def residual(found: LiveJudgement) -> str:
-    """Return a residual for people, with its size in σ."""
-    return f"{numbers.length(found.length)} ({found.sigma:.1f} σ)"
-
-
-def _heading(d: LiveTally) -> str:
-    if d.judged == 0:
-        return "Measuring: no judgement yet"
-    if d.wrong:
-        return "✗ The simple model fails: look at the red arrows"
-    return "✓ So far noise explains the readings"
-
-
-def _sentence(d: LiveTally) -> str:
-    if d.judged == 0:
-        return "The first readings tell where tracker and target are; then each one is compared."
-    share = numbers.percent(d.outside / d.judged)
-    told = (
-        f"{d.outside} of {d.judged} ({share}) compared readings are outside their 99 % noise "
-        "ball (noise alone: 1 %)."
-    )
-    if d.wrong:
-        told += " Something is missing in it: hilcal refine says what, after measuring."
-    return told
-
-
-TIMELINE = "time"
-RESIDUALS = "in σ: an arrow that leaves its noise ball = model wrong"
-IN_TIME = "in σ: grey noise, amber doubtful, red model wrong"
+    yield Items(tuple(f"note: {text}" for text in d.remarks[-REMARKS:]))
 
 
 def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
-    """Return the blueprint.
-
-    Args:
-        d: the campaign.
-        world: the entity below which its readings are drawn.
-        series: the entity below which its residuals are in time.
-    """
-    every = archetypes.VisibleTimeRanges(
-        timeline=TIMELINE,
-        start=rrb.TimeRangeBoundary.infinite(),
-        end=rrb.TimeRangeBoundary.cursor_relative(),
-    )
+    """Return the blueprint, of readings below `world` and residuals in time below `series`."""
+    ever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
+    every = archetypes.VisibleTimeRanges(timeline=TIMELINE, start=ever, end=now)
     of = "Residual of each reading," if d.group == 1 else f"Worst of every {d.group} residuals,"
-    middle, size = layout.center(d.anchor.reshape(-1, 3), d.told.arm.reach)
-    scene = layout.view3d(
+    middle, size = style.center(d.targets, d.told.arm.reach)
+    seen = np.vstack([d.targets, d.bodies[0, :, :3, 3]])
+    scene = style.view3d(
         "world",
         f"{of} {RESIDUALS}",
-        layout.near(middle, layout.EYE * size, live_seen(d)),
+        style.near(middle, style.EYE * size, seen),
         middle,
         [f"+ {world}/**"],
         overrides={f"{world}/{name}": every for name in ("arrows", "balls", "dots")},
@@ -293,25 +260,14 @@ def live_blueprint(d: LiveTally, world: str, series: str) -> rrb.Blueprint:
         origin=series,
         name=f"{of} {IN_TIME}",
         plot_legend=rrb.PlotLegend(visible=False),
-        axis_x=archetypes.TimeAxis(
-            view_range=rr.TimeRange(
-                start=rrb.TimeRangeBoundary.infinite(), end=rrb.TimeRangeBoundary.infinite()
-            )
-        ),
+        axis_x=archetypes.TimeAxis(view_range=rr.TimeRange(start=ever, end=ever)),
     )
-    told = rrb.Tabs(
-        rrb.TextDocumentView(origin="words/measuring", name="So far"),
-        rrb.TextDocumentView(origin="words/live_guide", name="How to read this"),
+    words = rrb.Tabs(
+        style.text("measuring", "So far"), style.text("live_guide", "How to read this")
     )
-    return layout.whole(
-        rrb.Horizontal(
-            rrb.Vertical(scene, in_time, row_shares=[11, 4]),
-            rrb.Vertical(told, _log(), row_shares=[3, 2]),
-            column_shares=[3, 2],
-        ),
-        TIMELINE,
-        "following",
-    )
+    left = rrb.Vertical(scene, in_time, row_shares=[11, 4])
+    right = rrb.Vertical(words, _log(), row_shares=[3, 2])
+    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), TIMELINE, "following")
 
 
 def _log() -> rrb.TextLogView:
@@ -321,18 +277,6 @@ def _log() -> rrb.TextLogView:
         text_log_columns=[rrb.encodings.TextLogColumn(kind=kind, visible=True) for kind in kinds],
     )
     return rrb.TextLogView(origin="log", name="Log", columns=shown)
-
-
-def live_seen(d: LiveTally) -> Floats:
-    """(K, 3) what is to be in the picture: targets and the arm in the first pose, m."""
-    return np.vstack([d.anchor.reshape(-1, 3), d.bodies[0, :, :3, 3]])
-
-
-_ABOVE = np.array([0.0, 0.0, 1.3 * BALL])
-BALLS = 60
-"""Readings from which a ball is drawn only where its arrow leaves it, for legibility."""
-MANY = 300
-"""Readings from which only arrows are drawn, and only those that leave their balls; a choice."""
 
 
 class LiveScene:
@@ -374,9 +318,7 @@ class LiveScene:
     def end(self, to_open: bool) -> None:
         """Tell the story once more, whole: its words know now which revision is the last.
 
-        Args:
-            to_open: let the recording open at the first revision, as a file does; else whoever
-                watches stays at the last one.
+        `to_open`: let it open at the first revision, as a file does; else it stays at the last one.
         """
         self.settle()
         self._now = None
@@ -403,45 +345,29 @@ class LiveScene:
         rec, d = self._rec, LiveTally.of(told)
         self._acts, self._now = self._acts + 1, d
         rec.send_recording_name(f"hilcal: {style.safe(told.name)}")
-        rec.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         self._arm = MovingArm(rec, f"{self._world}/arm", told.arm, told.targets)
-        rec.log("words/live_guide", style.document(GUIDE), static=True)
-        rec.log(
-            f"{self._world}/planned",
-            rr.Points3D(d.anchor.reshape(-1, 3), colors=[style.GREY], radii=[0.006]),
-            static=True,
-        )
+        fixed(rec, "words/live_guide", style.document(GUIDE))
+        planned = rr.Points3D(d.targets, colors=[style.GREY], radii=[0.006])
+        fixed(rec, f"{self._world}/planned", planned)
         for name, color in zip(style.LEVEL_NAMES, style.LEVEL_COLORS, strict=True):
-            marks = rr.SeriesPoints(
-                colors=[color], markers="circle", marker_sizes=[4.0], names=[name]
-            )
-            rec.log(f"{self._series}/{name}", marks, static=True)
+            fixed(rec, f"{self._series}/{name}", style.series(name, color, 0.0, 4.0)[1])
         line = rr.SeriesLines(colors=[style.NOISE], widths=[1.5], names=["99 %"])
-        rec.log(f"{self._series}/limit", line, static=True)
-        self._earlier(d)
+        fixed(rec, f"{self._series}/limit", line)
+        if told.earlier:  # what earlier sessions measured, as one batch
+            walls, steps = zip(*told.earlier, strict=True)
+            dots = rr.Points3D.columns(
+                positions=[d.place(step) for step in steps],
+                colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(steps), 1)),
+                radii=np.full(len(steps), 0.01),
+            )
+            time = rr.TimeColumn(TIMELINE, timestamp=list(walls))
+            along(rec, f"{self._world}/dots", time, dots)
         self._passed.append((wall, tuple(told.plan.q[0].tolist())))
         self._move()
         self._words(d)
         blueprint = live_blueprint(d, self._world, self._series)
         rec.send_blueprint(blueprint, make_active=True, make_default=True)
-
-    def _earlier(self, d: LiveTally) -> None:
-        """Send what earlier sessions measured as one batch."""
-        known = [(wall, d.place(step)) for wall, step in d.told.earlier]
-        if not known:
-            return
-        places = np.array([place for _, place in known])
-        self._rec.send_columns(
-            f"{self._world}/dots",
-            indexes=[
-                rr.TimeColumn(TIMELINE, timestamp=[wall for wall, _ in known]),
-            ],
-            columns=rr.Points3D.columns(
-                positions=places,
-                colors=np.tile(np.array(style.MEASURED, dtype=np.uint8), (len(places), 1)),
-                radii=np.full(len(places), 0.01),
-            ),
-        )
 
     def _move(self) -> None:
         """Send where the arm has been since the last time."""
@@ -452,9 +378,8 @@ class LiveScene:
 
     def _event(self, d: LiveTally, what: object) -> None:
         if isinstance(what, ReadingStored):
-            if (
-                self._batches and d.done > MANY
-            ):  # the arm stands at each reading, and skips its ways
+            if self._batches and d.done > MANY:
+                # the arm stands at each reading, and skips its ways
                 del self._passed[self._since : -1]
             self._since = len(self._passed)
             self._reading(d, what)
@@ -488,8 +413,7 @@ class LiveScene:
                 arrows.append(drawn)
             if d.judged <= (MANY if found.level else BALLS):
                 balls.append(at)
-            name = style.LEVEL_NAMES[found.level]
-            rec.log(f"{self._series}/{name}", rr.Scalars(found.sigma))
+            rec.log(f"{self._series}/{style.LEVEL_NAMES[found.level]}", rr.Scalars(found.sigma))
         if dots:
             dot = rr.Points3D(dots, colors=[style.MEASURED], radii=[0.01])
             rec.log(f"{self._world}/dots", dot)
@@ -505,7 +429,7 @@ class LiveScene:
         target, _, worst = max(read, key=lambda r: -1.0 if r[2] is None else r[2].norm2)
         words = f"{event.step.pose}, {event.step.load}"
         if worst is not None:
-            words += f"{', ' * bool(worst.target)}{worst.target}: {residual(worst)}"
+            words += f"{', ' * bool(worst.target)}{worst.target}: {worst}"
         rec.log(f"{self._world}/last", labels([d.place(event.step, target) + _ABOVE], [words]))
 
     def _words(self, d: LiveTally) -> None:
@@ -531,7 +455,7 @@ class LiveScene:
         rec.set_time("revision", sequence=new.revision)
         campaign.tell_revision(rec, self._story, new)
         rec.disable_timeline("revision")
-        titles = _titles(self._story)
+        titles = campaign.titles(self._story)
         if titles != self._titles or not earlier:
             views = campaign.blueprint(self._story)
             rec.send_blueprint(views, make_active=True, make_default=True)
@@ -542,24 +466,19 @@ Drawn = tuple[Floats, Floats, int]
 """Where an arrow begins, m; the arrow, m; its level."""
 
 
+def arrow(live: LiveResidual, found: LiveJudgement) -> Floats:
+    """(3,) a residual as drawn: its direction, and as long as sqrt(rᵀ V⁻¹ r) says, m."""
+    length = min(SIGMA_LENGTH * float(np.sqrt(found.norm2)), ARROW_CAP)
+    return np.asarray(length / (found.length or 1.0) * np.array(live.vector))
+
+
 def _arrows(of: Sequence[Drawn]) -> rr.Arrows3D:
     starts, vectors, levels = zip(*of, strict=True)
-    return rr.Arrows3D(
-        origins=starts,
-        vectors=vectors,
-        colors=[style.LEVEL_COLORS[level] for level in levels],
-        radii=[0.0055 if level else 0.0035 for level in levels],
-    )
+    colors = [style.LEVEL_COLORS[level] for level in levels]
+    radii = [0.0055 if level else 0.0035 for level in levels]
+    return rr.Arrows3D(origins=starts, vectors=vectors, colors=colors, radii=radii)
 
 
 def _balls(at: Sequence[Floats]) -> rr.Ellipsoids3D:
-    return rr.Ellipsoids3D(
-        centers=at,
-        half_sizes=[(BALL, BALL, BALL)] * len(at),
-        colors=[(*style.NOISE, 46)],
-        fill_mode="solid",
-    )
-
-
-def _titles(of: Story) -> tuple[str, ...]:
-    return campaign.residual_title(of), campaign.deflection_title(of), campaign.bars_title(of)
+    size, color = [(BALL, BALL, BALL)] * len(at), [(*style.NOISE, 46)]
+    return rr.Ellipsoids3D(centers=at, half_sizes=size, colors=color, fill_mode="solid")

@@ -1,6 +1,8 @@
-"""A plan in rerun: its recording, which shows it before anything is measured, also in words."""
+"""A plan in rerun, before anything is measured: the cell at each step, and the plan in words."""
 
-from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -9,18 +11,388 @@ import rerun.blueprint as rrb
 
 from hilcal import numbers
 from hilcal.cell import Cell
-from hilcal.config import CellConfig
+from hilcal.config import CellConfig, Obstacle
 from hilcal.design.next import PairPower
 from hilcal.design.summary import PlanSummary
+from hilcal.design.timing import pace, timeline
+from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
+from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
+from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
 from hilcal.present.document import Block, Words, heading, pairs, table
 from hilcal.present.plan import load_name
 from hilcal.present.running import spoken
-from hilcal.present.viewer import layout, plan_scene, recording, style
-from hilcal.present.viewer.plan_scene import SEEN, PlanView
+from hilcal.present.viewer import arm_shapes, recording, style
+from hilcal.present.viewer.recording import along, fixed
+from hilcal.robot import body
+from hilcal.robot import chain as chains
+from hilcal.robot.body import body_poses
 from hilcal.store.plan import UNLOADED, Plan
-from hilcal.types import Floats, Ints
+from hilcal.types import Bools, Floats, Ints
+
+SEEN, TURNED, HIDDEN, UNKNOWN = range(4)
+"""Does the tracker see the target: yes; it is turned too far away; something is between; not
+known, as the tracker's place is not."""
+_WAY_STEP_RAD = 0.08  # distance of the drawn points of a motion, of the leading joint
+
+
+@dataclass(frozen=True, eq=False)
+class PlanView:
+    """A plan in its cell: where everything is at each of its S steps, base axes, SI.
+
+    Attributes:
+        cell: the cell.
+        config: its loads, obstacles, limits and sight.
+        plan: poses and steps.
+        summary: cost, predicted precision and efficiency.
+        powers: of the suspects that the plan separates, pair by pair; else empty.
+
+    Raises:
+        InputError: the plan's poses do not have as many joints as the arm.
+    """
+
+    cell: Cell
+    config: CellConfig
+    plan: Plan
+    summary: PlanSummary
+    powers: tuple[PairPower, ...] = ()
+
+    def __post_init__(self) -> None:
+        """Refuse a plan of another arm."""
+        joints, arm = self.plan.q.shape[1], self.cell.arm
+        if joints != arm.n:
+            raise InputError(
+                f"the plan has {joints} joint angles per pose; {arm.name} has {arm.n} joints"
+            )
+
+    def __len__(self) -> int:
+        """Return the number of steps."""
+        return len(self.plan.steps)
+
+    @cached_property
+    def shapes(self) -> Clearance:
+        """Shapes of arm, tool, obstacles and loads, as collisions are checked."""
+        return clearance_of(self.cell, self.config)
+
+    @cached_property
+    def _view(self) -> LineOfSight | None:
+        return sight_of(self.shapes)
+
+    @property
+    def tracker(self) -> Floats | None:
+        """(3,) where the tracker stands; None where that is not known."""
+        return None if self._view is None else self._view.tracker
+
+    @cached_property
+    def loads(self) -> tuple[str, ...]:
+        """Names of the loads, in the order in which they are hung."""
+        return self.plan.loads
+
+    @cached_property
+    def load(self) -> Ints:
+        """(S,) index into `loads`."""
+        return np.array([self.loads.index(s.load) for s in self.plan.steps], dtype=np.int64)
+
+    @cached_property
+    def pose(self) -> Ints:
+        """(S,) index of the step's pose."""
+        row = {name: k for k, name in enumerate(self.plan.pose_names)}
+        return np.array([row[s.pose] for s in self.plan.steps], dtype=np.int64)
+
+    @property
+    def q(self) -> Floats:
+        """(S, n) joint angles, rad."""
+        return self.plan.q[self.pose]
+
+    @cached_property
+    def bodies(self) -> Floats:
+        """(S, n + 2, 4, 4) poses of base, bodies and flange."""
+        return body_poses(self.cell.arm, self.q)
+
+    @cached_property
+    def target(self) -> Floats:
+        """(S, 3) the target, or the flange where its place is not known."""
+        return chains.evaluate(self.cell.arm, self.q).point(self.cell.target[:3, 3])
+
+    @cached_property
+    def incidence(self) -> Floats | None:
+        """(S,) angle between the target's normal and the beam; None where not given."""
+        return None if self._view is None else self._view.incidence(self.q)
+
+    @cached_property
+    def sight(self) -> Ints:
+        """(S,) `SEEN` and so on."""
+        if self._view is None:
+            return np.full(len(self), UNKNOWN)
+        free = np.zeros(len(self), dtype=np.bool_)
+        for k, name in enumerate(self.loads):
+            free[self.load == k] = self._view.free(self.q[self.load == k], name)
+        angle, most = self.incidence, self.config.sight.incidence_max_rad
+        turned = np.zeros(len(self), dtype=np.bool_) if angle is None else angle > most
+        return np.where(~free, HIDDEN, np.where(turned, TURNED, SEEN)).astype(np.int64)
+
+    def why(self, step: int) -> str:
+        """Return why the target is not seen at a step; empty where it is."""
+        if self._view is None or self.sight[step] == SEEN:
+            return ""
+        q, load = self.q[step : step + 1], self.loads[self.load[step]]
+        problems = self._view.problems(q, load, "")
+        if words := "; ".join(line.removeprefix(": ") for line in problems):
+            return words
+        hidden = self._view.hidden(q, load)  # some of several targets
+        return f"hidden: {', '.join(self.cell.target_names[k] for k in hidden)}"
+
+    @cached_property
+    def rank(self) -> Ints:
+        """(S,) how many other loads are measured before in the same pose: its bead's place."""
+        order: dict[int, list[int]] = {}
+        pairs = list(zip(self.pose.tolist(), self.load.tolist(), strict=True))
+        for p, k in dict.fromkeys(pairs):
+            order.setdefault(p, []).append(k)
+        return np.array([order[p].index(k) for p, k in pairs], dtype=np.int64)
+
+    @cached_property
+    def ways(self) -> tuple[Floats, ...]:
+        """Of each step, (K, 3) the target's way there from the step before, straight in joints."""
+        stops = route(self.plan, self.cell.arm, self.config.limits.joint_margin_rad)
+        legs: list[list[Floats]] = [[]]
+        for a, b in pairwise(stops):
+            count = max(1, int(np.ceil(np.abs(b.q - a.q).max(initial=0.0) / _WAY_STEP_RAD)))
+            share = np.linspace(0.0, 1.0, count + 1)[:, None]
+            legs[-1].append(a.q + share * (b.q - a.q))
+            if b.step is not None:
+                legs.append([])
+        joined = [np.vstack(leg) for leg in legs if leg]
+        chain = chains.evaluate(self.cell.arm, np.vstack(joined))
+        ends = np.cumsum([len(leg) for leg in joined])[:-1]
+        return tuple(np.split(chain.point(self.cell.target[:3, 3]), ends))
+
+    @cached_property
+    def time(self) -> Floats:
+        """(S,) middle of each reading since the start, s."""
+        margin = self.config.limits.joint_margin_rad
+        return timeline(self.plan, self.cell.arm, margin, pace(self.config))[1]
+
+    @property
+    def reach(self) -> float:
+        """The arm's reach, m: sizes are drawn by it."""
+        return max(self.cell.arm.reach, 0.1)
+
+    @property
+    def steps(self) -> rr.TimeColumn:
+        """(S,) numbers of the steps on the timeline, from 1."""
+        return rr.TimeColumn("step", sequence=np.arange(1, len(self) + 1))
+
+    @property
+    def unseen(self) -> Bools:
+        """(S,) steps whose target the tracker does not see."""
+        return np.asarray((self.sight == TURNED) | (self.sight == HIDDEN))
+
+
+# In the order of SEEN, TURNED, HIDDEN, UNKNOWN.
+SIGHT_COLORS = np.array([style.NOISE, style.AMBER, style.RED, style.GREY], dtype=np.uint8)
+SIGHT_WORDS = ("seen", "turned too far away", "hidden", "sight not checked")
+# Labels stand on a plate in the theme's colour: these have a contrast of about 3 on both.
+_UNLOADED: style.Color = (225, 226, 230)
+# After Okabe & Ito's set for colour-blind readers, without the green, amber and red of the sight.
+_LOADS = np.array(
+    [
+        *((86, 180, 233), (240, 228, 66), (204, 121, 167), (70, 110, 235)),
+        *((205, 150, 110), (120, 220, 215), (165, 120, 245)),
+    ]
+)
+_FADED = 0.62
+BEAD, BEAD_GAP = 0.0075, 0.016
+"""Radius of a bead and distance of two in a stack, shares of the reach."""
+_OBSTACLE, _BOX, _TRACKER = (122, 112, 104), (64, 82, 108), (235, 235, 240)
+_SOLID = 90  # of 255: what stands behind an obstacle shows through
+_HEAD = 0.07  # m, of the drawn tracker
+_FORCE_LENGTH = 0.35  # the strongest pull is drawn this long, m
+_LABEL_ABOVE = 0.24  # m
+_DIM = 0.42  # of a colour: lines have no transparency
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def load_colors(names: tuple[str, ...]) -> "np.ndarray[tuple[int, ...], np.dtype[np.uint8]]":
+    """(L, 3) a colour of each load; beyond seven, the same again and darker."""
+    hung = [name for name in names if name != UNLOADED]
+    rgb = {n: _LOADS[k % 7] * _FADED ** (k // 7) for k, n in enumerate(hung)}
+    return np.array([rgb.get(n, np.array(_UNLOADED)) for n in names]).round().astype(np.uint8)
+
+
+def static_scene(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Log what never changes: shapes of the arm, what stands around, and a bead per reading."""
+    fixed(rec, "world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+    own = len(body.capsules(d.cell.arm))
+    arm_shapes.log_bodies(rec, d.shapes.scene.parts[:own], d.shapes.scene.parts[own:])
+    _obstacles(rec, d.config.obstacles)
+    _workspace(rec, d)
+    _beads(rec, d)
+    if d.tracker is not None:
+        at = d.tracker
+        low, high = ((at + k * _HEAD * _UP)[None] for k in (-1.2, 0.2))
+        fixed(rec, "world/tracker", arm_shapes.capsules(low, high, np.array([_HEAD]), [_TRACKER]))
+        name = arm_shapes.labels([at + 2.2 * _HEAD * _UP], ["tracker"])
+        fixed(rec, "world/tracker/name", name)
+
+
+def _obstacles(rec: rr.RecordingStream, things: tuple[Obstacle, ...]) -> None:
+    boxes = [x for x in things if x.center_m is not None]
+    for part, mode, alpha in (("body", "solid", _SOLID), ("edge", "majorwireframe", 255)):
+        if boxes:
+            drawn = rr.Boxes3D(
+                centers=[x.center_m or () for x in boxes],
+                sizes=[x.size_m or () for x in boxes],
+                colors=[(*_OBSTACLE, alpha)],
+                fill_mode=mode,  # type: ignore[arg-type]
+            )
+            fixed(rec, f"world/obstacles/box/{part}", drawn)
+    if stood := [x for x in things if x.bottom_m is not None]:
+        height = np.array([x.height_m for x in stood], dtype=float)
+        middle = np.array([x.bottom_m for x in stood]) + 0.5 * height[:, None] * _UP
+        cylinders = rr.Cylinders3D(
+            centers=middle,
+            lengths=height,
+            radii=[x.radius_m or 0.0 for x in stood],
+            colors=[(*_OBSTACLE, _SOLID)],
+            fill_mode="solid",
+        )
+        fixed(rec, "world/obstacles/cylinder", cylinders)
+    if things:
+        names = arm_shapes.labels([_named_at(x) for x in things], [x.name for x in things])
+        fixed(rec, "world/obstacles/names", names)
+
+
+def _named_at(thing: Obstacle) -> Floats:
+    """(3,) where an obstacle's name is written: on its top, or on a flat one's front edge."""
+    if thing.center_m is not None and thing.size_m is not None:
+        center, half = np.array(thing.center_m), 0.5 * np.array(thing.size_m)
+        flat = half[2] < 0.5 * min(half[:2])
+        return np.asarray(center + half * ([0.7, -0.7, 1.0] if flat else _UP))
+    return np.asarray(np.array(thing.bottom_m) + (thing.height_m or 0.0) * _UP)
+
+
+def _workspace(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Log the outline of every side of the workspace that is given."""
+    limits, reach = d.config.limits, 1.1 * d.reach
+    low = np.array(limits.workspace_min_m or (-reach, -reach, 0.0), dtype=float)
+    high = np.array(limits.workspace_max_m or (reach, reach, reach), dtype=float)
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    sides = []
+    for given, at in ((limits.workspace_min_m, low), (limits.workspace_max_m, high)):
+        for axis in range(3) if given is not None else ():
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            corners = np.tile(at, (5, 1))
+            corners[:, a] = [low[a], high[a], high[a], low[a], low[a]]
+            corners[:, b] = [low[b], low[b], high[b], high[b], low[b]]
+            sides.append(corners)
+    if sides:
+        lines = rr.LineStrips3D(sides, colors=[_BOX], radii=rr.Radius.ui_points(0.6))
+        fixed(rec, "world/workspace", lines)
+
+
+def _beads(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Log a bead per pose and load, and a cage around those that the tracker does not see."""
+    pairs = np.stack([d.pose, d.load], 1)
+    steps = np.sort(np.unique(pairs, axis=0, return_index=True)[1])
+    at = d.target[steps] + d.rank[steps, None] * BEAD_GAP * d.reach * _UP
+    colors = load_colors(d.loads)[d.load[steps]]
+    fixed(rec, "world/target/beads", rr.Points3D(at, colors=colors, radii=BEAD * d.reach))
+    lost = d.unseen[steps]
+    if lost.any():
+        cages = rr.Ellipsoids3D(
+            centers=at[lost],
+            half_sizes=np.full((int(lost.sum()), 3), 1.9 * BEAD * d.reach),
+            colors=SIGHT_COLORS[d.sight[steps[lost]]],
+            fill_mode="majorwireframe",
+            line_radii=rr.Radius.ui_points(0.5),
+        )
+        fixed(rec, "world/target/unseen", cages)
+
+
+def step_scene(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Send what changes with every step, as columns on `step`."""
+    arm_shapes.send_stands(rec, d.steps, d.bodies[:, :-1])
+    colors, beams = load_colors(d.loads)[d.load], SIGHT_COLORS[d.sight]
+
+    def lines(path: str, strips: object, of: object, radius: float) -> None:
+        radii = np.full(len(d), radius * d.reach)
+        drawn = rr.LineStrips3D.columns(strips=strips, colors=of, radii=radii)  # type: ignore[arg-type]
+        along(rec, path, d.steps, drawn)
+
+    now = np.full(len(d), 1.7 * BEAD * d.reach)
+    points = rr.Points3D.columns(positions=d.target, colors=colors, radii=now)
+    along(rec, "world/target/now", d.steps, points)
+    above = d.target + (_LABEL_ABOVE + d.rank.max(initial=0) * BEAD_GAP * d.reach) * _UP
+    words = [
+        f"{k}: {s.pose}, {load_name(s.load)}{_sight_words(d, k - 1)}"
+        for k, s in enumerate(d.plan.steps, start=1)
+    ]
+    labels = arm_shapes.label_columns(above + 0.25 * _LABEL_ABOVE * _UP, words)
+    along(rec, "world/label", d.steps, labels)
+    lines("world/label/leader", np.stack([d.target, above], 1), beams, 0.0012)
+    if d.tracker is not None:
+        start = np.broadcast_to(d.tracker, d.target.shape)
+        lines("world/beam", np.stack([start, d.target], 1), beams, 0.004)
+    lines("world/way/last", list(d.ways), colors, 0.0022)
+    _loads(rec, d)
+    _whole_ways(rec, d)
+
+
+def framed(d: PlanView) -> tuple[Floats, float]:
+    """Middle of what should be in the picture and its half size, m; a far tracker counts less."""
+    points = [np.zeros((1, 3)), d.target]
+    if d.tracker is not None:
+        far = float(np.linalg.norm(d.tracker))
+        points.append((d.tracker * min(1.0, 1.6 * d.reach / max(far, 1e-9)))[None])
+    lo, hi = np.vstack(points).min(0), np.vstack(points).max(0)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.35 * d.reach)
+
+
+def _sight_words(d: PlanView, step: int) -> str:
+    sight = int(d.sight[step])
+    return f": {SIGHT_WORDS[sight]}" if d.unseen[step] or sight == SEEN else ""
+
+
+def _loads(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Log what hangs or pulls, at the steps where there is some; cleared where there is none."""
+    forces = {x.name: np.array(x.force_N) for x in d.config.loads}
+    most = max((float(np.linalg.norm(f)) for f in forces.values()), default=0.0)
+    hook = chains.evaluate(d.cell.arm, d.q).point(d.cell.load_point)
+    for name, color in zip(d.loads, load_colors(d.loads), strict=True):
+        steps = np.flatnonzero(d.load == d.loads.index(name))
+        hung = d.shapes.segments(d.q[steps], name)
+        force = forces.get(name, np.zeros(3))
+        for i, step in enumerate(steps.tolist()):
+            rec.set_time("step", sequence=step + 1)
+            parts: dict[str, rr.AsComponents] = dict.fromkeys(
+                ("capsules", "arrow"), rr.Clear(recursive=False)
+            )
+            if hung:
+                start, end = (np.array([getattr(x, k)[i] for x in hung]) for k in ("start", "end"))
+                radius = np.array([x.radius for x in hung])
+                parts["capsules"] = arm_shapes.capsules(start, end, radius, [color])
+            if force.any():
+                way = [_FORCE_LENGTH * force / most]
+                parts["arrow"] = rr.Arrows3D(
+                    origins=[hook[step]], vectors=way, colors=[color], radii=[0.006 * d.reach]
+                )
+            for part, drawn in parts.items():
+                rec.log(f"world/load/{part}", drawn)
+    rec.reset_time()
+
+
+def _whole_ways(rec: rr.RecordingStream, d: PlanView) -> None:
+    """Log the target's whole way under the load of the step."""
+    colors = (_DIM * load_colors(d.loads)).astype(np.uint8)
+    starts = [0, *(np.flatnonzero(np.diff(d.load)) + 1).tolist(), len(d)]
+    for start, end in pairwise(starts):
+        rec.set_time("step", sequence=start + 1)
+        way, color = [np.vstack(d.ways[start:end])], [colors[d.load[start]]]
+        drawn = rr.LineStrips3D(way, colors=color, radii=rr.Radius.ui_points(0.6))
+        rec.log("world/way/whole", drawn)
+    rec.reset_time()
 
 
 def record_plan(
@@ -58,62 +430,34 @@ def record_plan(
 
 def _log(rec: rr.RecordingStream, d: PlanView) -> None:
     rec.send_recording_name(f"hilcal plan: {style.safe(d.cell.arm.name)}, {len(d)} readings")
-    plan_scene.static_scene(rec, d)
-    for name, text in (
-        ("plan", overview(d)),
-        ("notes", notes(d)),
-        ("guide", GUIDE),
-        ("parameters", style.markdown(plan_blocks.parameters_table(d.summary))),
-        ("criteria", style.markdown(plan_blocks.criteria_table(d.summary))),
-    ):
-        rec.log(f"words/{name}", style.document(text), static=True)
-    if d.summary.curve:
-        curve(rec, d.summary)
+    static_scene(rec, d)
+    _, _, *tables = plan_blocks.plan_report(d.summary)
+    times = pairs(row for row in plan_blocks.cost_rows(d.summary) if row[0] in NOT_FIRST)
+    details = style.markdown([times, *tables])
+    for name, text in (("plan", overview(d)), ("guide", GUIDE), ("details", details)):
+        fixed(rec, f"words/{name}", style.document(text))
     recording.flush(rec)
-    plan_scene.step_scene(rec, d)
+    step_scene(rec, d)
     schedule(rec, d)
-    cards = [step_card(d, k) for k in range(len(d))]
-    rec.send_columns(
-        "words/step",
-        indexes=[rr.TimeColumn("step", sequence=d.numbers)],
-        columns=rr.TextDocument.columns(text=cards, media_type=["text/markdown"] * len(cards)),
-    )
+    along(rec, "words/step", d.steps, style.documents([step_card(d, k) for k in range(len(d))]))
     recording.flush(rec)
 
 
-_DETECTABLE = 6
-"""Effects that are named in the overview."""
+NOT_FIRST = ("", "takes about")
+"""Rows of what a plan costs that stand with the details."""
 
 
 def overview(d: PlanView) -> str:
     """Return what a plan is for, its cost and efficiency; short, since a small window cuts it."""
     s = d.summary
-    title: Block = heading(
-        f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
-    )
-    rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in ("", "takes about")]
+    told = f"Plan: {s.poses} poses, {s.readings} readings, {spoken(s.duration.total)}"
+    rows = [row for row in plan_blocks.cost_rows(s) if row[0] not in NOT_FIRST]
     asked: list[Block] = []
     if d.powers:
         names = list(dict.fromkeys(t.effect for t in d.powers))
         question = heading(f"Which is it: {numbers.names(names, 'or')}?")
         asked = [question, plan_blocks.power_table(d.powers)]
-    return style.markdown([*asked, title, pairs([*rows, ("tracker", sight(d))])])
-
-
-def notes(d: PlanView) -> str:
-    """Return cost, remarks, what more poses would give, detectable effects and order of a plan."""
-    return style.markdown(_notes(d.summary))
-
-
-def _notes(s: PlanSummary) -> Iterator[Block]:
-    yield from (heading("Notes"), pairs(plan_blocks.cost_rows(s)))
-    yield from map(numbers.sentence, s.remarks)
-    if s.curve:
-        yield plan_blocks.enough(s.curve)
-    if found := plan_blocks.detectable(s):
-        named = [f"{effect} from {least}" for effect, least in found]
-        yield f"Detectable outside of the model: {numbers.few(named, _DETECTABLE)}."
-    yield from (plan_blocks.undetectable(s), plan_blocks.order_remark(s))
+    return style.markdown([*asked, heading(told), pairs([*rows, ("tracker", sight(d))])])
 
 
 def sight(d: PlanView) -> str:
@@ -129,11 +473,11 @@ def sight(d: PlanView) -> str:
 def step_card(d: PlanView, k: int) -> str:
     """Return step k (from 0) in words."""
     step = d.plan.steps[k]
-    under = "unloaded" if step.load == UNLOADED else f"under {step.load}"
-    head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {under}")
+    head = heading(f"Step {k + 1} of {len(d)}: {step.pose}, {load_name(step.load, 'under ')}")
     when = f"Minute {d.time[k] / 60.0:.0f} of {d.time[-1] / 60.0:.0f}."
     changes = bool(k) and d.load[k] != d.load[k - 1]
-    before = [Words(f"Before it: {_change(step.load)}, by hand.", "strong")] if changes else []
+    change = "everything is taken off" if step.load == UNLOADED else f"{step.load} is hung"
+    before = [Words(f"Before it: {change}, by hand.", "strong")] if changes else []
     angles = np.rad2deg(d.plan.joints(step.pose))
     rows = [(n, f"{a:.1f}") for n, a in zip(d.cell.arm.joint_names, angles, strict=True)]
     x, y, z = d.target[k]
@@ -141,10 +485,6 @@ def step_card(d: PlanView, k: int) -> str:
     place = f"{what} at {x:.3f}, {y:.3f}, {z:.3f} m, base axes."
     joints = table("joint", "deg", rows=rows)
     return style.markdown([head, when, *before, _sight(d, k), joints, place])
-
-
-def _change(load: str) -> str:
-    return "everything is taken off" if load == UNLOADED else f"{load} is hung"
 
 
 def _sight(d: PlanView, k: int) -> Words:
@@ -184,58 +524,25 @@ _DOT = 3.5
 
 def schedule(rec: rr.RecordingStream, d: PlanView) -> None:
     """Send the minute of each reading along `step`, one series per load; load changes are jumps."""
-    colors = plan_scene.load_colors(d.loads)
-    for k, name in enumerate(d.loads):
-        _dots(rec, d, f"load{k}", load_name(name), np.flatnonzero(d.load == k), tuple(colors[k]))
+    colors = load_colors(d.loads)
+    series = [
+        (f"load{k}", load_name(name), d.load == k, tuple(colors[k]), "circle", _DOT)
+        for k, name in enumerate(d.loads)
+    ]
     if d.unseen.any():
-        lost = np.flatnonzero(d.unseen)
-        _dots(rec, d, "unseen", "not seen by the tracker", lost, style.RED, "cross")
-
-
-def _dots(
-    rec: rr.RecordingStream,
-    d: PlanView,
-    entity: str,
-    name: str,
-    steps: Ints,
-    color: style.Color,
-    marker: str = "circle",
-) -> None:
-    points = rr.SeriesPoints(
-        names=[f"{style.safe(name)}: {len(steps)}"],
-        colors=[color],
-        markers=[marker],  # type: ignore[list-item]
-        marker_sizes=[_DOT if marker == "circle" else 2.0 * _DOT],
-    )
-    rec.log(f"schedule/{entity}", points, static=True)
-    rec.send_columns(
-        f"schedule/{entity}",
-        indexes=[rr.TimeColumn("step", sequence=d.numbers[steps])],
-        columns=rr.Scalars.columns(scalars=d.time[steps] / 60.0),
-    )
-
-
-def curve_unit(s: PlanSummary) -> tuple[str, float]:
-    """Return the unit of the sample-size curve and its factor."""
-    return numbers.unit_for("m", [p.position_std_m for p in s.curve])
-
-
-def curve(rec: rr.RecordingStream, s: PlanSummary) -> None:
-    """Log the sample-size curve as bars; the one nearest to the plan is a series of its own."""
-    poses = np.array([p.poses for p in s.curve], dtype=float)
-    height = curve_unit(s)[1] * np.array([p.position_std_m for p in s.curve])
-    width = 0.6 * float(np.diff(poses).min(initial=poses.max(initial=1.0)))
-    own = np.zeros(len(poses), dtype=np.bool_)
-    own[np.argmin(np.abs(poses - s.poses))] = True
-    for name, bars, color in (("other", ~own, style.GREY), ("plan", own, style.MEASURED)):
-        if bars.any():
-            chart = rr.BarChart(
-                height[bars],
-                abscissa=poses[bars],
-                widths=np.full(int(bars.sum()), width),
-                color=color,
-            )
-            rec.log(f"curve/{name}", chart, static=True)
+        told = "not seen by the tracker"
+        series.append(("unseen", told, d.unseen, style.RED, "cross", 2 * _DOT))
+    for entity, name, of, color, marker, size in series:
+        points = rr.SeriesPoints(
+            names=[f"{style.safe(name)}: {int(of.sum())}"],
+            colors=[color],
+            markers=[marker],  # type: ignore[list-item]
+            marker_sizes=[size],
+        )
+        fixed(rec, f"schedule/{entity}", points)
+        time = rr.TimeColumn("step", sequence=np.flatnonzero(of) + 1)
+        minutes = rr.Scalars.columns(scalars=d.time[of] / 60.0)
+        along(rec, f"schedule/{entity}", time, minutes)
 
 
 _FPS = 2.0
@@ -247,54 +554,21 @@ SCHEDULE = "Schedule: minute of each reading by step, colour by load"
 
 
 def blueprint(d: PlanView) -> rrb.Blueprint:
-    """Left: 3-D over the schedule. Right: the plan in words over the curve, with tables."""
-    scenes = [_steps(d)]
+    """Left: 3-D over the schedule. Right: the plan in words over its tables."""
+    middle, size = framed(d)
+    scenes = [style.view3d("world", STEPS, middle + size * _eye(d, middle, size), middle)]
     if d.tracker is not None:
         scenes.append(_from_tracker(d, d.tracker))
-    left = rrb.Vertical(rrb.Tabs(*scenes), _schedule(), row_shares=[7, 2])
-    right: list[rrb.View | rrb.Container] = [
-        rrb.Tabs(
-            rrb.TextDocumentView(origin="words/plan", name="Plan"),
-            rrb.TextDocumentView(origin="words/step", name="This step"),
-            rrb.TextDocumentView(origin="words/notes", name="Notes"),
-            rrb.TextDocumentView(origin="words/guide", name="How to read this"),
-        )
-    ]
-    details = _details(d)
-    if details:
-        right.append(rrb.Tabs(*details))
-    shares = [5, 4][: len(right)]
-    return layout.whole(
-        rrb.Horizontal(left, rrb.Vertical(*right, row_shares=shares), column_shares=[3, 2]),
-        "step",
-        fps=_FPS,
+    legend = rrb.PlotLegend(rrb.Corner2D.RightBottom)
+    times = rrb.TimeSeriesView(origin="schedule", name=SCHEDULE, plot_legend=legend)
+    words = (("plan", "Plan"), ("step", "This step"), ("guide", "How to read this"))
+    left = rrb.Vertical(rrb.Tabs(*scenes), times, row_shares=[7, 2])
+    right = rrb.Vertical(
+        rrb.Tabs(*(style.text(*w) for w in words)),
+        style.text("details", "Details"),
+        row_shares=[5, 4],
     )
-
-
-def curve_title(d: PlanView) -> str:
-    """Return the title of the sample-size curve, with its unit."""
-    unit = curve_unit(d.summary)[0]
-    return f"Position ± [{unit}] by number of poses; blue: nearest to this plan"
-
-
-def _details(d: PlanView) -> list[rrb.View]:
-    out: list[rrb.View] = []
-    if d.summary.curve:
-        out.append(
-            rrb.BarChartView(
-                origin="curve", name=curve_title(d), plot_legend=rrb.PlotLegend(visible=False)
-            )
-        )
-    if d.summary.criteria:
-        out.append(rrb.TextDocumentView(origin="words/criteria", name="Criteria"))
-    if d.summary.parameters:
-        out.append(rrb.TextDocumentView(origin="words/parameters", name="Parameters"))
-    return out
-
-
-def _steps(d: PlanView) -> rrb.Spatial3DView:
-    middle, size = plan_scene.framed(d)
-    return layout.view3d("world", STEPS, middle + size * _eye(d, middle, size), middle)
+    return style.whole(rrb.Horizontal(left, right, column_shares=[3, 2]), "step", fps=_FPS)
 
 
 def _from_tracker(d: PlanView, place: Floats) -> rrb.Spatial3DView:
@@ -302,7 +576,7 @@ def _from_tracker(d: PlanView, place: Floats) -> rrb.Spatial3DView:
     contents += [f"- $origin/{x}/**" for x in ("tracker", "beam", "workspace", "way")]
     at = d.target.mean(axis=0)
     far = float(np.linalg.norm(place - at))
-    return layout.view3d("world", f"{TRACKER}, {numbers.length(far)} away", place, at, contents)
+    return style.view3d("world", f"{TRACKER}, {numbers.length(far)} away", place, at, contents)
 
 
 def _eye(d: PlanView, middle: Floats, size: float) -> Floats:
@@ -313,10 +587,4 @@ def _eye(d: PlanView, middle: Floats, size: float) -> Floats:
         turn = float(np.arctan2(beam[1], beam[0]) - np.deg2rad(62.0))
     some = np.unique(np.linspace(0, len(d) - 1, _LOOKED_AT).round().astype(np.int64))
     points = np.vstack([d.bodies[some, 1:, :3, 3].reshape(-1, 3), d.target[some]])
-    return layout.direction(turn, middle, size, points, d.config.obstacles)
-
-
-def _schedule() -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        origin="schedule", name=SCHEDULE, plot_legend=rrb.PlotLegend(rrb.Corner2D.RightBottom)
-    )
+    return style.direction(turn, middle, size, points, d.config.obstacles)

@@ -50,16 +50,36 @@ def opened(*content: object) -> rr.RecordingStream:
     for part in content:
         array = isinstance(part, np.ndarray)
         sha.update(np.ascontiguousarray(part).tobytes() if array else repr(part).encode())
+    identifier = str(uuid.UUID(bytes=sha.digest()[:16]))
+    # Chunks end where the stream is flushed, not when a clock ticks: equal files.
+    return stream(identifier, rr.ChunkBatcherConfig.NEVER())
+
+
+def stream(identifier: str, batches: rr.ChunkBatcherConfig | None) -> rr.RecordingStream:
+    """Return a recording that has no other times than those that are set."""
     rec = rr.RecordingStream(
-        APPLICATION,
-        recording_id=str(uuid.UUID(bytes=sha.digest()[:16])),
-        send_properties=False,
-        # Chunks end where the stream is flushed, not when a clock ticks: equal files.
-        batcher_config=rr.ChunkBatcherConfig.NEVER(),
+        APPLICATION, recording_id=identifier, send_properties=False, batcher_config=batches
     )
     rec.set_log_time_enabled(False)
     rec.set_log_tick_enabled(False)
     return rec
+
+
+def slow(error: Exception) -> bool:
+    """Whether a failure is only that somebody did not take the data in time."""
+    return "timeout" in str(error).lower() or "timed out" in str(error).lower()
+
+
+def fixed(rec: rr.RecordingStream, path: str, *drawn: rr.AsComponents) -> None:
+    """Log what never changes."""
+    rec.log(path, *drawn, static=True)
+
+
+def along(
+    rec: rr.RecordingStream, path: str, time: rr.TimeColumn, columns: rr.ComponentColumnList
+) -> None:
+    """Send what an entity is at each of some times."""
+    rec.send_columns(path, indexes=[time], columns=columns)
 
 
 def require_folder(path: Path) -> None:
@@ -75,7 +95,7 @@ def require_folder(path: Path) -> None:
 def write(
     rec: rr.RecordingStream, blueprint: rrb.Blueprint, tell: Callable[[], None], path: Path
 ) -> None:
-    """Write what is told to a stream as a file, and close the stream.
+    """Write what is told to a stream as a file, whole or not at all, and close the stream.
 
     The recording is encoded in memory: rerun's own file sink can wait forever on a full disk.
 
@@ -100,7 +120,7 @@ def flush(rec: rr.RecordingStream) -> None:
     try:
         rec.flush(timeout_sec=_FLUSH_TIMEOUT)
     except (ValueError, RuntimeError, OSError) as error:
-        if "timeout" in str(error).lower() or "timed out" in str(error).lower():
+        if slow(error):
             _LOG.warning("recording: a viewer is slow: %s", error)
             return
         raise HilcalError(f"the recording's sink failed: {error}") from error

@@ -1,15 +1,19 @@
-"""What all views share: colours, nice scales, text without a missing glyph, markdown."""
+"""What all views share: colours, nice scales, text without a missing glyph, frames and eyes."""
 
 import math
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 from scipy import stats
 
+from hilcal.config import Obstacle
 from hilcal.present import story
 from hilcal.present.document import Block, Chart, Items, Table, Words
+from hilcal.types import Bools, Floats
 
 Color = tuple[int, int, int]
 
@@ -33,6 +37,7 @@ BALL_SIGMAS = float(np.sqrt(stats.chi2.ppf(story.LIMITS[0], 3)))
 
 # Greek letters and these signs are in the viewer's fonts; a missing glyph ends the viewer.
 _SIGNS = "■●▲→µ²³±×√Δ✓✗⚠°"
+_BARS = str.maketrans("", "", "▁▂▃▄▅▆▇█")  # of tables on a terminal; not in the viewer's fonts
 _UNSAFE = re.compile(rf"[^\n\x20-\x7e\u00a1-\u00ac\u00ae-\u00ff\u0391-\u03a9\u03b1-\u03c9{_SIGNS}]")
 _MARKDOWN = re.compile(r"([\\`*_\[\]<>|#~$])")
 
@@ -44,7 +49,7 @@ def safe(text: str) -> str:
 
 def escaped(text: str) -> str:
     """Text made safe, on one line, and without any meaning in markdown."""
-    return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.split())))
+    return _MARKDOWN.sub(r"\\\1", safe(" ".join(text.translate(_BARS).split())))
 
 
 def nice(value: float) -> float:
@@ -63,9 +68,23 @@ def markdown(blocks: Iterable[Block]) -> str:
     return "\n\n".join(filter(None, map(_one, blocks)))
 
 
+def series(name: str, color: Color, width: float, mark: float) -> tuple[rr.AsComponents, ...]:
+    """Return how a series of numbers is drawn: a line of some width with marks of some size."""
+    names, colors = [safe(name)], [color]
+    return (
+        rr.SeriesLines(names=names, colors=colors, widths=[width]),
+        rr.SeriesPoints(names=names, colors=colors, markers=["circle"], marker_sizes=[mark]),
+    )
+
+
 def document(text: str) -> rr.TextDocument:
     """Return markdown as the viewer takes it."""
     return rr.TextDocument(text, media_type="text/markdown")
+
+
+def documents(texts: list[str]) -> rr.ComponentColumnList:
+    """Return one such document for each of some times."""
+    return rr.TextDocument.columns(text=texts, media_type=["text/markdown"] * len(texts))
 
 
 def _one(block: Block) -> str:
@@ -88,8 +107,123 @@ def _one(block: Block) -> str:
 
 def _table(of: Table) -> str:
     if not any(of.heads):
-        return "\n".join(f"- **{escaped(name)}** {escaped(said)}" for name, said in of.rows)
+        rows = ((f"**{escaped(name)}** " if name else "") + escaped(said) for name, said in of.rows)
+        return "\n".join(f"- {row}" for row in rows)
     cells = [of.heads, *of.rows]
     lines = [f"| {' | '.join(escaped(c) or ' ' for c in row)} |" for row in cells]
     sides = ["---" if k in of.left else "---:" for k in range(len(of.heads))]
     return "\n".join([lines[0], f"| {' | '.join(sides)} |", *lines[1:]])
+
+
+_TURNS = np.deg2rad(np.array([0, 15, -15, 30, -30, 45, -45, 60, -60, 90, -90, 120, -120, 150, 180]))
+_HEIGHTS = (0.75, 1.2)
+_SAMPLES = np.linspace(0.0, 0.98, 80)  # of a line of sight
+_FOV = np.deg2rad(55.0)  # of the viewer's eye, upright
+_ASPECT = 1.15  # of a small window, without the room for labels at both sides
+_EDGE = 0.92  # of the view is used at most
+_FACTORS = np.arange(0.7, 2.51, 0.05)
+_WORTH = 0.02  # share of points that must come into sight for the eye to go one place further
+
+
+def hidden(eye: Floats, points: Floats, things: tuple[Obstacle, ...]) -> Bools:
+    """Return (K,) which of the points (K, 3) an obstacle hides from an eye (3,), m."""
+    at = eye + _SAMPLES[:, None] * (points - eye)[:, None]
+    out = np.zeros(len(points), dtype=np.bool_)
+    for x in things:
+        if x.center_m is not None and x.size_m is not None:
+            off = np.abs(at - np.array(x.center_m)) <= 0.5 * np.array(x.size_m)
+            out |= off.all(axis=2).any(axis=1)
+        elif x.bottom_m is not None and x.radius_m is not None and x.height_m is not None:
+            off = at - np.array(x.bottom_m)
+            inside = np.hypot(off[..., 0], off[..., 1]) <= x.radius_m
+            out |= (inside & (off[..., 2] >= 0.0) & (off[..., 2] <= x.height_m)).any(axis=1)
+    return np.asarray(out)
+
+
+def direction(
+    turn: float, middle: Floats, size: float, points: Floats, things: tuple[Obstacle, ...]
+) -> Floats:
+    """Return the direction (3,) to the eye, in half sizes (m) of the picture about its middle (3,).
+
+    It is that near the preferred `turn` about z, rad, from where things hide fewest points (K, 3).
+    """
+    angles = [(turn + a, z) for z in _HEIGHTS for a in _TURNS]
+    places = [np.array([1.7 * np.cos(a), 1.7 * np.sin(a), z]) for a, z in angles]
+    covered = [hidden(middle + size * place, points, things).mean() for place in places]
+    return places[int(np.argmin(covered + _WORTH * np.arange(len(places))))]
+
+
+def in_view(eye: Floats, look: Floats, points: Floats) -> Bools:
+    """Return (K,) which of the points (K, 3) an eye sees that looks at a place, z upwards."""
+    ahead = (look - eye) / np.linalg.norm(look - eye)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    way = points - eye
+    depth = way @ ahead
+    half = _EDGE * np.tan(_FOV / 2) * depth
+    upright = np.abs(way @ np.cross(right, ahead))
+    return np.asarray((depth > 0.0) & (upright < half) & (np.abs(way @ right) < _ASPECT * half))
+
+
+def center(points: Floats, reach: float) -> tuple[Floats, float]:
+    """Middle of points (K, 3) and the origin, and half their size: where the eye looks, m."""
+    points = np.vstack([points, np.zeros((1, 3))])
+    lo, hi = points.min(0), points.max(0)
+    return (lo + hi) / 2, max(float(np.linalg.norm(hi - lo)) / 2, 0.3 * reach)
+
+
+def near(look: Floats, way: Floats, points: Floats) -> Floats:
+    """Return the place (3,) of the eye, as near along `way` from `look` as shows all points."""
+    places = [look + f * way for f in _FACTORS]
+    return next((x for x in places if in_view(x, look, points).all()), places[-1])
+
+
+EYE = np.array([1.05, -1.35, 0.55])
+# Views that draw with light colours stay dark in the light theme too.
+BACKGROUND = rrb.Background(color=(22, 24, 29), kind=rrb.BackgroundKind.SolidColor)
+
+GRID = rrb.LineGrid3D(visible=True, spacing=0.25, stroke_width=0.7, color=(120, 124, 132, 70))
+
+
+def whole(
+    contents: rrb.Container,
+    timeline: str,
+    play: Literal["paused", "following"] = "paused",
+    fps: float | None = None,
+) -> rrb.Blueprint:
+    """Return a blueprint of these views alone, over a line for the time."""
+    return rrb.Blueprint(
+        contents,
+        rrb.TimePanel(timeline=timeline, state="collapsed", fps=fps, play_state=play),
+        rrb.SelectionPanel(state="hidden"),
+        rrb.BlueprintPanel(state="hidden"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def text(of: str, name: str) -> rrb.TextDocumentView:
+    """Return a view of words."""
+    return rrb.TextDocumentView(origin=f"words/{of}", name=name)
+
+
+def view3d(
+    origin: str,
+    name: str,
+    place: Floats,
+    look: Floats,
+    contents: Sequence[str] = ("$origin/**",),
+    **more: Any,
+) -> rrb.Spatial3DView:
+    """Return a 3-D view whose eye stands at a place and looks at another, z upwards."""
+    return rrb.Spatial3DView(
+        origin=origin,
+        contents=list(contents),
+        name=name,
+        background=BACKGROUND,
+        line_grid=GRID,
+        eye_controls=rrb.EyeControls3D(
+            kind=rrb.Eye3DKind.Orbital, position=place, look_target=look, eye_up=(0.0, 0.0, 1.0)
+        ),
+        **more,
+    )

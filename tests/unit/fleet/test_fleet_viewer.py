@@ -44,7 +44,10 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None
     d = drawn_type(of, whole.members)
     assert np.argwhere(d.odd).tolist() == [[ODD, d.names.index("joint_compliance.j3")]]
     assert d.joints == tuple(int(name[-1]) for name in d.names)
-    assert (d.units.shape, d.campaigns.shape) == ((ARMS, len(d.names)), (2 * ARMS, len(d.names)))
+    assert (d.pooled.distance.shape, d.campaigns.shape) == (
+        (ARMS, len(d.names)),
+        (2 * ARMS, len(d.names)),
+    )
     assert [d.owner[k] for k in (0, 1, 2)] == [0, 0, 1]
     assert d.seconds[1] - d.seconds[0] == 59 * 86400
     odd = d.campaigns[np.array(d.owner) == ODD][:, d.names.index("joint_compliance.j3")]

@@ -20,7 +20,6 @@ from hilcal.present.fit import before_and_after, errors, fit_report, worst_poses
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.verdict import message
 from hilcal.present.viewer import campaign as viewer
-from hilcal.present.viewer import campaign_scene as viewer_scene
 from tests.support.campaigns import campaign
 
 
@@ -87,7 +86,7 @@ def test_a_p_value_reads_the_same_wherever_it_stands(absolute):
     revision = story.revisions[0]
     panel = viewer.verdict(story, revision)
     assert f"| {value.replace('<', chr(92) + '<')} |" in panel
-    assert numbers.p_equals(lead.score.p_value) in revision.message
+    assert numbers.p_equals(lead.score.p_value) in str(revision.panels["verdict"][0])
 
 
 @pytest.mark.parametrize(
@@ -123,6 +122,6 @@ def test_terminal_and_viewer_call_the_worst_pose_by_its_name(absolute):
     worst = worst_poses(full_prediction(absolute))[0]
     story = build_story([Chapter(1, None, absolute, None)])
     assert worst.pose in absolute.readings.pose_names
-    assert story.pose_name(viewer_scene.worst(story.revisions[0])) == worst.pose
+    assert story.pose_name(viewer.worst(story.revisions[0])) == worst.pose
     details = viewer.details(story, story.revisions[0])
     assert f"Worst: pose {worst.pose}, load {worst.load}," in details

@@ -13,7 +13,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import Fit, fit
 from hilcal.present.charts import style
-from hilcal.present.charts.comparisons import error_per_revision
+from hilcal.present.charts.comparisons import MOST, error_per_revision, made_of
 from hilcal.present.charts.evidence import (
     added_variable,
     correlations,
@@ -22,7 +22,6 @@ from hilcal.present.charts.evidence import (
     noise_check,
     parameter_correlations,
 )
-from hilcal.present.charts.made_of import MOST, made_of
 from hilcal.present.charts.readings import (
     LONGEST,
     drawn,

@@ -19,8 +19,8 @@ from hilcal import numbers
 from hilcal.calibration.budget import budget
 from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
-from hilcal.present.html.content import ReportContent
-from hilcal.present.html.first_screen import (
+from hilcal.present.html.certificate import (
+    ReportContent,
     first_screen,
     left_out_errors,
     limit_words,

@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
-from hilcal.present.viewer import campaign, campaign_scene, save, style
+from hilcal.present.viewer import campaign, save, style
 from hilcal.robot.body import body_poses, capsules
 from tests.support.recordings import rows, same, texts, values
-from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
+from tests.support.viewer_story import story, ur10e
 
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
 READINGS = 90
@@ -55,51 +55,6 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
         assert called in {words for _, words, _ in campaign.SERIES}
 
 
-def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return left and right edges and heights of the bars of a revision."""
-    left, width, height = (
-        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
-        if name != "widths"
-        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
-        for name in ("abscissa", "widths", "values")
-    )
-    return left, left + width, height
-
-
-def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
-    told, path = doubtful(), tmp_path / "doubt.rrd"
-    save(told, path)
-    left, right, height = bars(path, "/follows/mean", 2)
-    np.testing.assert_allclose(height, ANGLE.y)
-    assert ((left < ANGLE.x) & (ANGLE.x < right)).all()
-    np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
-    assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
-
-
-def test_loads_stand_beside_each_other_in_their_order(tmp_path):
-    told, path = doubtful(), tmp_path / "load.rrd"
-    third = replace(told.revisions[2], follows=LOAD)
-    save(replace(told, revisions=(third,)), path)
-    left, right, height = bars(path, "/follows/mean", 2)
-    np.testing.assert_allclose(height, LOAD.y)
-    np.testing.assert_allclose(right - left, 1.0)
-
-
-def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
-    left, _, height = bars(recording, "/follows/mean", 0)
-    assert 4 <= len(left) <= 12
-    assert np.all(np.diff(left) > 0)
-    follows = told.revisions[0].follows
-    assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
-
-
-def test_a_curve_of_one_bin_or_no_height_is_drawn(tmp_path):
-    one = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
-    told = doubtful()
-    save(replace(told, revisions=(replace(told.revisions[2], follows=one),)), tmp_path / "one.rrd")
-    assert bars(tmp_path / "one.rrd", "/follows/mean", 2)[2].tolist() == [0.0]
-
-
 def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):
     read = rows(recording, "/words/verdict", "TextDocument:text", "revision")
     heads = [read[k][0].splitlines()[0] for k in range(4)]
@@ -116,7 +71,7 @@ def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told
 
 def test_the_leader_of_the_worst_reading_is_no_arrow(told, recording):
     strips = rows(recording, "/world/residual/leader", "LineStrips3D:strips", "revision")
-    balls, _ = campaign_scene.noise_balls(told, np.arange(len(told)))
+    balls, _ = campaign.noise_balls(told, np.arange(len(told)))
     for r in told.revisions:
         worst = int(np.argmax(r.whitened_norm2))
         dots = np.array([np.array(s) for s in strips[r.revision]]) - told.anchor[worst]
@@ -162,14 +117,14 @@ def test_timelines_are_revision_and_pose(recording):
 
 def test_every_reading_has_its_arrow(told, recording):
     drawn = rows(recording, "/world/residual/arrows", "Arrows3D:vectors", "revision")
-    scale = campaign_scene.residual_scale(told)
+    scale = campaign.residual_scale(told)
     for r in told.revisions:
         vectors = np.array(drawn[r.revision])
         assert vectors.shape == (READINGS, 3)
         length = np.linalg.norm(r.residual, axis=1) * scale
         np.testing.assert_allclose(
             np.linalg.norm(vectors, axis=1),
-            np.minimum(length, campaign_scene.ARROW_CAP),
+            np.minimum(length, campaign.ARROW_CAP),
             rtol=1e-5,
         )
 
@@ -241,7 +196,7 @@ def test_thousands_of_readings_stay_small_and_say_what_they_show(tmp_path):
     assert path.stat().st_size < 20e6
     arrows = rows(path, "/world/residual/arrows", "Arrows3D:vectors", "revision")
     assert all(100 < len(a) < 300 for a in arrows.values())
-    title = campaign.residual_title(big)
+    title = campaign.titles(big)[0]
     assert f"about {len(arrows[0])} of 3000" in title
     balls = rows(path, "/world/residual/noise", "Ellipsoids3D:centers", "revision")
     origins = rows(path, "/world/residual/arrows", "Arrows3D:origins", "revision")
@@ -258,21 +213,15 @@ def test_subsample_keeps_the_worst():
     assert np.diff(chosen).max() < 100
 
 
-def test_ellipsoids_give_the_covariance_back():
+def test_noise_balls_give_the_covariance_back():
     rng = np.random.default_rng(3)
-    a = rng.standard_normal((50, 3, 3))
-    covariance = a @ a.transpose(0, 2, 1)
-    half, quaternion = campaign_scene.ellipsoids(covariance)
-    x, y, z, w = quaternion.T
-    rotation = np.stack(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
+    a = 1e-5 * rng.standard_normal((12, 3, 3))
+    told = replace(story(poses=4, loads=3), covariance=a @ a.transpose(0, 2, 1) + 1e-10 * np.eye(3))
+    half, quaternion = campaign.noise_balls(told, np.arange(12))
+    half = half / (style.BALL_SIGMAS * campaign.residual_scale(told))
+    rotation = Rotation.from_quat(quaternion).as_matrix()
     again = rotation * half[:, None] ** 2 @ rotation.transpose(0, 2, 1)
-    np.testing.assert_allclose(again, covariance, atol=1e-12)
+    np.testing.assert_allclose(again, told.covariance, rtol=1e-9, atol=1e-18)
 
 
 def test_levels_hold_the_share_of_noise_they_name():

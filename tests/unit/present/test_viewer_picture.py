@@ -49,7 +49,7 @@ def test_the_picture_shows_the_red_vanish(recording, tmp_path):
     told = story()
     reached = [levels(r.whitened_norm2).max() for r in told.revisions]
     assert (reached[0], reached[3] < 2) == (2, True)  # red at first, none in the end
-    view = campaign.residual_title(told)
+    view = campaign.titles(told)[0]
     shots = [Shot(tmp_path / f"{k}.png", "revision", k, view) for k in (0, 3)]
     reports = pictures(recording, shots, SIZE, LONGEST)
     assert len(reports) >= 10
@@ -82,15 +82,13 @@ def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
 def test_every_view_is_drawn_without_a_report(recording, tmp_path):
     d = story()
     names = [
-        campaign.residual_title(d),
-        campaign.deflection_title(d),
-        campaign.bars_title(d),
+        *campaign.titles(d),
         *(
             "Verdict",
             "Details",
             campaign.ERRORS,
             "How to read this",
-            campaign.FOLLOWS,
+            campaign.PANELS["follows"],
             "Table",
             "Log",
         ),

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.present.viewer import arm_shapes, plan, plan_scene, style
-from hilcal.present.viewer.plan import record_plan
-from hilcal.present.viewer.plan_scene import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView
+from hilcal.present.viewer import arm_shapes, plan, style
+from hilcal.present.viewer.plan import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView, record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED
 from tests.support.recordings import entities, rows
@@ -145,7 +144,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(shadowed, recording):
     colors = [rgb(c) for c in rows(recording, "/world/target/beads", "Points3D:colors")[0]]
     pairs = list(dict.fromkeys((s.pose, s.load) for s in PLAN.steps))
     assert len(places) == len(pairs) == 8
-    by_load = dict(zip(PLAN.loads, plan_scene.load_colors(PLAN.loads).tolist(), strict=True))
+    by_load = dict(zip(PLAN.loads, plan.load_colors(PLAN.loads).tolist(), strict=True))
     assert len({tuple(c) for c in by_load.values()}) == 3
     for place, color, (pose, load) in zip(places, colors, pairs, strict=True):
         assert list(color) == by_load[load]

@@ -6,9 +6,8 @@ from rerun.chunk import RrdReader
 
 from hilcal.config import Obstacle
 from hilcal.design.next import PairPower
-from hilcal.present.viewer import layout
-from hilcal.present.viewer.plan import record_plan
-from hilcal.present.viewer.plan_scene import PlanView
+from hilcal.present.viewer import style
+from hilcal.present.viewer.plan import PlanView, record_plan
 from tests.support.recordings import rows
 from tests.support.viewer_plan import PLAN, SUMMARY, configured, strict
 
@@ -64,8 +63,8 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
     record_plan(cell, config, PLAN, SUMMARY, path)
     d = PlanView(cell, config, PLAN, SUMMARY)
     arm = d.bodies[:, 1:, :3, 3].reshape(-1, 3)
-    assert layout.hidden(preferred, arm, config.obstacles).mean() > 0.3
-    assert layout.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02
+    assert style.hidden(preferred, arm, config.obstacles).mean() > 0.3
+    assert style.hidden(eye_place(path), arm, config.obstacles).mean() < 0.02
 
 
 @pytest.mark.parametrize(
@@ -78,15 +77,15 @@ def test_a_tripod_before_the_arm_makes_the_eye_go_elsewhere(tmp_path):
 def test_what_stands_behind_an_obstacle_is_hidden_and_nothing_else(thing):
     behind, above, aside, before = [0, 0, 0.5], [0, 0, 2.0], [0, 1.5, 0.5], [1.5, 0, 0.5]
     points = np.array([behind, above, aside, before], dtype=float)
-    found = layout.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
+    found = style.hidden(np.array([2.0, 0.0, 0.5]), points, (thing,))
     assert found.tolist() == [True, False, False, False]
 
 
 def test_the_eye_is_as_near_as_shows_everything():
     look, way = np.array([0.0, 0.0, 0.5]), np.array([1.0, -1.3, 0.5])
     corners = np.array([[x, y, z] for x in (-0.6, 0.6) for y in (-0.6, 0.6) for z in (0.0, 1.0)])
-    place = layout.near(look, way, corners)
-    assert layout.in_view(place, look, corners).all()
-    assert not layout.in_view(look + 0.9 * (place - look), look, corners).all()
+    place = style.near(look, way, corners)
+    assert style.in_view(place, look, corners).all()
+    assert not style.in_view(look + 0.9 * (place - look), look, corners).all()
     behind = place + (place - look)
-    assert not layout.in_view(place, look, behind[None])[0]
+    assert not style.in_view(place, look, behind[None])[0]

@@ -118,9 +118,9 @@ def test_a_changed_cell_keeps_how_the_model_was_reached(run: Path) -> None:
     assert next(f.text for f in again.figures if f.key == "mass_kg") == "1.4"
     before = WorkbenchSession(run, few_effects()).load(revision=2)
     assert (before.changes, before.diagnosis.verdict) == ({}, added.diagnosis.verdict)
-    rows = {row.what: row for row in two_revisions(*again.records[1:])}
-    assert (rows["cell"].second, rows["model"].difference) == ("[tool] mass_kg = 1.4", "")
-    assert two_revisions(*again.records[:2])[0].difference == f"+ {BASE}"
+    rows = {row[0]: row for row in two_revisions(*again.records[1:]).rows}
+    assert (rows["cell"][2], rows["model"][3]) == ("[tool] mass_kg = 1.4", "")
+    assert two_revisions(*again.records[:2]).rows[0][3] == f"+ {BASE}"
 
 
 def test_a_calibration_is_of_a_revision_that_is_kept(run: Path, tmp_path: Path) -> None:
