@@ -325,6 +325,56 @@ def learnt(
     return {"prediction_m": predict(asked.train, asked.test), "std_m": std}
 
 
+@dataclass(frozen=True)
+class Sought:
+    """What a search for formulas is given: quantities, and what a fit leaves, as a value to explain.
+
+    In a task with a law the value is that law's: v = D r / D D of the residuals r, D what they
+    move by with the joint or along the axis that the law acts on; else it is r in three columns.
+
+    Attributes:
+        names: of the quantities, each divided by its largest value, as a formula says it.
+        x: (N, m) quantities of the rows.
+        y: (N, k) values, in units of their root mean square.
+        size: that root mean square.
+        moves: (N, 3, k) what a value moves a reading by.
+        known: (N, 3) positions by the fit.
+    """
+
+    names: list[str]
+    x: Floats
+    y: Floats
+    size: float
+    moves: Floats
+    known: Floats
+
+    @classmethod
+    def of(cls, asked: Asked, theta: Floats, rows: ArmRows) -> "Sought":
+        """Prepare rows; their values are NaN where they are to be predicted."""
+        named = asked.task.about.get("quantities")
+        columns = {**asked.train.columns, **{f"tau{j + 1}": asked.train.torque[:, j] for j in range(6)}}
+        own = {**rows.columns, **{f"tau{j + 1}": rows.torque[:, j] for j in range(6)}}
+        if not named:
+            named = {f"q{j}": f"q{j}_rad" for j in range(1, 7)} | {f"tau{j}": f"tau{j}" for j in range(1, 7)}
+        most = {n: 1.0 if n[0] == "q" else float(f"{np.abs(columns[c]).max():.4g}") or 1.0 for n, c in named.items()}
+        x = np.stack([own[c] / most[n] for n, c in named.items()], axis=1)
+        names = [n if most[n] == 1.0 else f"({n}/{most[n]})" for n in named]
+        known, to = asked.arm.predict(theta, rows), asked.task.about.get("acts_on")
+        off, moves = rows.y - known, np.broadcast_to(np.eye(3), (len(x), 3, 3))
+        if to is not None:
+            joints = asked.arm.jacobian(theta, rows)[1]
+            up = np.broadcast_to(rotation(theta[:3])[:, 2], known.shape)
+            moves = (up if to == "base_z" else joints[:, :, int(to[1:]) - 1])[:, :, None]
+        square = np.sum(moves**2, axis=1)
+        y = np.einsum("nik,ni->nk", moves, off) / np.maximum(square, 1e-2 * square.max())
+        size = float(np.sqrt(np.mean(y**2)))
+        return cls(names, x, y / size, size, moves, known)
+
+    def positions(self, value: Floats) -> Floats:
+        """(N, 3) positions with values (N, k), in their units, beside the fit."""
+        return np.asarray(self.known + self.size * np.einsum("nik,nk->ni", self.moves, value))
+
+
 def enter(entrant: Callable[[Asked], dict[str, Any]]) -> None:
     """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`."""
     began = time.perf_counter()
