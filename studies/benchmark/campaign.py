@@ -1,6 +1,6 @@
 """A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -142,13 +142,3 @@ def candidates() -> list[dict[str, str]]:
     """Return the candidates with their laws, as task.json has them."""
     laws = {effect.name: effect.summary for effect in BUILT_IN}
     return [{"effect": name, "law": laws[name]} for name in CANDIDATES]
-
-
-def first_rows(states: States, rows: int) -> States:
-    """Return the first states: those that are trained on."""
-    return replace(
-        states,
-        q=states.q[:rows],
-        wrench=states.wrench[:rows],
-        time=None if states.time is None else states.time[:rows],
-    )

@@ -66,10 +66,16 @@ class Formula:
         try:
             tree = ast.parse(text.strip(), mode="eval").body
             constants = tuple(_checked(tree, {*names, "pi"}))
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        except (SyntaxError, ValueError, OverflowError, RecursionError, MemoryError) as error:
             what = " ".join(str(error).split())
             raise FormulaError(f"formula {text[:80]!r}: {what}") from error
         return cls(text, constants, tree)
+
+    @property
+    def variables(self) -> set[str]:
+        """Names of the quantities in it."""
+        named = {node.id for node in ast.walk(self._tree) if isinstance(node, ast.Name)}
+        return named - {*FUNCTIONS, "pi"}
 
     def value(self, columns: Mapping[str, Floats], constants: Floats | None = None) -> Floats:
         """Return its (N,) values at the columns (N,) of the quantities; not finite where undefined.
@@ -145,48 +151,75 @@ def _value(node: ast.expr, columns: Mapping[str, Floats], numbers: Iterator[floa
     raise FormulaError("an expression that was not checked")
 
 
-def law_error(formula: Formula, truth: Formula, columns: Mapping[str, Floats]) -> float:
-    """Return rms(f - f_true) / rms(f_true), means removed; infinite where f is undefined."""
-    off = _centred(formula.value(columns)) - (true := _centred(truth.value(columns)))
-    ratio = float(np.sqrt(np.mean(off**2) / np.mean(true**2)))
-    return ratio if np.isfinite(ratio) else float("inf")
+@dataclass(frozen=True, slots=True, eq=False)
+class Comparison:
+    """A law that was found beside the true one, at N states.
 
+    What a joint's zero and its compliance can stand for is no part of a law: a constant and, where
+    it acts on joint j, a multiple of tau_j. Both values are compared with these projected out.
 
-def equivalent(formula: Formula, truth: Formula, columns: Mapping[str, Floats]) -> bool:
-    """Whether g f(constants) + c, all refitted, agrees with the truth to 1 % at every state.
-
-    Levenberg-Marquardt from the formula's own constants; a constant c of a law is not told from a
-    joint's zero.
+    Attributes:
+        found: the formula that was found.
+        true: the law.
+        columns: (N,) quantities by name.
+        acts_on: "q1" to "q6", or another site.
     """
-    true = _centred(truth.value(columns))
-    true /= np.abs(true).max()
-    if len(formula.constants) > MOST_CONSTANTS:
-        return False
 
-    def off(theta: Floats) -> Floats:
-        return np.asarray(theta[0] * _centred(formula.value(columns, theta[1:])) - true)
+    found: Formula
+    true: Formula
+    columns: Mapping[str, Floats]
+    acts_on: str
 
-    own = _centred(formula.value(columns))
-    size = float(own @ own)
-    if not np.isfinite(size) or size == 0.0:
-        return False
-    theta = np.array([float(own @ true) / size, *formula.constants])
-    r, damping = off(theta), 1e-3
-    for _ in range(_ROUNDS):
-        step = _STEP * np.maximum(np.abs(theta), 1e-6)
-        J = np.column_stack([(off(theta + h) - r) / h.sum() for h in np.diag(step)])
-        if not np.all(np.isfinite(J)) or np.abs(r).max() < 0.1 * EQUIVALENT:
-            break
-        scale = np.sqrt((J**2).sum(axis=0)) + 1e-300
-        A = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(theta))])
-        move = np.linalg.lstsq(A, -np.append(r, np.zeros(len(theta))), rcond=None)[0] / scale
-        tried = off(theta + move)
-        if np.all(np.isfinite(tried)) and tried @ tried < r @ r:
-            theta, r, damping = theta + move, tried, max(damping / 5.0, 1e-12)
-        elif (damping := 5.0 * damping) > 1e8:
-            break
-    return bool(np.abs(r).max() <= EQUIVALENT)
+    def _own(self, values: Floats) -> Floats:
+        beside = [np.ones(len(values))]
+        if self.acts_on.startswith("q"):
+            beside.append(self.columns[f"tau{self.acts_on[1:]}"])
+        basis = np.linalg.qr(np.column_stack(beside))[0]
+        with np.errstate(all="ignore"):
+            return np.asarray(values - basis @ (basis.T @ values))
 
+    def error(self) -> float:
+        """Return rms(f - f_true) / rms(f_true); infinite where f is undefined."""
+        true = self._own(self.true.value(self.columns))
+        off = self._own(self.found.value(self.columns)) - true
+        ratio = float(np.sqrt(np.mean(off**2) / np.mean(true**2)))
+        return ratio if np.isfinite(ratio) else float("inf")
 
-def _centred(values: Floats) -> Floats:
-    return np.asarray(values - values.mean())
+    def equivalent(self) -> bool:
+        """Whether g f(constants), all refitted, agrees with the law to 1 % at every state.
+
+        It has to be of the same quantities, so that a term that would have to vanish counts as
+        wrong. Levenberg-Marquardt from the formula's own constants.
+        """
+        true = self._own(self.true.value(self.columns))
+        true /= np.abs(true).max()
+        beside = {f"tau{self.acts_on[1:]}"}
+        if len(self.found.constants) > MOST_CONSTANTS or (
+            self.found.variables - beside != self.true.variables - beside
+        ):
+            return False
+
+        def off(theta: Floats) -> Floats:
+            found = self.found.value(self.columns, theta[1:])
+            return np.asarray(theta[0] * self._own(found) - true)
+
+        own = self._own(self.found.value(self.columns))
+        size = float(own @ own)
+        if not np.isfinite(size) or size == 0.0:
+            return False
+        theta = np.array([float(own @ true) / size, *self.found.constants])
+        r, damping = off(theta), 1e-3
+        for _ in range(_ROUNDS):
+            step = _STEP * np.maximum(np.abs(theta), 1e-6)
+            J = np.column_stack([(off(theta + h) - r) / h.sum() for h in np.diag(step)])
+            if not np.all(np.isfinite(J)) or np.abs(r).max() < 0.1 * EQUIVALENT:
+                break
+            scale = np.sqrt((J**2).sum(axis=0)) + 1e-300
+            A = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(theta))])
+            move = np.linalg.lstsq(A, -np.append(r, np.zeros(len(theta))), rcond=None)[0] / scale
+            tried = off(theta + move)
+            if np.all(np.isfinite(tried)) and tried @ tried < r @ r:
+                theta, r, damping = theta + move, tried, max(damping / 5.0, 1e-12)
+            elif (damping := 5.0 * damping) > 1e8:
+                break
+        return bool(np.abs(r).max() <= EQUIVALENT)

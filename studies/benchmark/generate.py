@@ -2,7 +2,8 @@
 
 Everything random in a task comes from HMAC-SHA256(key, id of the task). The public tasks are
 those of the key "public"; those of another key cannot be known before it is. Which effects a task
-hides, and how strongly, is drawn as well: an id tells its track alone.
+hides, and how strongly, follows from the key as well: an id tells its track alone, and an entrant
+cannot tell a private task from a public one.
 
 Needs hilcal; track mujoco also `mujoco`; the real tracks the folder HILCAL_DATA.
 """
@@ -76,9 +77,8 @@ def specs(part: str, key: str, tracks: Sequence[str], rounds: int) -> Iterator[S
             cells += [(n, 0.0, 0) for n in POSES]
         cells = cells * rounds
         order = seeded(key, f"{part} {track}").permutation(len(cells))
-        prefix = "" if part == PUBLIC else f"{part}-"
         for number, (at, (n, strength, count)) in enumerate(zip(order, cells, strict=True)):
-            yield Spec(f"{prefix}{track}-{at + 1:03d}", track, number, n, strength, count)
+            yield Spec(f"{track}-{at + 1:03d}", track, number, n, strength, count)
 
 
 def seeded(key: str, what: str) -> np.random.Generator:
@@ -103,7 +103,6 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
     about = {
         "id": spec.id,
         "track": spec.track,
-        "part": part,
         "n_poses": spec.poses,
         "n_train": c.n_train,
         "n_test": len(c.states) - c.n_train,
@@ -125,7 +124,7 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
         "robot.urdf": task.urdf,
         "train.csv": _csv(labels, {**states, **seen, **further}, first),
         "test.csv": _csv(labels, {**states, **further}, last),
-        "truth.json": json.dumps(task.truth, indent=1) + "\n",
+        "truth.json": json.dumps({"part": part, **task.truth}, indent=1) + "\n",
         "truth.csv": _csv({}, true, last, decimals=7),
     }
 
@@ -174,8 +173,9 @@ def generate(
     """Make the tasks of a part; tracks that cannot be made here are named and left out."""
     if part not in (PUBLIC, "private"):
         raise InputError(f"part {part!r}; valid: public, private")
-    if (part == PUBLIC) == bool(key):
-        raise InputError(f"key: part {part} takes {'none' if part == PUBLIC else 'one: --key KEY'}")
+    if (part == PUBLIC) == bool(key) or key == PUBLIC:
+        valid = "none" if part == PUBLIC else "--key KEY, another than that of the public part"
+        raise InputError(f"key {key!r} for the {part} part; valid: {valid}")
     every = ("elastic", "mujoco", "law", *real.SERIES)
     wanted = tuple(tracks.split(",")) if tracks else every
     for track in wanted:

@@ -92,16 +92,8 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
         "law": {
             "formula": formula,
             "acts_on": acts_on,
-            "variables": sorted(name for name in QUANTITIES if _occurs(name, formula)),
+            "variables": sorted(Formula.parse(formula, columns).variables),
         },
     }
     out = made(c, moved(formula), truth, further)
     return replace(out, about=out.about | {"quantities": QUANTITIES, "acts_on": acts_on})
-
-
-def _occurs(name: str, formula: str) -> bool:
-    try:
-        Formula.parse(formula, {other: 0 for other in QUANTITIES if other != name})
-    except ValueError:
-        return True
-    return False

@@ -12,7 +12,6 @@ from studies.benchmark.campaign import (
     TARGET_SCATTER,
     Campaign,
     Made,
-    first_rows,
     made,
     named,
 )
@@ -46,7 +45,7 @@ def mujoco_task(
     registration = np.eye(4)
     registration[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     registration[:3, 3] = 3.0 * np.cos(side), 3.0 * np.sin(side), rng.uniform(-0.8, 0.2)
-    train = first_rows(c.states, c.n_train)
+    train = c.states[: c.n_train]
     drawn = _directions(soft, limit, rng)
 
     def springs(more: Hidden) -> Springs:

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from .formula import Floats, Formula, FormulaError, equivalent, law_error
+from .formula import Comparison, Floats, Formula, FormulaError
 from .task import BenchmarkError, Result, Task, Truth, folders, read_result, read_task, read_truth
 
 REAL = ("ur10", "ur5")
@@ -71,7 +71,7 @@ def score(task: Task, truth: Truth, result: Result) -> Row:
     if result.effects is not None:
         out |= _naming(result.effects, truth)
     if truth.about.get("law") is not None and result.law is not None:
-        out |= _law(result.law, truth.about["law"]["formula"], task.quantities)
+        out |= _law(result.law, truth.about["law"], task.quantities)
     return out
 
 
@@ -87,14 +87,13 @@ def _naming(p: Mapping[str, float], truth: Truth) -> Row:
     }
 
 
-def _law(said: object, true: str, columns: Mapping[str, Floats]) -> Row:
-    law = Formula.parse(true, columns)
+def _law(said: object, true: Mapping[str, str], columns: Mapping[str, Floats]) -> Row:
     try:
-        formula = Formula.parse(said, columns)
+        formula, law = (Formula.parse(text, columns) for text in (said, true["formula"]))
     except FormulaError as error:
         raise BenchmarkError(f"law: {error}") from error
-    same = equivalent(formula, law, columns)
-    return {"law_error": law_error(formula, law, columns), "law_equivalent": float(same)}
+    found = Comparison(formula, law, columns, true["acts_on"])
+    return {"law_error": found.error(), "law_equivalent": float(found.equivalent())}
 
 
 def score_all(tasks: Path, results: Path) -> dict[str, Any]:
@@ -111,8 +110,11 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
     rows: list[Row] = []
     for folder in folders(tasks):
         task, truth = read_task(folder), read_truth(folder)
+        if len(truth.position) != len(task.test.pose):
+            raise BenchmarkError(f"{folder}: truth.csv and test.csv have other numbers of rows")
         about = {
             "task": task.about["id"],
+            "part": truth.about["part"],
             "track": task.about["track"],
             "poses": task.about["n_poses"],
             "strength": truth.about["strength_sigma"],
@@ -134,7 +136,8 @@ def groups(rows: Sequence[Row]) -> list[Row]:
     """Return what the scores come to: per track, N and strength, and per track as a whole.
 
     `error_m` and `relative` are geometric means over the tasks that an entrant did; `relative` is
-    to the best entrant's error in each task. Errors under a nanometre count as one. Intervals are of 95 %, by bootstrap over tasks.
+    to the best entrant's error in each task. Errors under a nanometre count as one. Intervals are
+    of 95 %, by bootstrap over tasks.
     `log_score_of_the_rate` is that of saying how often candidates are present, of each the same.
     """
     out = []
@@ -212,8 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BenchmarkError as error:
         print(f"score: {error}", file=sys.stderr)
         return 2
-    json.dump(document, sys.stdout, indent=1)
-    print()
+    print(json.dumps(document, indent=1))
     return 0
 
 

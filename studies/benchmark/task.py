@@ -15,6 +15,9 @@ from .formula import Floats
 JOINTS = tuple(f"q{j}_rad" for j in range(1, 7))
 POSITION = ("x_m", "y_m", "z_m")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
+TOLD = ("id", "track", "n_poses", "n_train", "n_test", "noise", "candidates")
+HIDDEN = ("part", "kind", "strength_sigma", "effects", "either")
+"""Keys of task.json and truth.json that are used here."""
 SECRET = ("truth.json", "truth.csv")
 """Files of a task that no entrant sees."""
 
@@ -120,12 +123,9 @@ def read_task(folder: Path) -> Task:
     Raises:
         BenchmarkError: a file that is missing or not as the format says.
     """
-    about = _json(folder / "task.json")
-    train, test = _table(folder / "train.csv"), _table(folder / "test.csv")
-    lacking = [n for n in (*JOINTS, *POSITION, *WRENCH) if n not in train.numbers]
-    lacking += [n for n in (*JOINTS, *WRENCH) if n not in test.numbers]
-    if lacking:
-        raise BenchmarkError(f"{folder}: column {lacking[0]} is missing")
+    about = _about(folder / "task.json", TOLD)
+    train = _table(folder / "train.csv", (*JOINTS, *POSITION, *WRENCH))
+    test = _table(folder / "test.csv", (*JOINTS, *WRENCH, *about.get("quantities", {}).values()))
     return Task(folder, about, train, test)
 
 
@@ -135,7 +135,8 @@ def read_truth(folder: Path) -> Truth:
     Raises:
         BenchmarkError: a file that is missing or not as the format says.
     """
-    return Truth(_json(folder / "truth.json"), _table(folder / "truth.csv").of(POSITION))
+    about = _about(folder / "truth.json", HIDDEN)
+    return Truth(about, _table(folder / "truth.csv", POSITION).of(POSITION))
 
 
 def for_entrants(folder: Path, to: Path) -> None:
@@ -164,13 +165,15 @@ def read_result(path: Path, task: Task) -> Result:
     if effects is not None and task.candidates:
         effects = _probabilities(effects, task.candidates, path)
     law, seconds = said.get("law"), said.get("seconds")
+    if law is not None and not (isinstance(law, dict) and "formula" in law):
+        raise BenchmarkError(f'{path}: law; valid: {{"formula": TEXT}} or null')
     if not isinstance(seconds, int | float) or not 0.0 <= seconds < np.inf:
         raise BenchmarkError(f"{path}: seconds {seconds!r}; valid: a number of 0 or more")
     return Result(
         prediction,
         std,
         effects if task.candidates else None,
-        law.get("formula") if isinstance(law, dict) else None,
+        None if law is None else law["formula"],
         float(seconds),
     )
 
@@ -179,7 +182,7 @@ def _rows(value: object, rows: int, key: str, path: Path) -> Floats:
     valid = f"valid: {rows} rows of three finite numbers, m"
     try:
         out = np.array(value, dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise BenchmarkError(f"{path}: {key} is no table of numbers; {valid}") from error
     if out.shape != (rows, 3):
         raise BenchmarkError(f"{path}: {key} has shape {out.shape}; {valid}")
@@ -198,6 +201,14 @@ def _probabilities(effects: object, names: Sequence[str], path: Path) -> dict[st
     return effects
 
 
+def _about(path: Path, keys: Sequence[str]) -> dict[str, Any]:
+    about = _json(path)
+    lacking = [k for k in keys if not isinstance(about, dict) or k not in about]
+    if lacking:
+        raise BenchmarkError(f"{path}: {lacking[0]} is missing; valid: an object of {list(keys)}")
+    return dict(about)
+
+
 def _json(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -207,7 +218,7 @@ def _json(path: Path) -> Any:
         raise BenchmarkError(f"{path}: not JSON ({' '.join(str(error).split())})") from error
 
 
-def _table(path: Path) -> Table:
+def _table(path: Path, needed: Sequence[str]) -> Table:
     try:
         with path.open(encoding="utf-8", newline="") as stream:
             header, *rows = csv.reader(stream)
@@ -222,7 +233,10 @@ def _table(path: Path) -> Table:
     try:
         numbers = {name: np.array(column, dtype=float) for name, column in words.items()}
     except ValueError as error:
-        raise BenchmarkError(f"{path}: {error}") from error
+        raise BenchmarkError(f"{path}: {error}; valid: numbers") from error
+    lacking = [name for name in needed if name not in numbers]
+    if lacking:
+        raise BenchmarkError(f"{path}: column {lacking[0]} is missing")
     bad = [name for name, column in numbers.items() if not np.all(np.isfinite(column))]
     if bad:
         raise BenchmarkError(f"{path}: column {bad[0]} has numbers that are not finite")

@@ -13,7 +13,6 @@ from studies.benchmark.campaign import (
     TARGET_SCATTER,
     Campaign,
     Made,
-    first_rows,
     made,
     named,
 )
@@ -48,7 +47,7 @@ def elastic(
     world, hidden = bare(c.cell, rng), list[str]()
     if "joint_stiffening" in choice[:count]:
         world = softened(world, "joint_stiffening")
-    train = first_rows(c.states, c.n_train)
+    train = c.states[: c.n_train]
     for name in choice:
         if len(hidden) == count:
             break
