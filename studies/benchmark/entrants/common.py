@@ -246,7 +246,7 @@ def _numbers(text: str) -> Floats:
     return np.array([float(v) for v in text.split()])
 
 
-def _origin(origin: Any) -> Floats:  # noqa: ANN401  (an element, or None)
+def _origin(origin: Any) -> Floats:
     if origin is None:
         return np.eye(4)
     r, p, y = _numbers(origin.get("rpy", "0 0 0"))
@@ -327,7 +327,7 @@ def learnt(
 
 @dataclass(frozen=True)
 class Sought:
-    """What a search for formulas is given: quantities, and what a fit leaves, as a value to explain.
+    """What a search for formulas is given: quantities, and what a fit leaves, as a value.
 
     In a task with a law the value is that law's: v = D r / D D of the residuals r, D what they
     move by with the joint or along the axis that the law acts on; else it is r in three columns.
@@ -352,11 +352,19 @@ class Sought:
     def of(cls, asked: Asked, theta: Floats, rows: ArmRows) -> "Sought":
         """Prepare rows; their values are NaN where they are to be predicted."""
         named = asked.task.about.get("quantities")
-        columns = {**asked.train.columns, **{f"tau{j + 1}": asked.train.torque[:, j] for j in range(6)}}
+        columns = {
+            **asked.train.columns,
+            **{f"tau{j + 1}": asked.train.torque[:, j] for j in range(6)},
+        }
         own = {**rows.columns, **{f"tau{j + 1}": rows.torque[:, j] for j in range(6)}}
         if not named:
-            named = {f"q{j}": f"q{j}_rad" for j in range(1, 7)} | {f"tau{j}": f"tau{j}" for j in range(1, 7)}
-        most = {n: 1.0 if n[0] == "q" else float(f"{np.abs(columns[c]).max():.4g}") or 1.0 for n, c in named.items()}
+            named = {f"q{j}": f"q{j}_rad" for j in range(1, 7)} | {
+                f"tau{j}": f"tau{j}" for j in range(1, 7)
+            }
+        most = {
+            n: 1.0 if n[0] == "q" else float(f"{np.abs(columns[c]).max():.4g}") or 1.0
+            for n, c in named.items()
+        }
         x = np.stack([own[c] / most[n] for n, c in named.items()], axis=1)
         names = [n if most[n] == 1.0 else f"({n}/{most[n]})" for n in named]
         known, to = asked.arm.predict(theta, rows), asked.task.about.get("acts_on")
@@ -376,10 +384,13 @@ class Sought:
 
 
 def enter(entrant: Callable[[Asked], dict[str, Any]]) -> None:
-    """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`."""
-    began = time.perf_counter()
+    """Run an entrant as the command `python entrant.py TASK_DIR OUT.json`.
+
+    Its seconds are those of the processor, which do not depend on what else the machine does.
+    """
+    began = time.process_time()
     result = {"std_m": None, "effects": None, "law": None, "note": ""}
     result |= entrant(Asked.read(Path(sys.argv[1])))
-    result["seconds"] = time.perf_counter() - began
+    result["seconds"] = time.process_time() - began
     plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in result.items()}
     Path(sys.argv[2]).write_text(json.dumps(plain), encoding="utf-8")

@@ -15,7 +15,9 @@ from benchmark.entrants.common import Asked, enter, learnt, ridge
 def gaussian_process(asked: Asked) -> dict[str, Any]:
     """Learn the residual with one length for all features."""
     fit, _ = ridge(asked)
-    kernel = ConstantKernel(0.5, (1e-4, 10.0)) * RBF(5.0, (1.0, 100.0)) + WhiteKernel(0.5, (1e-4, 10.0))
+    kernel = ConstantKernel(0.5, (1e-4, 10.0)) * RBF(5.0, (1.0, 100.0)) + WhiteKernel(
+        0.5, (1e-4, 10.0)
+    )
 
     def make() -> Any:
         return GaussianProcessRegressor(kernel, n_restarts_optimizer=1, random_state=0)
