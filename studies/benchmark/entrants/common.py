@@ -129,7 +129,8 @@ class NominalArm:
         root = ET.parse(urdf).getroot()  # noqa: S314  (the task's own file)
         above = {j.find("child").get("link"): j for j in root.findall("joint")}  # type: ignore[union-attr]
         links = {x.get("name"): x for x in root.findall("link")}
-        way, link = [], "tool0"
+        way: list[ET.Element] = []
+        link = "tool0"
         while link in above:
             way.insert(0, above[link])
             link = above[link].find("parent").get("link")  # type: ignore[union-attr, assignment]
@@ -389,7 +390,7 @@ def enter(entrant: Callable[[Asked], dict[str, Any]]) -> None:
     Its seconds are those of the processor, which do not depend on what else the machine does.
     """
     began = time.process_time()
-    result = {"std_m": None, "effects": None, "law": None, "note": ""}
+    result: dict[str, Any] = {"std_m": None, "effects": None, "law": None, "note": ""}
     result |= entrant(Asked.read(Path(sys.argv[1])))
     result["seconds"] = time.process_time() - began
     plain = {n: v.tolist() if isinstance(v, np.ndarray) else v for n, v in result.items()}

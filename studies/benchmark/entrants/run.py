@@ -67,10 +67,18 @@ class Entrants:
         if mark.exists() and mark.read_text(encoding="utf-8") == stamp:
             return
         venv.create(self.envs / name, with_pip=True, clear=True)
-        pip = [self.python(name), "-m", "pip", "install", "--quiet", "-r", needs.absolute()]
+        pip = [
+            str(self.python(name)),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "-r",
+            str(needs.absolute()),
+        ]
         made = subprocess.run(pip, capture_output=True, text=True, cwd=ROOT, check=False)  # noqa: S603
         if made.returncode:
-            self.unable[name] = f"its environment cannot be made: {_last(made.stderr)}"
+            self.unable[name] = f"its environment cannot be made: {_last(made.stderr, 'ERROR')}"
         else:
             mark.write_text(stamp, encoding="utf-8")
 
@@ -127,8 +135,10 @@ def scores(tasks: Path, results: Path) -> dict[str, Any]:
     return {"tasks": rows, "groups": groups(rows)}
 
 
-def _last(text: str) -> str:
-    return next((line for line in reversed(text.splitlines()) if line.strip()), "no words")[:300]
+def _last(text: str, word: str = "") -> str:
+    """Return the last line that has a word, or anything."""
+    lines = [line for line in text.splitlines() if line.strip() and word in line]
+    return lines[-1][:300] if lines else "no words"
 
 
 def _pairs(given: Sequence[str]) -> dict[str, Path]:

@@ -9,7 +9,7 @@ from sklearn.ensemble import HistGradientBoostingRegressor
 from sklearn.multioutput import MultiOutputRegressor
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, learnt
+from benchmark.entrants.common import Asked, enter, learnt  # type: ignore[import-not-found]
 
 
 def boosting(asked: Asked) -> dict[str, Any]:
@@ -24,7 +24,8 @@ def boosting(asked: Asked) -> dict[str, Any]:
         )
         return MultiOutputRegressor(trees)
 
-    return learnt(asked, fit, make)
+    out: dict[str, Any] = learnt(asked, fit, make)
+    return out
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ figaroh 1.0 models no load on the tool: rows are fitted alike, whatever hangs th
 of the links alone.
 """
 
+import json
 import logging
 import sys
 from pathlib import Path
@@ -12,16 +13,15 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import yaml
-from figaroh.calibration.base_calibration import BaseCalibration
-from figaroh.calibration.calibration_tools import calc_updated_fkm
-from figaroh.tools.robot import Robot
+from figaroh.calibration.base_calibration import BaseCalibration  # type: ignore[import-not-found]
+from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
+from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, spread
+from benchmark.entrants.common import Asked, enter, spread  # type: ignore[import-not-found]
 
 
-class Arm(BaseCalibration):  # type: ignore[misc]
+class PlacedArm(BaseCalibration):  # type: ignore[misc]
     """An arm whose base and target are estimated; residuals of positions, m."""
 
     def cost_function(self, var: Any) -> Any:
@@ -51,8 +51,8 @@ def geometry(asked: Asked) -> dict[str, Any]:
             "data": {"number_of_samples": len(rows.q), "source_file": str(data)},
         }
         about = {"robot": {"name": "arm"}, "tasks": {"calibration": calibration}}
-        config.write_text(yaml.safe_dump(about), encoding="utf-8")
-        arm = Arm(robot, str(config))
+        config.write_text(json.dumps(about), encoding="utf-8")
+        arm = PlacedArm(robot, str(config))
         arm.calib_config |= {"known_baseframe": False, "known_tipframe": False}
         arm.initialize()
         var = arm.solve(enable_logging=False).x

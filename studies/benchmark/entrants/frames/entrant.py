@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, left_out, spread
+from benchmark.entrants.common import Asked, enter, left_out, spread  # type: ignore[import-not-found]
 
 
 def frames(asked: Asked) -> dict[str, Any]:

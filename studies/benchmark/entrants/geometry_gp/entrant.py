@@ -9,7 +9,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, learnt, ridge
+from benchmark.entrants.common import Asked, enter, learnt, ridge  # type: ignore[import-not-found]
 
 
 def gaussian_process(asked: Asked) -> dict[str, Any]:
@@ -22,7 +22,8 @@ def gaussian_process(asked: Asked) -> dict[str, Any]:
     def make() -> Any:
         return GaussianProcessRegressor(kernel, n_restarts_optimizer=1, random_state=0)
 
-    return learnt(asked, fit, make)
+    out: dict[str, Any] = learnt(asked, fit, make)
+    return out
 
 
 if __name__ == "__main__":

@@ -17,11 +17,11 @@ import numpy as np
 import hilcal as hc
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import JOINTS, WRENCH, Asked, enter
+from benchmark.entrants.common import JOINTS, WRENCH, Asked, enter  # type: ignore[import-not-found]
 
 CELL = """robot = {{model = "{urdf}", gravity_m_s2 = {gravity_m_s2}}}
 tool = {{mass_kg = {tool[mass_kg]}, com_m = {tool[com_m]}, load_point_m = {load_point_m}}}
-tracker = {{range_std_m = {s}, transverse_std_m = {s}, range_std_per_m = 0, transverse_std_per_m = 0}}
+tracker = {{range_std_m={s}, transverse_std_m={s}, range_std_per_m=0, transverse_std_per_m=0}}
 """
 NAMES = {"angle": "q", "torque": "tau"}
 JOINT = re.compile(r"s\.(angle|torque)\[:, (\d)(?::(\d))?\](\.sum\(axis=1\))?")

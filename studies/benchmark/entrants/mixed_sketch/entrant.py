@@ -16,7 +16,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, ridge
+from benchmark.entrants.common import Asked, enter, ridge  # type: ignore[import-not-found]
 
 WAVES, SPREAD = 32, 3.0
 

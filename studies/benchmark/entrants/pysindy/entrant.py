@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pysindy as ps
+import pysindy as ps  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, Sought, enter, left_out, ridge, spread
+from benchmark.entrants.common import Asked, Sought, enter, left_out, ridge, spread  # type: ignore[import-not-found]
 
 THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)
 """Least share that a term has of the root mean square of what is explained; 10: no term."""

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, Sought, enter, ridge, spread
+from benchmark.entrants.common import Asked, Sought, enter, ridge, spread  # type: ignore[import-not-found]
 
 
 def regression() -> Any:
     """Return PySR's search, or end with 3 where Julia is not at hand."""
     try:
-        from pysr import PySRRegressor
+        from pysr import PySRRegressor  # type: ignore[import-not-found]
     except Exception as error:  # juliapkg lets through whatever its download meets
         print(f"not run: needs Julia, which cannot be had here ({error})", file=sys.stderr)
         sys.exit(3)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, ridge, spread
+from benchmark.entrants.common import Asked, enter, ridge, spread  # type: ignore[import-not-found]
 
 
 def geometry(asked: Asked) -> dict[str, Any]:
