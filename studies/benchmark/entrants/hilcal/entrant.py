@@ -6,6 +6,7 @@ others beside it, in a background half the restricted likelihood ratio. What cou
 effect shares its probability, by their evidence.
 """
 
+# mypy: disable-error-code="attr-defined, name-defined, operator"
 import re
 import sys
 from pathlib import Path

@@ -60,7 +60,7 @@ def mixed(asked: Asked) -> dict[str, Any]:
         return float(r @ w + logs + np.sum(((s - mean) / SPREAD) ** 2))
 
     bounds = [(m - 5.0, m + 5.0) for m in mean[:-1]] + [(-1.0, 4.0)]
-    often = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
+    often: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
     s = minimize(cost, mean, method="Powell", bounds=bounds, options=often).x
     root, inner, b, w = solved(s)
     size = np.concatenate(
