@@ -1,14 +1,15 @@
 """A simulated task before anything is hidden in it: an arm, states to learn from and to predict."""
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
 from hilcal.effects.catalogue import BUILT_IN
+from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
@@ -58,20 +59,20 @@ class Made:
     """A task that is complete but for its noise.
 
     Attributes:
-        about: the content of task.json but for what all tasks have.
-        urdf: the nominal arm.
-        columns: (N,) further columns by name, trained rows first.
         campaign: its states.
         position: (N, 3) what the instrument would read without noise, m.
         truth: the content of truth.json.
+        columns: (N,) further columns by name.
+        about: what task.json has beyond what all tasks have.
+        sigma: noise of one reading and axis, m.
     """
 
-    about: dict[str, Any]
-    urdf: str
-    columns: dict[str, Floats]
     campaign: Campaign
     position: Floats
     truth: dict[str, Any]
+    columns: dict[str, Floats] = field(default_factory=dict)
+    about: dict[str, Any] = field(default_factory=dict)
+    sigma: float = SIGMA
 
 
 def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
@@ -103,29 +104,6 @@ def campaign(robot: str, poses: int, rng: np.random.Generator) -> Campaign:
     )
 
 
-def made(
-    c: Campaign,
-    position: Floats,
-    truth: dict[str, Any],
-    columns: dict[str, Floats] | None = None,
-    sigma: float = SIGMA,
-) -> Made:
-    """Return a task of a campaign; `sigma` is the noise of one reading that it states, m."""
-    cell = c.cell
-    about = {
-        "arm": {
-            "name": cell.arm.name,
-            "target_m": np.round(cell.target[:3, 3], 6).tolist(),
-            "tool": {"mass_kg": cell.tool_mass, "com_m": np.asarray(cell.tool_com).tolist()},
-            "load_point_m": np.asarray(cell.load_point).tolist(),
-            "gravity_m_s2": np.asarray(cell.gravity).tolist(),
-        },
-        "noise": {"sigma_m": sigma},
-        "frame": "tracker",
-    }
-    return Made(about, urdf(cell.arm), columns or {}, c, position, truth)
-
-
 def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dict[str, Any]:
     """Return the truth of a task whose effects are to be named, and the kind that it is of."""
     either = {name for effect in hidden for name in CONTAINED.get(effect, ())}
@@ -136,6 +114,26 @@ def named(hidden: list[str], strength: float, parameters: dict[str, Any]) -> dic
         "either": sorted(either),
         "parameters": parameters,
     }
+
+
+def hide_each(choice: Sequence[str], count: int, hide: Callable[[str], None]) -> list[str]:
+    """Hide the first `count` effects of a choice that can be hidden, and return their names.
+
+    Raises:
+        InputError: fewer can, e.g. since a gear would have to stiffen to nothing.
+    """
+    hidden: list[str] = []
+    for name in choice:
+        if len(hidden) == count:
+            break
+        try:
+            hide(name)
+        except InputError:
+            continue
+        hidden.append(name)
+    if len(hidden) < count:
+        raise InputError(f"only {hidden} of {list(choice)} can be hidden; valid: {count} of them")
+    return hidden
 
 
 def candidates() -> list[dict[str, str]]:

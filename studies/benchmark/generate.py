@@ -22,12 +22,13 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from hilcal.calibration.handover import urdf
 from hilcal.cli import application, execute
 from hilcal.errors import InputError
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 from studies.benchmark import real
-from studies.benchmark.campaign import ARMS, CANDIDATES, SIGMA, Made, campaign, candidates
+from studies.benchmark.campaign import ARMS, CANDIDATES, Made, campaign, candidates
 from studies.benchmark.laws import LAWS, law
 from studies.benchmark.mujoco_tasks import SHOWN, mujoco_task
 from studies.benchmark.task import JOINTS, POSITION, WRENCH
@@ -95,17 +96,27 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
     """
     rng = seeded(key, spec.id)
     if spec.track in real.SERIES:
-        task, noise = real.real_task(spec.track, spec.number, spec.poses, rng), 0.0
+        task = real.real_task(spec.track, spec.number, spec.poses, rng)
+        read = task.position
     else:
-        task, noise = _simulated(spec, part, key, rng), SIGMA
-    c = task.campaign
-    read = task.position + noise * rng.standard_normal(task.position.shape)
+        task = _simulated(spec, part, key, rng)
+        read = task.position + task.sigma * rng.standard_normal(task.position.shape)
+    c, cell = task.campaign, task.campaign.cell
     about = {
         "id": spec.id,
         "track": spec.track,
         "n_poses": spec.poses,
         "n_train": c.n_train,
         "n_test": len(c.states) - c.n_train,
+        "arm": {
+            "name": cell.arm.name,
+            "target_m": np.round(cell.target[:3, 3], 6).tolist(),
+            "tool": {"mass_kg": cell.tool_mass, "com_m": cell.tool_com.tolist()},
+            "load_point_m": cell.load_point.tolist(),
+            "gravity_m_s2": cell.gravity.tolist(),
+        },
+        "noise": {"sigma_m": task.sigma},
+        "frame": "tracker",
         **task.about,
         "candidates": candidates() if spec.track in ("elastic", "mujoco") else [],
     }
@@ -121,7 +132,7 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
     labels = {"pose": c.pose, "load": c.load}
     return {
         "task.json": json.dumps(about, indent=1) + "\n",
-        "robot.urdf": task.urdf,
+        "robot.urdf": urdf(cell.arm),
         "train.csv": _csv(labels, {**states, **seen, **further}, first),
         "test.csv": _csv(labels, {**states, **further}, last),
         "truth.json": json.dumps({"part": part, **task.truth}, indent=1) + "\n",
@@ -130,9 +141,9 @@ def make(spec: Spec, part: str, key: str) -> dict[str, str]:
 
 
 def _simulated(spec: Spec, part: str, key: str, rng: np.random.Generator) -> Made:
-    """Make a simulated task; over the tasks of a track, effects and arms come in turn."""
+    """Make a simulated task; over the tasks of a track effects come in turn, arms at random."""
     turn = seeded(key, f"{part} {spec.track} effects")
-    c = campaign(ARMS[(spec.number + int(turn.integers(len(ARMS)))) % len(ARMS)], spec.poses, rng)
+    c = campaign(str(rng.choice(ARMS)), spec.poses, rng)
     if spec.track == "law":
         number = int(turn.permutation(len(LAWS))[spec.number % len(LAWS)])
         return law(c, number, spec.strength, rng)

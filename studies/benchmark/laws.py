@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.types import Floats
-from studies.benchmark.campaign import SIGMA, Campaign, Made, made
+from studies.benchmark.campaign import SIGMA, Campaign, Made
 from studies.benchmark.formula import Formula
 from studies.benchmark.world_elastic import bare
 from studies.temperatures import air
@@ -95,5 +95,5 @@ def law(c: Campaign, number: int, strength: float, rng: np.random.Generator) -> 
             "variables": sorted(Formula.parse(formula, columns).variables),
         },
     }
-    out = made(c, moved(formula), truth, further)
-    return replace(out, about=out.about | {"quantities": QUANTITIES, "acts_on": acts_on})
+    about = {"quantities": QUANTITIES, "acts_on": acts_on}
+    return Made(c, moved(formula), truth, further, about)

@@ -18,7 +18,7 @@ from hilcal.library import read_table
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
-from studies.benchmark.campaign import FRESH, Campaign, Made, made
+from studies.benchmark.campaign import FRESH, Campaign, Made
 
 POSES = (30, 60, 120)
 SERIES: dict[str, tuple[str, str]] = {
@@ -56,6 +56,7 @@ def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> 
         cell_from_config(config.model_copy(update={"robot": robot})),
         tool_mass=mass,
         tool_com=np.array(com),
+        target=np.block([[np.eye(3), np.array([target]).T], [np.zeros(3), 1.0]]),
     )
     folder, odd = Path(os.environ["HILCAL_DATA"]), number % 2
     first, last = (folder / file for file in SERIES[track])
@@ -76,10 +77,8 @@ def real_task(track: str, number: int, poses: int, rng: np.random.Generator) -> 
     states = States(q=np.round(q, 7), wrench=np.zeros((len(q), 6)))
     c = Campaign(cell, states, names, ("none",) * len(q), poses)
     truth = {"kind": "real", "strength_sigma": 0.0, "effects": [], "either": []}
-    task = made(c, position, truth, sigma=sigma)
-    arm = task.about["arm"] | {"target_m": target}
     source = {"file": str(file.relative_to(folder)), "licence": "MIT"}
-    return replace(task, about=task.about | {"arm": arm, "source": source})
+    return Made(c, position, truth, about={"source": source}, sigma=sigma)
 
 
 def _ur5(path: Path) -> tuple[Floats, Floats]:

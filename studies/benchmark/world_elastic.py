@@ -7,13 +7,12 @@ import numpy as np
 from drivers.simulated.injected_effects import hide, nothing_hidden, softened
 from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell
-from hilcal.errors import InputError
 from studies.benchmark.campaign import (
     SIGMA,
     TARGET_SCATTER,
     Campaign,
     Made,
-    made,
+    hide_each,
     named,
 )
 
@@ -44,19 +43,15 @@ def elastic(
     Raises:
         InputError: fewer of them can be hidden so.
     """
-    world, hidden = bare(c.cell, rng), list[str]()
+    world = bare(c.cell, rng)
     if "joint_stiffening" in choice[:count]:
         world = softened(world, "joint_stiffening")
-    train = c.states[: c.n_train]
-    for name in choice:
-        if len(hidden) == count:
-            break
-        try:
-            world = hide(name, c.cell, train, strength, "absolute", rng, world=world)
-        except InputError:  # e.g. a gear that would have to stiffen to nothing
-            continue
-        hidden.append(name)
-    if len(hidden) < count:
-        raise InputError(f"only {hidden} of {list(choice)} can be hidden; valid: {count} of them")
-    truth = named(hidden, strength, {k: float(f"{v:.6g}") for k, v in world.truth.items()})
-    return made(c, world.sight(c.states).position, truth)
+
+    def hidden(name: str) -> None:
+        nonlocal world
+        train = c.states[: c.n_train]
+        world = hide(name, c.cell, train, strength, "absolute", rng, world=world)
+
+    names = hide_each(choice, count, hidden)
+    truth = named(names, strength, {k: float(f"{v:.6g}") for k, v in world.truth.items()})
+    return Made(c, world.sight(c.states).position, truth)

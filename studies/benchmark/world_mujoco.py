@@ -166,7 +166,7 @@ class Springs:
             wrench: (N, 6) force and moment as read, base axes, at the load point, N and N·m.
 
         Raises:
-            RuntimeError: springs that do not come to rest.
+            RuntimeError: springs that do not come to rest, or that stiffen to nothing.
         """
         mj, m = self._mujoco, self._model
         d = mj.MjData(m)
@@ -194,7 +194,10 @@ class Springs:
                     where = d.xpos[hand] + turn @ point
                     mj.mj_applyFT(m, d, acts[:3], acts[3:], where, hand, force)
                 exerted = force[springs]
-                soft[at] = compliance[row] + stiffening * exerted[at] ** 2
+                more = stiffening * exerted[at] ** 2
+                if np.any(compliance[row] + 3.0 * more <= 0.0):
+                    raise RuntimeError(f"state {row}: a gear would spring back under more torque")
+                soft[at] = compliance[row] + more
                 m.jnt_stiffness[springs] = 1.0 / soft
                 moved = soft * exerted - d.qpos[springs]
                 d.qpos[springs] += moved
