@@ -25,7 +25,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from ..score import groups, score_all
+from ..score import score_all
 from ..task import BenchmarkError, folders, for_entrants, read_result, read_task
 from .tables import block, page
 
@@ -120,19 +120,22 @@ class Entrants:
         return ""
 
 
-def scores(tasks: Path, results: Path) -> dict[str, Any]:
-    """Score what was run; tasks that an entrant was not given are no failures of it.
+def scores(tasks: Path, results: Path) -> list[dict[str, Any]]:
+    """Return a row of scores of each entrant and task that was run.
 
     Raises:
         BenchmarkError: as `score_all`.
     """
-    rows = score_all(tasks, results)["tasks"]
-    rows = [r for r in rows if (results / r["entrant"] / f"{r['task']}.json").exists()]
-    for r in rows:
-        if r["failed"]:  # without the name of the file
-            path = results / r["entrant"] / f"{r['task']}.json"
-            r["failed"] = r["failed"].replace(f"{path}: failed: ", "").replace(f"{path}: ", "")
-    return {"tasks": rows, "groups": groups(rows)}
+    rows = []
+    for row in score_all(tasks, results)["tasks"]:
+        path = results / row["entrant"] / f"{row['task']}.json"
+        if path.exists():
+            if row["failed"]:  # without the name of the file
+                row["failed"] = row["failed"].replace(f"{path}: ", "").removeprefix("failed: ")
+            rows.append(
+                {n: float(f"{v:.4g}") if isinstance(v, float) else v for n, v in row.items()}
+            )
+    return rows
 
 
 def _last(text: str, word: str = "") -> str:
@@ -182,16 +185,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
             for k, (name, task, run) in enumerate(runs, start=1):
                 run.result()
                 print(f"{k}/{len(runs)} {name} {task.name}", file=sys.stderr, flush=True)
-        found = scores(given.folder, given.output)
+        rows = scores(given.folder, given.output)
     except BenchmarkError as error:
         print(f"run: {error}", file=sys.stderr)
         return 2
-    found = {"date": datetime.now(UTC).date().isoformat(), **found}
+    date = datetime.now(UTC).date().isoformat()
     if given.keep:
-        given.keep.write_text(json.dumps(found) + "\n", encoding="utf-8")
+        lines = ",\n".join(json.dumps([*row.values()]) for row in rows)
+        head = json.dumps({"date": date, "columns": [*rows[0]]})[:-1]
+        given.keep.write_text(f'{head}, "rows": [\n{lines}\n]}}\n', encoding="utf-8")
     if given.page:
-        given.page.write_text(page(found, given.home), encoding="utf-8")
-    print(block(found))
+        given.page.write_text(page(date, rows, given.home), encoding="utf-8")
+    print(block(rows))
     return 0
 
 

@@ -1,9 +1,13 @@
 """The benchmark's scores as Markdown: the page of the docs, and the block for the README."""
 
+import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from ..score import groups
 
 TRACKS = {
     "elastic": "simulated, Pinocchio",
@@ -18,34 +22,40 @@ REASONS = "not-first.md"
 Group = Mapping[str, Any]
 
 
-def block(found: Mapping[str, Any]) -> str:
+def kept(path: Path) -> tuple[str, list[Group]]:
+    """Return date and rows of the scores that `--keep` wrote."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    return found["date"], [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+
+
+def block(rows: Sequence[Group]) -> str:
     """Return the small table: errors relative to the best, coverage, naming and time."""
-    whole = {g["track"]: _by_name(g) for g in found["groups"] if g["poses"] is None}
+    whole = {g["track"]: _by_name(g) for g in groups(rows) if g["poses"] is None}
     tracks = [t for t in TRACKS if t in whole]
     names = [*dict.fromkeys(name for t in tracks for name in whole[t])]
     order = sorted(names, key=lambda n: _key([whole[t].get(n, {}) for t in tracks]))
-    rows = []
+    lines = []
     for name in order:
         own = [whole[t].get(name, {}) for t in tracks]
-        every = [row for row in found["tasks"] if row["entrant"] == name and not row["failed"]]
-        rows.append(
+        every = [row for row in rows if row["entrant"] == name and not row["failed"]]
+        lines.append(
             [name, *(_value(e, "relative") for e in own), _mean(every, "coverage", "{:.0%}"),
              _mean(every, "log_score", "{:.2f}"), _mean(every, "law_equivalent", "{:.0%}"),
              _middle([row["seconds"] for row in every])]
         )  # fmt: skip
     head = ["entrant", *(TRACKS[t] for t in tracks), "in 95 % band", "log score", "laws", "s"]
-    return _table(head, rows)
+    return _table(head, lines)
 
 
-def page(found: Mapping[str, Any], home: Path) -> str:
+def page(date: str, rows: Sequence[Group], home: Path) -> str:
     """Return the page: a table of each track, by poses and strength, and what failed."""
     out = [
         "# The benchmark of hidden effects",
         "",
-        "Made by `python -m studies.benchmark.entrants.run`, measured on " + found["date"] + ".",
+        "Made by `python -m studies.benchmark.entrants.run`, measured on " + date + ".",
         "Tasks, format and scores: `studies/benchmark/README.md`.",
         "",
-        block(found),
+        block(rows),
         "",
         "Error at fresh poses: rms, over the best entrant's in each task; geometric mean over the",
         "tasks that an entrant did; 1.00: always the best. In 95 % band: share of coordinates",
@@ -55,27 +65,24 @@ def page(found: Mapping[str, Any], home: Path) -> str:
         "",
         "| entrant | what it is |",
         "|---|---|",
-        *(f"| `{n}` | {_summary(home / n / 'entrant.py')} |" for n in _entrants(found)),
+        *(
+            f"| `{n}` | {_summary(home / n / 'entrant.py')} |"
+            for n in dict.fromkeys(row["entrant"] for row in rows)
+        ),
     ]
     reasons = home / REASONS
     if reasons.exists():
         out += ["", "## Where hilcal is not first", "", reasons.read_text(encoding="utf-8").strip()]
+    every = groups(rows)
     for track, title in TRACKS.items():
-        own = [g for g in found["groups"] if g["track"] == track]
+        own = [g for g in every if g["track"] == track]
         if own:
             out += ["", f"## Track {track}: {title}", "", _track(own[0])]
             out += ["", "Error relative to the best, by poses and strength:", "", _cells(own[1:])]
-    failed = {(r["entrant"], r["failed"]) for r in found["tasks"] if r["failed"]}
+    failed = Counter((row["entrant"], row["failed"]) for row in rows if row["failed"])
     if failed:
-        rows = [
-            [
-                f"`{n}`",
-                why,
-                str(sum((r["entrant"], r["failed"]) == (n, why) for r in found["tasks"])),
-            ]
-            for n, why in sorted(failed)
-        ]
-        out += ["", "## What did not run", "", _table(["entrant", "reason", "tasks"], rows)]
+        lines = [[f"`{name}`", why, str(n)] for (name, why), n in sorted(failed.items())]
+        out += ["", "## What did not run", "", _table(["entrant", "reason", "tasks"], lines)]
     return "\n".join(out) + "\n"
 
 
@@ -119,10 +126,6 @@ def _cells(cells: Sequence[Group]) -> str:
 
 def _by_name(g: Group) -> dict[str, Group]:
     return {e["entrant"]: e for e in g["entrants"]}
-
-
-def _entrants(found: Mapping[str, Any]) -> list[str]:
-    return [*dict.fromkeys(row["entrant"] for row in found["tasks"])]
 
 
 def _key(own: Sequence[Group]) -> float:

@@ -13,7 +13,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.urdf import arm_from_urdf
 from studies.benchmark.entrants.common import COMPLIANCE, Asked, left_out, rotation
 from studies.benchmark.entrants.run import HERE, main, scores
-from studies.benchmark.entrants.tables import block, page
+from studies.benchmark.entrants.tables import block, kept, page
 
 ROOT = Path(__file__).resolve().parents[3]
 TASKS = ROOT / "studies" / "benchmark" / "tasks" / "public"
@@ -130,7 +130,7 @@ def test_simple_entrants_run_and_geometry_is_better_than_frames(
 ) -> None:
     task = first_task("elastic")
     assert run(tmp_path, str(TASKS), "--entrants", "frames,ridge", "--tasks", task.name) == 0
-    rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")["tasks"]}
+    rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
     assert rows.keys() == {"frames", "ridge"}
     assert not any(r["failed"] for r in rows.values())
     assert rows["ridge"]["rms_m"] < 0.5 * rows["frames"]["rms_m"]
@@ -163,7 +163,7 @@ def test_the_runner_survives_whatever_entrants_do(tmp_path: Path, fakes: Path) -
         run(tmp_path, str(TASKS), "--tasks", task, "--limit", "3", "--jobs", "2", home=fakes) == 0
     )
     found = scores(TASKS, tmp_path / "out")
-    why = {r["entrant"]: r["failed"] for r in found["tasks"]}
+    why = {r["entrant"]: r["failed"] for r in found}
     assert why.pop("good") is None
     assert why.pop("crash") == "exit code 1: ValueError: no such arm"
     assert why.pop("hang") == "no answer within 3 s"
@@ -171,7 +171,7 @@ def test_the_runner_survives_whatever_entrants_do(tmp_path: Path, fakes: Path) -
     assert "prediction_m has shape (199, 3)" in why.pop("short")
     assert why.pop("cannot") == "not run: needs Julia"
     assert why.pop("silent") == "cannot be read (No such file or directory)"
-    text = page({"date": "2026-01-01", **found}, fakes)
+    text = page("2026-01-01", found, fakes)
     assert "| `crash` | exit code 1: ValueError: no such arm | 1 |" in text
     assert "| good | 1.00 |" in block(found)
 
@@ -180,11 +180,14 @@ def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
     words = (str(TASKS), "--entrants", "good,cannot", "--tasks", first_task("elastic").name)
     assert run(tmp_path, *words, home=fakes) == 0
     (fakes / "good" / "entrant.py").write_text("raise SystemExit(1)")
-    kept, told = tmp_path / "kept.json", tmp_path / "page.md"
-    assert run(tmp_path, *words, "--keep", str(kept), "--page", str(told), home=fakes) == 0
-    rows = {r["entrant"]: r["failed"] for r in json.loads(kept.read_text())["tasks"]}
-    assert rows == {"good": None, "cannot": "not run: needs Julia"}
-    assert told.read_text() == page(json.loads(kept.read_text()), fakes)
+    kept_in, told = tmp_path / "kept.json", tmp_path / "page.md"
+    assert run(tmp_path, *words, "--keep", str(kept_in), "--page", str(told), home=fakes) == 0
+    date, rows = kept(kept_in)
+    assert {r["entrant"]: r["failed"] for r in rows} == {
+        "good": None,
+        "cannot": "not run: needs Julia",
+    }
+    assert told.read_text() == page(date, rows, fakes)
 
 
 def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
@@ -192,7 +195,7 @@ def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: P
     folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]
     words = [str(TASKS), "--entrants", "good", "--tasks", first_task("elastic").name]
     assert main([*words, *folders]) == 0
-    failed = scores(TASKS, tmp_path / "out")["tasks"][0]["failed"]
+    failed = scores(TASKS, tmp_path / "out")[0]["failed"]
     assert failed.startswith("its environment cannot be made: ERROR:")
 
 
@@ -211,6 +214,7 @@ def test_wrong_words_are_refused(
 
 
 def test_the_page_is_made_of_what_was_kept() -> None:
-    found = json.loads(KEPT.read_text(encoding="utf-8"))
-    assert PAGE.read_text(encoding="utf-8") == page(found, HERE)
-    assert block(found) in PAGE.read_text(encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
+    date, rows = kept(KEPT)
+    assert text == page(date, rows, HERE)
+    assert block(rows) in text
