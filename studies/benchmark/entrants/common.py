@@ -36,7 +36,9 @@ COMPLIANCE = slice(45, 51)
 ORDINARY = np.r_[np.tile([5e-4] * 6, 6), np.full(6, 2e-5)]
 """Standard deviations of geometry and compliance: half a millimetre, half a milliradian, and the
 compliance of a gear of a mid-sized arm; choices."""
+UNITS = (("q", "_rad"), ("tau", ""))
 MULTIPLES = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""Of `ORDINARY`, that are tried on poses left out."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ class ArmRows:
         q: (N, 6) joint angles, rad.
         torque: (N, 6) about each joint's axis, of the nominal arm, N m.
         y: (N, 3) positions that were read, m; NaN where they are to be predicted.
-        columns: all columns of numbers, by name.
+        columns: all columns of numbers, by name; `tau1` ... are those of `torque`.
     """
 
     pose: npt.NDArray[Any]
@@ -63,7 +65,8 @@ class ArmRows:
         q, nothing = table.of(JOINTS), np.full((len(table.pose), 3), np.nan)
         y = table.of(POSITION) if POSITION[0] in table.numbers else nothing
         torque = arm.torques(q, table.of(WRENCH))
-        return cls(np.array(table.pose), q, torque, y, table.numbers)
+        own = {f"tau{j + 1}": torque[:, j] for j in range(6)}
+        return cls(np.array(table.pose), q, torque, y, {**table.numbers, **own})
 
     def __getitem__(self, i: npt.NDArray[Any]) -> "ArmRows":
         """Return the chosen readings."""
@@ -353,23 +356,16 @@ class Sought:
     def of(cls, asked: Asked, theta: Floats, rows: ArmRows) -> "Sought":
         """Prepare rows; their values are NaN where they are to be predicted."""
         named = asked.task.about.get("quantities")
-        columns = {
-            **asked.train.columns,
-            **{f"tau{j + 1}": asked.train.torque[:, j] for j in range(6)},
-        }
-        own = {**rows.columns, **{f"tau{j + 1}": rows.torque[:, j] for j in range(6)}}
-        if not named:
-            named = {f"q{j}": f"q{j}_rad" for j in range(1, 7)} | {
-                f"tau{j}": f"tau{j}" for j in range(1, 7)
-            }
-        most = {
-            n: 1.0 if n[0] == "q" else float(f"{np.abs(columns[c]).max():.4g}") or 1.0
-            for n, c in named.items()
-        }
-        x = np.stack([own[c] / most[n] for n, c in named.items()], axis=1)
-        names = [n if most[n] == 1.0 else f"({n}/{most[n]})" for n in named]
+        named = named or {f"{n}{j}": f"{n}{j}{u}" for n, u in UNITS for j in range(1, 7)}
+        names, x = [], []
+        for name, column in named.items():
+            most = float(f"{np.abs(asked.train.columns[column]).max():.4g}")
+            if most < 1e-9:  # as the torque of an upright axis
+                continue
+            names.append(name if name[0] == "q" else f"({name}/{most})")
+            x.append(rows.columns[column] / (1.0 if name[0] == "q" else most))
         known, to = asked.arm.predict(theta, rows), asked.task.about.get("acts_on")
-        off, moves = rows.y - known, np.broadcast_to(np.eye(3), (len(x), 3, 3))
+        off, moves = rows.y - known, np.broadcast_to(np.eye(3), (len(known), 3, 3))
         if to is not None:
             joints = asked.arm.jacobian(theta, rows)[1]
             up = np.broadcast_to(rotation(theta[:3])[:, 2], known.shape)
@@ -377,7 +373,7 @@ class Sought:
         square = np.sum(moves**2, axis=1)
         y = np.einsum("nik,ni->nk", moves, off) / np.maximum(square, 1e-2 * square.max())
         size = float(np.sqrt(np.mean(y**2)))
-        return cls(names, x, y / size, size, moves, known)
+        return cls(names, np.stack(x, axis=1), y / size, size, moves, known)
 
     def positions(self, value: Floats) -> Floats:
         """(N, 3) positions with values (N, k), in their units, beside the fit."""

@@ -27,10 +27,10 @@ def wave(name: str, k: int) -> tuple[Any, Any]:
 
 
 def library(angles: int, all_: int) -> Any:
-    """Waves of angles, powers and halves of the others, and products of one of each."""
+    """Waves of angles, powers and moduli of the others, and products of one of each."""
     waves, said = zip(*(wave(f, k) for k in (1, 2, 3) for f in ("sin", "cos")), strict=True)
-    powers = [lambda x: x, lambda x: x**2, lambda x: np.maximum(x, 0)]
-    words = [lambda x: x, lambda x: f"{x}**2", lambda x: f"max({x},0)"]
+    powers = [lambda x: x, lambda x: x**2, lambda x: np.abs(x)]
+    words = [lambda x: x, lambda x: f"{x}**2", lambda x: f"abs({x})"]
     both = [ps.CustomLibrary([*waves], [*said]), ps.CustomLibrary(powers, words)]
     parts = [list(range(angles)), list(range(angles, all_))]
     return ps.GeneralizedLibrary(both, [[1, 1]], inputs_per_library=parts)
