@@ -191,8 +191,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
     date = datetime.now(UTC).date().isoformat()
     if given.keep:
-        lines = ",\n".join(json.dumps([*row.values()]) for row in rows)
-        head = json.dumps({"date": date, "columns": [*rows[0]]})[:-1]
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        lines = ",\n".join(json.dumps([row.get(name) for name in names]) for row in rows)
+        head = json.dumps({"date": date, "columns": names})[:-1]
         given.keep.write_text(f'{head}, "rows": [\n{lines}\n]}}\n', encoding="utf-8")
     if given.page:
         given.page.write_text(page(date, rows, given.home), encoding="utf-8")
