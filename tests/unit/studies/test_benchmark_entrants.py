@@ -14,6 +14,7 @@ from hilcal.robot.urdf import arm_from_urdf
 from studies.benchmark.entrants.common import COMPLIANCE, Asked, left_out, rotation
 from studies.benchmark.entrants.run import HERE, main, scores
 from studies.benchmark.entrants.tables import block, kept, page
+from studies.benchmark.task import read_task, read_truth
 
 ROOT = Path(__file__).resolve().parents[3]
 TASKS = ROOT / "studies" / "benchmark" / "tasks" / "public"
@@ -137,6 +138,23 @@ def test_simple_entrants_run_and_geometry_is_better_than_frames(
     table = capsys.readouterr().out.splitlines()
     assert table[2].startswith("| ridge | 1.00 |")
     assert table[3].startswith("| frames |")
+
+
+@pytest.mark.slow
+def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path: Path) -> None:
+    task = next(
+        path
+        for path in sorted(TASKS.glob("elastic-*"))
+        if read_task(path).about["n_poses"] == 30 and read_truth(path).about["strength_sigma"] >= 1
+    )
+    words = [str(TASKS), "--entrants", "hilcal,ridge", "--tasks", task.name]
+    assert run(tmp_path, *words) == 0
+    rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
+    hilcal = rows["hilcal"]
+    assert hilcal["failed"] is None
+    assert hilcal["rms_m"] < rows["ridge"]["rms_m"]
+    rate = len(read_truth(task).about["effects"]) / len(read_task(task).candidates)
+    assert hilcal["log_score"] > rate * np.log(rate) + (1 - rate) * np.log(1 - rate)
 
 
 @pytest.fixture
