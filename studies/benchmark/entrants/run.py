@@ -162,6 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("--envs", type=Path, default=Path(".benchmark-envs"), help="of environments")
     instead = "an interpreter for an entrant, in the place of its environment"
     p.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help=instead)
+    p.add_argument("--score", action="store_true", help="run nothing, score what is there")
     p.add_argument("--keep", type=Path, help="keep the scores, JSON")
     p.add_argument("--page", type=Path, help="write the page of tables, Markdown")
     given = p.parse_args(arguments)
@@ -175,7 +176,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not tasks:
             raise BenchmarkError(f"--tasks {given.tasks}: no task of {given.folder} is called so")
         wanted = [(n, t, given.output / n / f"{t.name}.json") for t in tasks for n in names]
-        missing = [(n, t, out) for n, t, out in wanted if not out.exists()]
+        missing = [(n, t, out) for n, t, out in wanted if not (given.score or out.exists())]
         for name in dict.fromkeys(n for n, _, _ in missing):
             print(f"preparing {name}", file=sys.stderr, flush=True)
             entrants.prepare(name)

@@ -198,6 +198,7 @@ def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
     words = (str(TASKS), "--entrants", "good,cannot", "--tasks", first_task("elastic").name)
     assert run(tmp_path, *words, home=fakes) == 0
     (fakes / "good" / "entrant.py").write_text("raise SystemExit(1)")
+    assert run(tmp_path, str(TASKS), "--score", home=fakes) == 0
     kept_in, told = tmp_path / "kept.json", tmp_path / "page.md"
     assert run(tmp_path, *words, "--keep", str(kept_in), "--page", str(told), home=fakes) == 0
     date, rows = kept(kept_in)
