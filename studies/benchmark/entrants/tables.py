@@ -19,7 +19,7 @@ TRACKS = {
 """Name of each track in the tables."""
 REASONS = "not-first.md"
 """Beside the entrants: where hilcal is not first, and why; people write it."""
-Group = Mapping[str, Any]
+Group = dict[str, Any]
 
 
 def kept(path: Path) -> tuple[str, list[Group]]:
