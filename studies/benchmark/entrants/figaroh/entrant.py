@@ -5,7 +5,6 @@ figaroh 1.0 models no load on the tool: rows are fitted alike, whatever hangs th
 of the links alone.
 """
 
-import json
 import logging
 import sys
 from pathlib import Path
@@ -13,6 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+import yaml  # type: ignore[import-untyped]
 from figaroh.calibration.base_calibration import BaseCalibration  # type: ignore[import-not-found]
 from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
 from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
@@ -51,7 +51,7 @@ def geometry(asked: Asked) -> dict[str, Any]:
             "data": {"number_of_samples": len(rows.q), "source_file": str(data)},
         }
         about = {"robot": {"name": "arm"}, "tasks": {"calibration": calibration}}
-        config.write_text(json.dumps(about), encoding="utf-8")
+        config.write_text(yaml.safe_dump(about), encoding="utf-8")
         arm = PlacedArm(robot, str(config))
         arm.calib_config |= {"known_baseframe": False, "known_tipframe": False}
         arm.initialize()
