@@ -80,7 +80,7 @@ class Entrants:
         if made.returncode:
             self.unable[name] = f"its environment cannot be made: {_last(made.stderr, 'ERROR')}"
         else:
-            mark.write_text(stamp, encoding="utf-8")
+            _put(mark, stamp)
 
     def python(self, name: str) -> Path:
         """Return the interpreter of an entrant."""
@@ -90,7 +90,7 @@ class Entrants:
         """Run an entrant on a task and keep what it answered, or why it did not."""
         reason = self.unable.get(name) or self._answer(name, task, out)
         if reason:
-            out.write_text(json.dumps({"failed": reason}), encoding="utf-8")
+            _put(out, json.dumps({"failed": reason}))
 
     def _answer(self, name: str, task: Path, out: Path) -> str:
         env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH" or name in self.given}
@@ -116,7 +116,7 @@ class Entrants:
                 read_result(new, read_task(copy))
             except BenchmarkError as error:
                 return str(error).replace(f"{new}: ", "")
-            out.write_bytes(new.read_bytes())
+            _put(out, new.read_text(encoding="utf-8"))
         return ""
 
 
@@ -136,6 +136,13 @@ def scores(tasks: Path, results: Path) -> list[dict[str, Any]]:
                 {n: float(f"{v:.4g}") if isinstance(v, float) else v for n, v in row.items()}
             )
     return rows
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a file beside its place and put it there when it is complete."""
+    new = path.with_name(f".{path.name}.new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
 
 
 def _last(text: str, word: str = "") -> str:
@@ -195,9 +202,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         names = list(dict.fromkeys(name for row in rows for name in row))
         lines = ",\n".join(json.dumps([row.get(name) for name in names]) for row in rows)
         head = json.dumps({"date": date, "columns": names})[:-1]
-        given.keep.write_text(f'{head}, "rows": [\n{lines}\n]}}\n', encoding="utf-8")
+        _put(given.keep, f'{head}, "rows": [\n{lines}\n]}}\n')
     if given.page:
-        given.page.write_text(page(date, rows, given.home), encoding="utf-8")
+        _put(given.page, page(date, rows, given.home))
     print(block(rows))
     return 0
 
