@@ -1,0 +1,1 @@
+"""Who enters the benchmark: a folder each, the runner and the tables."""

@@ -1,0 +1,1 @@
+"""An entrant: `python entrant.py TASK_DIR OUT.json`."""

@@ -1,0 +1,79 @@
+"""A sketch of a mixed model: families of effects as random, their variances by REML.
+
+    y = A b + Σ_f Z_f u_f + e,   u_f ~ N(0, s_f² 1),  e ~ N(0, s_e² 1)
+
+b: frames; families: link lengths, link angles, compliances, waves of the joints in octaves. Log s
+has a weak normal prior (Patterson and Thompson, Biometrika 58 (1971) 545; Robinson, Statistical
+Science 6 (1991) 15). It is linear about the frames of a ridge fit, and dense.
+"""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.optimize import minimize
+
+sys.path.append(str(Path(__file__).parents[3]))
+from benchmark.entrants.common import Asked, enter, ridge  # type: ignore[import-not-found]
+
+WAVES, SPREAD = 32, 3.0
+
+
+def columns(asked: Asked, theta: Any, rows: Any) -> tuple[Any, dict[str, Any]]:
+    """Return columns of the frames and of each family, in ordinary magnitudes."""
+    by, joints = asked.arm.jacobian(theta, rows)
+    each = by[:, :, 9:45].reshape(len(by), 3, 6, 6)
+    z = {
+        "length": 5e-4 * each[..., :3],
+        "angle": 5e-4 * each[..., 3:],
+        "give": 1e-5 * by[:, :, 45:],
+    }
+    for k in range(1, WAVES + 1):
+        name = f"octave {int(np.ceil(np.log2(k)))}"
+        two = [1e-4 * joints * f(k * rows.q)[:, None] for f in (np.sin, np.cos)]
+        z[name] = np.concatenate([*([z[name]] if name in z else []), *two], axis=-1)
+    return by[:, :, :9].reshape(-1, 9), {n: c.reshape(3 * len(by), -1) for n, c in z.items()}
+
+
+def mixed(asked: Asked) -> dict[str, Any]:
+    """Estimate the variances, predict by the BLUP, and say how far it may be off."""
+    theta = ridge(asked)[0](asked.train)
+    theta[9:] = 0.0
+    (a, z), (at, zt) = (columns(asked, theta, rows) for rows in (asked.train, asked.test))
+    r = (asked.train.y - asked.arm.predict(theta, asked.train)).ravel()
+    gram = [c @ c.T for c in z.values()]
+    mean = np.r_[0.0, 0.0, 0.0, -0.7 * np.arange(len(z) - 3), 0.0]
+
+    def solved(s: Any) -> tuple[Any, Any, Any, Any]:
+        v = sum(np.exp(2 * x) * g for x, g in zip(s, gram, strict=False))
+        root = cho_factor(v + np.exp(2 * s[-1]) * asked.sigma**2 * np.eye(len(r)), lower=True)
+        wa = cho_solve(root, a)
+        inner = np.linalg.inv(a.T @ wa)
+        b = inner @ (wa.T @ r)
+        return root, inner, b, cho_solve(root, r - a @ b)
+
+    def cost(s: Any) -> float:
+        root, inner, _, w = solved(s)
+        logs = 2 * np.log(np.diag(root[0])).sum() - np.linalg.slogdet(inner)[1]
+        return float(r @ w + logs + np.sum(((s - mean) / SPREAD) ** 2))
+
+    bounds = [(m - 5.0, m + 5.0) for m in mean[:-1]] + [(-1.0, 4.0)]
+    often: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
+    s = minimize(cost, mean, method="Powell", bounds=bounds, options=often).x
+    root, inner, b, w = solved(s)
+    size = np.concatenate(
+        [np.full(c.shape[1], np.exp(x)) for x, c in zip(s, z.values(), strict=False)]
+    )
+    own, other = (np.hstack([*c.values()]) * size for c in (z, zt))
+    across = other @ own.T
+    rest = at - across @ cho_solve(root, a)
+    variance = np.sum(other**2, 1) - np.sum(across * cho_solve(root, across.T).T, 1)
+    std = np.sqrt(np.maximum(variance + np.sum((rest @ inner) * rest, 1), 0.0))
+    there = asked.arm.predict(theta, asked.test) + (at @ b + across @ w).reshape(-1, 3)
+    return {"prediction_m": there, "std_m": std.reshape(-1, 3)}
+
+
+if __name__ == "__main__":
+    enter(mixed)

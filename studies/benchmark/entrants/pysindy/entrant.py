@@ -1,0 +1,67 @@
+"""PySINDy: geometry and compliance by ridge, and a sparse library regression on what they leave.
+
+What SINDy takes for dx/dt may be any value that is linear in a library of functions: here that of
+the law, or the residual itself where the task does not say what is moved.
+"""
+
+import sys
+import warnings
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pysindy as ps  # type: ignore[import-not-found]
+
+sys.path.append(str(Path(__file__).parents[3]))
+from benchmark.entrants.common import Asked, Sought, enter, left_out, ridge, spread  # type: ignore[import-not-found]
+
+THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)
+"""Least share that a term has of the root mean square of what is explained; 10: no term."""
+
+
+def wave(name: str, k: int) -> tuple[Any, Any]:
+    """Return sine or cosine of k x, and how it is written."""
+    f = getattr(np, name)
+    return lambda x: f(k * x), lambda x: f"{name}({k}*{x})"
+
+
+def library(angles: int, all_: int) -> Any:
+    """Waves of angles, powers and moduli of the others, and products of one of each."""
+    waves, said = zip(*(wave(f, k) for k in (1, 2, 3) for f in ("sin", "cos")), strict=True)
+    powers = [lambda x: x, lambda x: x**2, lambda x: np.abs(x)]
+    words = [lambda x: x, lambda x: f"{x}**2", lambda x: f"abs({x})"]
+    both = [ps.CustomLibrary([*waves], [*said]), ps.CustomLibrary(powers, words)]
+    parts = [list(range(angles)), list(range(angles, all_))]
+    return ps.GeneralizedLibrary(both, [[1, 1]], inputs_per_library=parts)
+
+
+def sparse(asked: Asked) -> dict[str, Any]:
+    """Choose the threshold on poses left out."""
+    fit, _ = ridge(asked)
+
+    def model(at: Any, threshold: float) -> Any:
+        optimizer = ps.STLSQ(threshold * len(at.x) ** 0.5, alpha=0.1, normalize_columns=True)
+        made = ps.SINDy(optimizer, library(6, at.x.shape[1]))
+        return made.fit(at.x, t=1.0, x_dot=at.y, feature_names=at.names)
+
+    def predict(threshold: float, rows: Any, other: Any) -> Any:
+        theta = fit(rows)
+        at, there = Sought.of(asked, theta, rows), Sought.of(asked, theta, other)
+        return replace(there, size=at.size).positions(model(at, threshold).predict(there.x))
+
+    tried = [left_out(asked.train, lambda a, b, t=t: predict(t, a, b)) for t in THRESHOLDS]
+    best = int(np.argmin([np.sum(r**2) for r in tried]))
+    out = {"prediction_m": predict(THRESHOLDS[best], asked.train, asked.test)}
+    if "acts_on" in asked.task.about:
+        at = Sought.of(asked, fit(asked.train), asked.train)
+        found = model(at, THRESHOLDS[best])
+        terms = zip(found.coefficients()[0] * at.size, found.get_feature_names(), strict=True)
+        words = [f"{c:.4g}*{name.replace(' ', '*')}" for c, name in terms if c != 0.0]
+        out["law"] = {"formula": " + ".join(words)} if words else None
+    return out | {"std_m": spread(tried[best], asked)}
+
+
+if __name__ == "__main__":
+    warnings.simplefilter("ignore")  # of a threshold that leaves no term
+    enter(sparse)

@@ -1,0 +1,19 @@
+"""Geometry and joint compliance by ridge regression, its strength chosen on poses left out."""
+
+import sys
+from pathlib import Path
+from typing import Any
+
+sys.path.append(str(Path(__file__).parents[3]))
+from benchmark.entrants.common import Asked, enter, ridge, spread  # type: ignore[import-not-found]
+
+
+def geometry(asked: Asked) -> dict[str, Any]:
+    """Fit 51 parameters."""
+    fit, off = ridge(asked)
+    there = asked.arm.predict(fit(asked.train), asked.test)
+    return {"prediction_m": there, "std_m": spread(off, asked)}
+
+
+if __name__ == "__main__":
+    enter(geometry)

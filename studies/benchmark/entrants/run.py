@@ -1,0 +1,213 @@
+"""Run the entrants, each in an environment of its own, on tasks; keep, score and tell the results.
+
+    python -m studies.benchmark.entrants.run TASKS -o RESULTS [--entrants a,b] [--tasks GLOB]
+
+An entrant is a folder beside this file with entrant.py and requirements.txt. Its environment is
+made once. It sees a copy of the task without the truth. What stops it (a crash, the limit of time,
+an answer that is not as the format says) is kept as {"failed": reason}; with exit code 3 it says
+that it cannot run here at all, and is not tried on other tasks. Results that are there already are
+not made again, so that a run that was stopped goes on.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import venv
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from ..score import score_all
+from ..task import BenchmarkError, folders, for_entrants, read_result, read_task
+from .tables import block, page
+
+HERE = Path(__file__).parent
+ROOT = HERE.parents[2]
+CANNOT_RUN = 3
+"""Exit code of an entrant that cannot run on this machine."""
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+@dataclass(frozen=True, slots=True)
+class Entrants:
+    """Who enters, and how each is run.
+
+    Attributes:
+        home: folder of a folder of each entrant.
+        envs: folder of their environments.
+        given: interpreters by entrant, in the place of an environment.
+        limit: seconds that an entrant has for a task.
+        unable: reasons of those that cannot run here; filled as they say so.
+    """
+
+    home: Path
+    envs: Path
+    given: Mapping[str, Path]
+    limit: float
+    unable: dict[str, str] = field(default_factory=dict)
+
+    def names(self) -> list[str]:
+        """Return all entrants."""
+        return sorted(path.parent.name for path in self.home.glob("*/entrant.py"))
+
+    def prepare(self, name: str) -> None:
+        """Make the environment of an entrant, unless it is there; note why it cannot be made."""
+        if name in self.given:
+            return
+        needs = self.home / name / "requirements.txt"
+        mark, stamp = self.envs / name / "made", hashlib.sha256(needs.read_bytes()).hexdigest()
+        if mark.exists() and mark.read_text(encoding="utf-8") == stamp:
+            return
+        venv.create(self.envs / name, with_pip=True, clear=True)
+        pip = [
+            str(self.python(name)),
+            "-m",
+            "pip",
+            "install",
+            "--quiet",
+            "-r",
+            str(needs.absolute()),
+        ]
+        made = subprocess.run(pip, capture_output=True, text=True, cwd=ROOT, check=False)  # noqa: S603
+        if made.returncode:
+            self.unable[name] = f"its environment cannot be made: {_last(made.stderr, 'ERROR')}"
+        else:
+            _put(mark, stamp)
+
+    def python(self, name: str) -> Path:
+        """Return the interpreter of an entrant."""
+        return self.given.get(name, self.envs.absolute() / name / "bin" / "python")
+
+    def run(self, name: str, task: Path, out: Path) -> None:
+        """Run an entrant on a task and keep what it answered, or why it did not."""
+        reason = self.unable.get(name) or self._answer(name, task, out)
+        if reason:
+            _put(out, json.dumps({"failed": reason}))
+
+    def _answer(self, name: str, task: Path, out: Path) -> str:
+        env = {k: v for k, v in os.environ.items() if k != "PYTHONPATH" or name in self.given}
+        with tempfile.TemporaryDirectory() as folder:
+            copy, new = Path(folder, task.name), Path(folder, "out.json")
+            for_entrants(task, copy)
+            command = [self.python(name), (self.home / name / "entrant.py").absolute(), copy, new]
+            with subprocess.Popen(  # noqa: S603
+                command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=folder,
+                env=env | ONE_THREAD, start_new_session=True,
+            ) as process:  # fmt: skip
+                try:
+                    said = process.communicate(timeout=self.limit)[1]
+                except subprocess.TimeoutExpired:
+                    os.killpg(process.pid, signal.SIGKILL)
+                    return f"no answer within {self.limit:g} s"
+            if process.returncode == CANNOT_RUN:
+                self.unable[name] = _last(said)
+                return self.unable[name]
+            if process.returncode:
+                return f"exit code {process.returncode}: {_last(said)}"
+            try:
+                read_result(new, read_task(copy))
+            except BenchmarkError as error:
+                return str(error).replace(f"{new}: ", "")
+            _put(out, new.read_text(encoding="utf-8"))
+        return ""
+
+
+def scores(tasks: Path, results: Path) -> list[dict[str, Any]]:
+    """Return a row of scores of each entrant and task that was run.
+
+    Raises:
+        BenchmarkError: as `score_all`.
+    """
+    rows = []
+    for row in score_all(tasks, results)["tasks"]:
+        path = results / row["entrant"] / f"{row['task']}.json"
+        if path.exists():
+            if row["failed"]:  # without the name of the file
+                row["failed"] = row["failed"].replace(f"{path}: ", "").removeprefix("failed: ")
+            rows.append(
+                {n: float(f"{v:.4g}") if isinstance(v, float) else v for n, v in row.items()}
+            )
+    return rows
+
+
+def _put(path: Path, text: str) -> None:
+    """Write a file beside its place and put it there when it is complete."""
+    new = path.with_name(f".{path.name}.new")
+    new.write_text(text, encoding="utf-8")
+    new.replace(path)
+
+
+def _last(text: str, word: str = "") -> str:
+    """Return the last line that has a word, or anything."""
+    lines = [line for line in text.splitlines() if line.strip() and word in line]
+    return lines[-1][:300] if lines else "no words"
+
+
+def _pairs(given: Sequence[str]) -> dict[str, Path]:
+    pairs = [text.partition("=") for text in given]
+    return {name: Path(path) for name, _, path in pairs}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run, score and tell; exit code 2 for what is not as it should be."""
+    p = argparse.ArgumentParser(prog="run", description="Run the benchmark's entrants.")
+    p.add_argument("folder", metavar="TASKS", type=Path, help="folder of tasks with their truth")
+    p.add_argument("-o", "--output", metavar="RESULTS", type=Path, required=True)
+    p.add_argument("--entrants", default="", help="names, by commas; all where absent")
+    p.add_argument("--tasks", default="*", help='which: a pattern of their names, e.g. "law-*"')
+    p.add_argument("--jobs", type=int, default=1, help="runs at the same time")
+    p.add_argument("--limit", type=float, default=900.0, help="seconds for a task")
+    p.add_argument("--home", type=Path, default=HERE, help="folder of the entrants")
+    p.add_argument("--envs", type=Path, default=Path(".benchmark-envs"), help="of environments")
+    instead = "an interpreter for an entrant, in the place of its environment"
+    p.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help=instead)
+    p.add_argument("--score", action="store_true", help="run nothing, score what is there")
+    p.add_argument("--keep", type=Path, help="keep the scores, JSON")
+    p.add_argument("--page", type=Path, help="write the page of tables, Markdown")
+    given = p.parse_args(arguments)
+    entrants = Entrants(given.home, given.envs, _pairs(given.python), given.limit)
+    try:
+        known = entrants.names()
+        names = given.entrants.split(",") if given.entrants else known
+        if unknown := [*{*names, *entrants.given} - {*known}]:
+            raise BenchmarkError(f"entrant {unknown[0]!r} is unknown; valid: {', '.join(known)}")
+        tasks = [t for t in folders(given.folder) if t.match(given.tasks)]
+        if not tasks:
+            raise BenchmarkError(f"--tasks {given.tasks}: no task of {given.folder} is called so")
+        wanted = [(n, t, given.output / n / f"{t.name}.json") for t in tasks for n in names]
+        missing = [(n, t, out) for n, t, out in wanted if not (given.score or out.exists())]
+        for name in dict.fromkeys(n for n, _, _ in missing):
+            print(f"preparing {name}", file=sys.stderr, flush=True)
+            entrants.prepare(name)
+            (given.output / name).mkdir(parents=True, exist_ok=True)
+        with ThreadPoolExecutor(max(given.jobs, 1)) as pool:
+            runs = [(n, t, pool.submit(entrants.run, n, t, out)) for n, t, out in missing]
+            for k, (name, task, run) in enumerate(runs, start=1):
+                run.result()
+                print(f"{k}/{len(runs)} {name} {task.name}", file=sys.stderr, flush=True)
+        rows = scores(given.folder, given.output)
+    except BenchmarkError as error:
+        print(f"run: {error}", file=sys.stderr)
+        return 2
+    date = datetime.now(UTC).date().isoformat()
+    if given.keep:
+        names = list(dict.fromkeys(name for row in rows for name in row))
+        lines = ",\n".join(json.dumps([row.get(name) for name in names]) for row in rows)
+        head = json.dumps({"date": date, "columns": names})[:-1]
+        _put(given.keep, f'{head}, "rows": [\n{lines}\n]}}\n')
+    if given.page:
+        _put(given.page, page(date, rows, given.home))
+    print(block(rows))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,239 @@
+"""The benchmark's entrants: their arm, their size, and a runner that survives all of them."""
+
+import ast
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.robot.chain import evaluate
+from hilcal.robot.urdf import arm_from_urdf
+from studies.benchmark.entrants.common import COMPLIANCE, Asked, left_out, rotation
+from studies.benchmark.entrants.run import HERE, main, scores
+from studies.benchmark.entrants.tables import block, kept, page
+from studies.benchmark.task import read_task, read_truth
+
+ROOT = Path(__file__).resolve().parents[3]
+TASKS = ROOT / "studies" / "benchmark" / "tasks" / "public"
+MOST_LINES = 60
+KEPT = ROOT / "docs" / "measured" / "benchmark" / "scores.json"
+PAGE = ROOT / "docs" / "reference" / "benchmark.md"
+FAKES = {
+    "good": "print(rows, end='')",
+    "crash": "raise ValueError('no such arm')",
+    "hang": "import time; time.sleep(60)",
+    "nan": "rows[3][1] = float('nan')",
+    "short": "rows.pop()",
+    "cannot": "print('not run: needs Julia', file=sys.stderr); sys.exit(3)",
+    "silent": "sys.exit(0)",
+}
+"""What entrants do before they answer."""
+
+
+def first_task(track: str, poses: int = 30) -> Path:
+    """Return the first public task of a track and a number of poses."""
+    for path in sorted(TASKS.glob(f"{track}-*")):
+        if json.loads((path / "task.json").read_text())["n_poses"] == poses:
+            return path
+    raise LookupError(track)
+
+
+def code_lines(path: Path) -> int:
+    """Lines of a file without blank ones, comments, docstrings and imports."""
+    tree, skipped = ast.parse(path.read_text()), set()
+    for node in ast.walk(tree):
+        own = isinstance(node, ast.Import | ast.ImportFrom)
+        own |= isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        if own:
+            skipped |= {*range(node.lineno, (node.end_lineno or node.lineno) + 1)}
+    lines = enumerate(path.read_text().splitlines(), start=1)
+    return sum(
+        bool(t.strip()) and not t.strip().startswith("#") and k not in skipped for k, t in lines
+    )
+
+
+@pytest.mark.parametrize("path", sorted(HERE.glob("*/entrant.py")), ids=lambda p: p.parent.name)
+def test_an_adapter_is_small_and_pinned(path: Path) -> None:
+    assert code_lines(path) <= MOST_LINES
+    needs = path.with_name("requirements.txt").read_text().split()
+    assert path.parent.name == "hilcal" or all("==" in line for line in needs)
+
+
+@pytest.mark.parametrize("name", ["common.py", "run.py", "tables.py", "frames/entrant.py"])
+def test_what_others_need_imports_numpy_alone(name: str) -> None:
+    tree = ast.parse((HERE / name).read_text())
+    plain = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
+    plain += [
+        n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level
+    ]
+    known = {*sys.stdlib_module_names, "numpy", "benchmark"}
+    assert {n.split(".")[0] for n in plain} <= known
+
+
+@pytest.fixture(scope="module")
+def asked() -> Asked:
+    """The smallest task of the elastic track."""
+    return Asked.read(first_task("elastic"))
+
+
+def test_positions_are_those_of_hilcals_chain(asked: Asked) -> None:
+    theta = np.zeros(51)
+    theta[:6] = [0.3, -1.0, 2.0, 1.0, 2.0, 3.0]
+    arm = arm_from_urdf(asked.task.folder / "robot.urdf")
+    point = evaluate(arm, asked.train.q).point(asked.arm.target)
+    expected = point @ rotation(theta[:3]).T + theta[3:6]
+    np.testing.assert_allclose(asked.arm.predict(theta, asked.train), expected, atol=1e-12)
+
+
+def test_torques_are_those_of_another_dynamics() -> None:
+    law = Asked.read(first_task("law"))
+    stated = np.stack([law.train.columns[f"x_tau{j}_Nm"] for j in range(1, 7)], axis=1)
+    np.testing.assert_allclose(law.train.torque, stated, atol=6e-4)  # they are rounded to 1e-3
+
+
+def test_derivatives_are_exact(asked: Asked) -> None:
+    rng = np.random.default_rng(1)
+    theta = asked.arm.registered(asked.train)
+    theta[COMPLIANCE] = 1e-5
+    by, joints = asked.arm.jacobian(theta, asked.train)
+    for k in range(51):
+        step = (1e-4 if k < COMPLIANCE.start else 1e-7) * np.eye(51)[k]
+        ends = [asked.arm.predict(theta + s * step, asked.train) for s in (1, -1)]
+        slope = (ends[0] - ends[1]) / (2 * step[k])
+        np.testing.assert_allclose(by[:, :, k], slope, atol=2e-7 * np.abs(slope).max())
+    turn = 1e-4 * rng.standard_normal((len(asked.train.q), 6))
+    ends = [asked.arm.predict(theta, asked.train, s * turn) for s in (1, -1)]
+    moved = np.einsum("nij,nj->ni", joints, turn)
+    np.testing.assert_allclose(moved, (ends[0] - ends[1]) / 2, atol=1e-10)
+
+
+def test_poses_are_left_out_whole(asked: Asked) -> None:
+    def predict(rows: Any, other: Any) -> Any:
+        assert not {*rows.pose} & {*other.pose}
+        return other.y
+
+    assert not left_out(asked.train, predict).any()
+
+
+def run(tmp_path: Path, *more: str, home: Path = HERE) -> int:
+    """Run entrants with this interpreter; results go to tmp_path."""
+    names = [p.parent.name for p in home.glob("*/entrant.py")]
+    given = [f"--python={n}={sys.executable}" for n in names]
+    folders = ["-o", str(tmp_path / "out"), "--home", str(home), "--envs", str(tmp_path / "envs")]
+    return main([*folders, *given, *more])
+
+
+def test_simple_entrants_run_and_geometry_is_better_than_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    task = first_task("elastic")
+    assert run(tmp_path, str(TASKS), "--entrants", "frames,ridge", "--tasks", task.name) == 0
+    rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
+    assert rows.keys() == {"frames", "ridge"}
+    assert not any(r["failed"] for r in rows.values())
+    assert rows["ridge"]["rms_m"] < 0.5 * rows["frames"]["rms_m"]
+    table = capsys.readouterr().out.splitlines()
+    assert table[2].startswith("| ridge | 1.00 |")
+    assert table[3].startswith("| frames |")
+
+
+@pytest.mark.slow
+def test_hilcals_adapter_predicts_with_bands_and_names(tmp_path: Path) -> None:
+    task = next(
+        path
+        for path in sorted(TASKS.glob("elastic-*"))
+        if read_task(path).about["n_poses"] == 30 and read_truth(path).about["strength_sigma"] >= 1
+    )
+    words = [str(TASKS), "--entrants", "hilcal,ridge", "--tasks", task.name]
+    assert run(tmp_path, *words) == 0
+    rows = {r["entrant"]: r for r in scores(TASKS, tmp_path / "out")}
+    hilcal = rows["hilcal"]
+    assert hilcal["failed"] is None
+    assert hilcal["rms_m"] < rows["ridge"]["rms_m"]
+    rate = len(read_truth(task).about["effects"]) / len(read_task(task).candidates)
+    assert hilcal["log_score"] > rate * np.log(rate) + (1 - rate) * np.log(1 - rate)
+
+
+@pytest.fixture
+def fakes(tmp_path: Path) -> Path:
+    """A folder of entrants that fail in all ways."""
+    for name, act in FAKES.items():
+        folder = tmp_path / "home" / name
+        folder.mkdir(parents=True)
+        (folder / "requirements.txt").write_text("")
+        (folder / "entrant.py").write_text(
+            f'"""{name}."""\nimport json, sys\n'
+            "task = json.load(open(sys.argv[1] + '/task.json'))\n"
+            "from pathlib import Path\nseen = sorted(p.name for p in Path(sys.argv[1]).iterdir())\n"
+            "assert 'truth.csv' not in seen and 'truth.json' not in seen, seen\n"
+            f"rows = [[0.0, 0.0, 0.0] for _ in range(task['n_test'])]\n{act}\n"
+            "json.dump({'prediction_m': rows, 'seconds': 0.1}, open(sys.argv[2], 'w'))\n"
+        )
+    return tmp_path / "home"
+
+
+def test_the_runner_survives_whatever_entrants_do(tmp_path: Path, fakes: Path) -> None:
+    task = first_task("elastic").name
+    assert (
+        run(tmp_path, str(TASKS), "--tasks", task, "--limit", "3", "--jobs", "2", home=fakes) == 0
+    )
+    found = scores(TASKS, tmp_path / "out")
+    why = {r["entrant"]: r["failed"] for r in found}
+    assert why.pop("good") is None
+    assert why.pop("crash") == "exit code 1: ValueError: no such arm"
+    assert why.pop("hang") == "no answer within 3 s"
+    assert "prediction_m has numbers that are not finite" in why.pop("nan")
+    assert "prediction_m has shape (199, 3)" in why.pop("short")
+    assert why.pop("cannot") == "not run: needs Julia"
+    assert why.pop("silent") == "cannot be read (No such file or directory)"
+    text = page("2026-01-01", found, fakes)
+    assert "| `crash` | exit code 1: ValueError: no such arm | 1 |" in text
+    assert "| good | 1.00 |" in block(found)
+
+
+def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
+    words = (str(TASKS), "--entrants", "good,cannot", "--tasks", first_task("elastic").name)
+    assert run(tmp_path, *words, home=fakes) == 0
+    (fakes / "good" / "entrant.py").write_text("raise SystemExit(1)")
+    assert run(tmp_path, str(TASKS), "--score", home=fakes) == 0
+    kept_in, told = tmp_path / "kept.json", tmp_path / "page.md"
+    assert run(tmp_path, *words, "--keep", str(kept_in), "--page", str(told), home=fakes) == 0
+    date, rows = kept(kept_in)
+    assert {r["entrant"]: r["failed"] for r in rows} == {
+        "good": None,
+        "cannot": "not run: needs Julia",
+    }
+    assert told.read_text() == page(date, rows, fakes)
+
+
+def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
+    (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
+    folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]
+    words = [str(TASKS), "--entrants", "good", "--tasks", first_task("elastic").name]
+    assert main([*words, *folders]) == 0
+    failed = scores(TASKS, tmp_path / "out")[0]["failed"]
+    assert failed.startswith("its environment cannot be made: ERROR:")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--entrants", "nobody"], "entrant 'nobody' is unknown; valid: boosting, figaroh,"),
+        (["--tasks", "none-*"], "--tasks none-*: no task of"),
+    ],
+)
+def test_wrong_words_are_refused(
+    words: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([str(TASKS), "-o", str(tmp_path), *words]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_the_page_is_made_of_what_was_kept() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    date, rows = kept(KEPT)
+    assert text == page(date, rows, HERE)
+    assert block(rows) in text
