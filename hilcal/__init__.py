@@ -61,40 +61,43 @@ _PLACES = {
 __all__ = ["__version__", *_PLACES]
 
 if TYPE_CHECKING:
-    from hilcal.calibration.calibration import Calibration
-    from hilcal.campaign.campaign import Campaign
-    from hilcal.cell import Cell
-    from hilcal.diagnosis.comparison import Comparison
-    from hilcal.diagnosis.diagnosis import Diagnosis
-    from hilcal.diagnosis.verdict import diagnose
-    from hilcal.discovery.discovery import discover
-    from hilcal.effects.catalogue import Catalogue, installed
-    from hilcal.effects.check import check_effect
-    from hilcal.effects.protocol import Effect
-    from hilcal.effects.spec import effect
-    from hilcal.errors import CannotAnswerError, DeviceError, HilcalError, InputError
-    from hilcal.identification.fit import Fit
-    from hilcal.identification.posterior import Posterior
-    from hilcal.identification.table_preview import preview_table
-    from hilcal.library import (
-        baseline,
-        bootstrap,
-        fit,
-        fit_stream,
-        load_posterior,
-        plan,
-        read_table,
-        refine,
-        simulate,
-        view,
-    )
-    from hilcal.model.model import Model
-    from hilcal.procedure.procedure import Procedure
-    from hilcal.readings.readings import Readings, States
-    from hilcal.refinement import Refinement
-    from hilcal.transfer.compare import compare
-    from hilcal.validation import validate
-    from hilcal.write_report import report
+    from hilcal.calibration.calibration import Calibration as Calibration
+    from hilcal.campaign.campaign import Campaign as Campaign
+    from hilcal.cell import Cell as Cell
+    from hilcal.diagnosis.comparison import Comparison as Comparison
+    from hilcal.diagnosis.diagnosis import Diagnosis as Diagnosis
+    from hilcal.diagnosis.verdict import diagnose as diagnose
+    from hilcal.discovery.discovery import discover as discover
+    from hilcal.effects.catalogue import Catalogue as Catalogue
+    from hilcal.effects.catalogue import installed as installed
+    from hilcal.effects.check import check_effect as check_effect
+    from hilcal.effects.protocol import Effect as Effect
+    from hilcal.effects.spec import effect as effect
+    from hilcal.errors import CannotAnswerError as CannotAnswerError
+    from hilcal.errors import DeviceError as DeviceError
+    from hilcal.errors import HilcalError as HilcalError
+    from hilcal.errors import InputError as InputError
+    from hilcal.identification.fit import Fit as Fit
+    from hilcal.identification.posterior import Posterior as Posterior
+    from hilcal.identification.table_preview import preview_table as preview_table
+    from hilcal.library import baseline as baseline
+    from hilcal.library import bootstrap as bootstrap
+    from hilcal.library import fit as fit
+    from hilcal.library import fit_stream as fit_stream
+    from hilcal.library import load_posterior as load_posterior
+    from hilcal.library import plan as plan
+    from hilcal.library import read_table as read_table
+    from hilcal.library import refine as refine
+    from hilcal.library import simulate as simulate
+    from hilcal.library import view as view
+    from hilcal.model.model import Model as Model
+    from hilcal.procedure.procedure import Procedure as Procedure
+    from hilcal.readings.readings import Readings as Readings
+    from hilcal.readings.readings import States as States
+    from hilcal.refinement import Refinement as Refinement
+    from hilcal.transfer.compare import compare as compare
+    from hilcal.validation import validate as validate
+    from hilcal.write_report import report as report
 
 
 def __getattr__(name: str) -> object:

@@ -15,6 +15,7 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import as_counted
 from hilcal.robot.factory import FactoryKinematics, read_factory, with_factory
 from hilcal.robot.se3 import rotation
+from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 
@@ -55,7 +56,7 @@ def plane_frame(direction: Floats, origin: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Cell:
+class Cell(Brief):
     """What a prediction needs beside states and effects; SI units.
 
     Attributes:

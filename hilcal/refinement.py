@@ -28,7 +28,8 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
-from hilcal.shown import Shown
+from hilcal.shown import Brief, Shown
+from hilcal.store.revision import change
 
 __all__ = ["Refinement", "RefinementStep", "add", "predicts_better", "refine", "remove"]
 
@@ -45,7 +46,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class RefinementStep:
+class RefinementStep(Brief):
     """One revision: a fit, its diagnosis, and what was changed to get there.
 
     Attributes:
@@ -60,12 +61,27 @@ class RefinementStep:
     added: str | None
     removed: str | None = None
 
+    def __repr__(self) -> str:
+        """Return the step in a line."""
+        what = change(self.added, self.removed) or " + ".join(self.fit.model.names)
+        error = f"{1e6 * self.fit.holdout.rms_m:.1f} µm rms on poses left out"
+        return f"RefinementStep({what}: {error}, {self.diagnosis.verdict})"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Refinement(Shown):
     """The steps of a refinement, from the starting model to the last one."""
 
     steps: tuple[RefinementStep, ...]
+
+    def _brief(self) -> dict[str, str]:
+        last = self.steps[-8:]
+        first = len(self.steps) - len(last)
+        return {
+            "model": " + ".join(self.fit.model.names),
+            "verdict": self.verdict,
+            **{f"steps[{k}]": repr(s) for k, s in enumerate(last, start=first)},
+        }
 
     @property
     def fit(self) -> Fit:

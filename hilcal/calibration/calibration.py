@@ -51,11 +51,13 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
+from hilcal.shown import Brief
+from hilcal.store.schema import is_campaign
 from hilcal.types import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(Brief):
     """A fitted model with what is known of it.
 
     >>> with hc.Campaign.open(RUN) as run:
@@ -149,10 +151,10 @@ class Calibration:
 
     @classmethod
     def load(cls, path: str | Path, catalogue: Catalogue | None = None) -> "Calibration":
-        """Read a calibration file.
+        """Read a calibration file, or make the calibration of a campaign's revision in use.
 
         Args:
-            path: the file.
+            path: a calibration, or a campaign.
             catalogue: has its effects; the installed ones unless given.
 
         Raises:
@@ -160,6 +162,11 @@ class Calibration:
         """
         from hilcal.calibration.storage import read
 
+        if is_campaign(Path(path)):
+            import hilcal  # campaigns are above calibrations: the library knows them
+
+            with hilcal.Campaign.open(path, catalogue, read_only=True) as run:
+                return run.calibration()
         return read(Path(path), catalogue)
 
     def save(self, path: str | Path) -> None:

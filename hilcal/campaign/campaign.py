@@ -51,6 +51,7 @@ from hilcal.readings.covariance import COVERS, FROM, INSTRUMENT, TRACKER, WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
+from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import typed_now
 from hilcal.store.overview import overview
@@ -66,7 +67,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Campaign:
+class Campaign(Brief):
     """An open campaign file; close it, or use it in a `with` statement.
 
     >>> with hc.Campaign.open(RUN) as run:

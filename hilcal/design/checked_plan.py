@@ -8,13 +8,13 @@ from hilcal.config import CellConfig
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
 from hilcal.measuring.dry_run import DryRun, dry_run
-from hilcal.shown import Shown
+from hilcal.shown import Shown, Tabular
 from hilcal.store.plan import Plan
 from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class CheckedPlan(Shown):
+class CheckedPlan(Shown, Tabular):
     """A plan whose dry run passed, and its summary.
 
     Attributes:

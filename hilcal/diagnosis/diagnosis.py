@@ -20,7 +20,7 @@ from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
 from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.shown import Shown
+from hilcal.shown import Shown, Tabular, presenter
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]
 Reason = Literal[
@@ -73,7 +73,7 @@ class History:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Diagnosis(Shown):
+class Diagnosis(Shown, Tabular):
     """What is wrong with a fitted model.
 
     Attributes:
@@ -124,6 +124,16 @@ class Diagnosis(Shown):
     pose_alone: PoseAlone | None = None
     background: tuple[BackgroundEffect, ...] = ()
     wrong_figures: tuple[WrongFigure, ...] = ()
+
+    def _brief(self) -> dict[str, str]:
+        first = self.suspects[:5]
+        return {
+            "model": " + ".join(self.fit.model.names),
+            "verdict": f"{self.verdict} ({self.reason})",
+            "message": presenter().message(self),
+            **{f"suspects[{k}]": repr(s) for k, s in enumerate(first)},
+            "and": f"{len(self.suspects) - len(first)} more suspects",
+        }
 
     @property
     def verdict(self) -> Verdict:

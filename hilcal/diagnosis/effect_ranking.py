@@ -46,6 +46,7 @@ from hilcal.regression.leave_out import left_out_residual
 from hilcal.regression.paired_test import improves
 from hilcal.regression.schur import eliminate
 from hilcal.regression.spectrum import Spectrum, spectrum
+from hilcal.shown import Brief
 from hilcal.types import Floats
 
 SAME_EVIDENCE = 3.0
@@ -99,7 +100,7 @@ class LeftOut:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Suspect:
+class Suspect(Brief):
     """An effect that is not in the model, and what it would explain.
 
     Attributes:
@@ -134,6 +135,11 @@ class Suspect:
     most: float = np.inf
     same_as: tuple[str, ...] = ()
     coarse: str = ""
+
+    def __repr__(self) -> str:
+        """Return the suspect in a line."""
+        share = f"{100 * self.share:.0f} % of the misfit"
+        return f"Suspect({self.effect}, p = {self.score.p_value:.2g}, {share})"
 
     @property
     def holdout_share(self) -> float:

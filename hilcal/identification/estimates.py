@@ -38,6 +38,13 @@ class Estimate:
     unit: str
     identifiable: bool
 
+    def line(self, width: int = 0) -> str:
+        """Return it in a line, the name padded to a width."""
+        value = "not determined"
+        if self.value is not None and self.std is not None:
+            value = f"{self.value: .4e} ± {self.std:.1e} {self.unit}"
+        return f"  {self.name:<{width}}  {value}"
+
 
 @dataclass(frozen=True, slots=True)
 class Estimates(Sequence[Estimate]):
@@ -72,6 +79,13 @@ class Estimates(Sequence[Estimate]):
                 if kept[k]
             )
         )
+
+    def __repr__(self) -> str:
+        """Return the first parameters, a line each."""
+        width = max((len(row.name) for row in self.rows), default=0)
+        lines = [row.line(width) for row in self.rows[:12]]
+        left = len(self.rows) - len(lines)
+        return "\n".join(["Estimates(", *lines, *([f"  ... and {left} more"] * bool(left)), ")"])
 
     def __len__(self) -> int:
         """Return the number of parameters."""
@@ -145,9 +159,4 @@ def summary(
         )
     lines.append(f"  variance factor {variance_factor:.3g} [{interval[0]:.3g}, {interval[1]:.3g}]")
     width = max((len(row.name) for row in estimates), default=0)
-    for row in estimates:
-        value = "not determined"
-        if row.value is not None and row.std is not None:
-            value = f"{row.value: .4e} ± {row.std:.1e} {row.unit}"
-        lines.append(f"  {row.name:<{width}}  {value}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *(row.line(width) for row in estimates)])

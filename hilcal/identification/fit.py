@@ -23,6 +23,7 @@ from hilcal.model.model import Model
 from hilcal.model.observe import Observation
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, Scaling, Whitening, inverse_root, whitening
+from hilcal.shown import Tabular
 from hilcal.types import Bools, Floats, Ints
 
 Frame = Literal["sensor", "base"]
@@ -42,7 +43,7 @@ _Used = tuple[Bools, Disagreement | None, _Solved]
 
 
 @dataclass(frozen=True, eq=False)
-class Fit(WithVarianceFactor):
+class Fit(WithVarianceFactor, Tabular):
     """A model fitted to readings.
 
     D is the number of measurements (readings or deflections), m their elements, P the
@@ -84,6 +85,17 @@ class Fit(WithVarianceFactor):
     dof: float
     error: ErrorBlock
     disagreement: Disagreement | None = None
+
+    def _brief(self) -> dict[str, str]:
+        return {
+            "model": " + ".join(self.model.names),
+            "fitted": f"{len(self.raw)} measurements ({self.mode}, scaling {self.scaling})",
+            "set aside": f"{np.count_nonzero(self.outlier)} readings",
+            "parameters": f"{len(self.theta)}",
+            "error": f"{1e6 * self.error.rms_m:.1f} µm rms, {self.error.rms_sigma:.2f} σ",
+            "chi2": f"{self.chi2:.4g} with {self.dof:.4g} degrees of freedom",
+            "more": "summary(), parameters, residuals(), to_frame(), predict()",
+        }
 
     @cached_property
     def left_out(self) -> Floats:

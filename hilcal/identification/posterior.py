@@ -25,6 +25,7 @@ from hilcal.readings.ranges import Range
 from hilcal.readings.whitening import Mode
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE
 from hilcal.regression.schur import schur_complement
+from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class LearntEffect:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Posterior:
+class Posterior(Brief):
     """A normal distribution of K parameters of an arm, in information form.
 
     >>> with hc.Campaign.open(RUN) as run:

@@ -25,6 +25,7 @@ from hilcal.robot.chain import Chain
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 
 if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
@@ -38,7 +39,7 @@ FLANGE_STEP = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class Prediction(Brief):
     """What a model predicts of N states.
 
     Attributes:
@@ -74,7 +75,7 @@ class Prediction:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model:
+class Model(Brief):
     """Robot and effects.
 
     Attributes:

@@ -19,6 +19,7 @@ from hilcal.robot.batch import empty, zeros
 from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
 from hilcal.robot.deviation import Deviation
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
 
 ALL = slice(0, 6)
@@ -26,7 +27,7 @@ ALL = slice(0, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+class Observation(Brief):
     """What the sensor would read without noise.
 
     Attributes:

@@ -1,11 +1,23 @@
 """What results say: a document of words, tables and charts, made once, and what renders it."""
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 def html_of(value: object) -> str:
     """Return a result as a notebook shows it."""
     from hilcal.present import notebook  # loads all kinds of results
 
     return notebook.html_of(value)
+
+
+def frame_of(value: object) -> "pd.DataFrame":
+    """Return a result as a data frame."""
+    from hilcal.present import frames  # loads all kinds of results
+
+    return frames.frame_of(value)
 
 
 def message(of: object) -> str:

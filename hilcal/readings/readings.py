@@ -9,6 +9,7 @@ import numpy as np
 from hilcal.errors import InputError
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise
+from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
 ObserverKind = Literal["station", "point", "gauge"]
@@ -17,7 +18,7 @@ SAME_POSE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class States:
+class States(Brief):
     """N states of the arm: everything that a prediction may depend on.
 
     Attributes:
@@ -87,7 +88,7 @@ class ObserverName:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Readings:
+class Readings(Tabular):
     """N readings of the target's position (m = 3) or pose (m = 6), one per state.
 
     A distance or a height is one number: the first element of a reading of m = 3, whose others are

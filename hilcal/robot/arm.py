@@ -7,6 +7,7 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.shown import Brief
 from hilcal.types import Bools, Floats
 
 UNKNOWN_TORQUE, UNKNOWN_FORCE = 150.0, 1500.0
@@ -51,7 +52,7 @@ def missing(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Arm:
+class Arm(Brief):
     """A serial arm of n joints, revolute or prismatic (rails, columns, gantries).
 
     The chain from base to flange is

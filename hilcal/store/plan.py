@@ -10,6 +10,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_names
+from hilcal.shown import Brief
 from hilcal.toml import read_json, suggest
 from hilcal.types import Floats
 
@@ -42,7 +43,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Plan:
+class Plan(Brief):
     """Poses, and steps in the order in which they are taken.
 
     Attributes:

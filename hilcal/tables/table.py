@@ -429,6 +429,14 @@ def write_table(
         InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
     """
     path = Path(path)
+    found = exchange_columns(readings, covers, units)
+    write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
+
+
+def exchange_columns(
+    readings: Readings, covers: str = INSTRUMENT, units: Sequence[str] | None = None
+) -> dict[str, Column]:
+    """Return the columns of an exchange table; arguments and errors as of `write_table`."""
     found: dict[str, Column] = {
         "pose": _names(readings.pose_names, readings.pose, "pose"),
         "load": _names(readings.load_names, readings.load, "load"),
@@ -440,8 +448,7 @@ def write_table(
     if covers != INSTRUMENT:
         found[columns.COVERS] = [covers] * len(readings)
     header, numbers = _number_columns(readings, units)
-    found |= zip(header, numbers, strict=True)
-    write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
+    return found | dict(zip(header, numbers, strict=True))
 
 
 def with_what_rounding_does(covers: str, readings: Readings) -> str:

@@ -1,0 +1,52 @@
+"""Results as pandas data frames: the columns that tables of files have."""
+
+import io
+from functools import singledispatch
+from typing import TYPE_CHECKING
+
+from hilcal.design.checked_plan import CheckedPlan
+from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.errors import InputError
+from hilcal.identification.fit import Fit
+from hilcal.identification.residual_table import residual_table
+from hilcal.readings.readings import Readings
+from hilcal.tables.table import exchange_columns
+from hilcal.tables.write import plan_csv
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def frame_of(value: object) -> "pd.DataFrame":
+    """Return a result as a data frame.
+
+    Raises:
+        InputError: pandas is not installed.
+    """
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise InputError(
+            "to_frame needs pandas, which is not installed: pip install pandas"
+        ) from error
+    if isinstance(value, CheckedPlan):
+        text = io.StringIO(plan_csv(value.plan))
+        names = {"pose": str, "load": str}
+        return pd.read_csv(text, dtype=names, keep_default_na=False, float_precision="round_trip")
+    return pd.DataFrame(_columns(value))
+
+
+@singledispatch
+def _columns(value: object) -> object:
+    raise TypeError(f"no rows for a {type(value).__name__}")
+
+
+_columns.register(Readings, exchange_columns)
+_columns.register(Fit, residual_table)
+
+
+@_columns.register
+def _(d: Diagnosis) -> object:
+    rows = d.to_dict()["suspects"]
+    assert isinstance(rows, list)  # noqa: S101 - so the contract says
+    return rows
