@@ -29,7 +29,7 @@ from hilcal.diagnosis.change_found import Changes
 from hilcal.diagnosis.completed import completed
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier import Earlier, earlier_fit
+from hilcal.identification.earlier_fit import EarlierFit, earlier_fit
 from hilcal.identification.fit import fit
 from hilcal.identification.later_readings import setting
 from hilcal.readings.readings import Readings
@@ -67,7 +67,7 @@ class StudiedArm:
     world: World
     loads: Sequence[tuple[str, Floats]]
     others: Sequence[tuple[str, Floats]]
-    earlier: Earlier
+    earlier: EarlierFit
 
 
 @dataclass(frozen=True, slots=True, eq=False)

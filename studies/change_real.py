@@ -14,7 +14,7 @@ from hilcal.cell import Cell
 from hilcal.diagnosis.change import find_changes
 from hilcal.diagnosis.completed import completed
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier import Earlier, earlier_fit
+from hilcal.identification.earlier_fit import EarlierFit, earlier_fit
 from hilcal.identification.fit import fit
 from hilcal.identification.later_readings import setting
 from hilcal.library import read_table
@@ -82,7 +82,7 @@ def real_case(k: int, study: RealStudy) -> RealCase:
 
 
 @cache
-def _begun(study: RealStudy) -> tuple[Earlier, list[tuple[Readings, int]]]:
+def _begun(study: RealStudy) -> tuple[EarlierFit, list[tuple[Readings, int]]]:
     """Fit one half, and draw later readings and a joint, or 0, for each comparison.
 
     Once in each process: what is fitted is larger than what it takes to fit it.
@@ -102,7 +102,7 @@ def _begun(study: RealStudy) -> tuple[Earlier, list[tuple[Readings, int]]]:
     return earlier, out
 
 
-def _moved(earlier: Earlier, later: Readings, j: int) -> Readings:
+def _moved(earlier: EarlierFit, later: Readings, j: int) -> Readings:
     """Return the readings as they were, had the zero of a joint moved: by the fitted model."""
     model, theta, s = earlier.fit.model, earlier.fit.theta, later.states
     step = ZERO_RAD * np.eye(s.q.shape[1])[j]

@@ -22,7 +22,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit
 from hilcal.present.charts import style
-from hilcal.present.charts.made_of import made_of
+from hilcal.present.charts.comparisons import made_of
 from hilcal.readings.covariance import (
     TrackerNoise,
     measurement_covariance,

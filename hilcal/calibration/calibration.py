@@ -27,7 +27,7 @@ from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.compensation import Inverse, Pose, invert
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.conditions import Condition, conditions_of, needed
-from hilcal.calibration.learnt import Learnt
+from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import ToolPoses
 from hilcal.calibration.scatter import Scatter, scatter_of
@@ -93,7 +93,7 @@ class Calibration(Brief):
     loads: Mapping[str, Floats]
     source: Mapping[str, Any]
     sensor: SensorMount | None = None
-    learnt: Learnt | None = None
+    learnt: CovarianceSource | None = None
     conditions: Mapping[str, Condition] = field(default_factory=dict)
     _tracked: ToolPose = field(init=False, repr=False)
 
@@ -140,7 +140,7 @@ class Calibration(Brief):
             # With a carried prior the covariance does not follow from these readings alone.
             learnt=None
             if model.prior is not None
-            else Learnt(
+            else CovarianceSource(
                 p.excess.of_readings(used, found.mode),
                 p.prior,
                 p.noise,

@@ -25,7 +25,7 @@ from hilcal.calibration.check_stored import (
     check_spread,
 )
 from hilcal.calibration.conditions import Condition
-from hilcal.calibration.learnt import Learnt
+from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.sensed import SensorMount
@@ -167,7 +167,7 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
     check_numbers("std", std, (len(names),), least=0.0)
     root = learnt = None
     if "learnt" in content:
-        learnt = Learnt.from_json(content["learnt"])
+        learnt = CovarianceSource.from_json(content["learnt"])
         learnt.check(model)
     else:
         flat = np.frombuffer(base64.b64decode(content["covariance_root"]), dtype="<f4")
@@ -215,7 +215,7 @@ def _small(c: Calibration) -> dict[str, object] | None:
     states = c.learnt.readings.states
     states = states[:: max(len(states) // TRIED, 1)]
     jacobian = c.model.jacobian(c.model.predict(states, c.theta), c.theta, 3)
-    again = Learnt.from_json(small).root(c.model, c.theta, c.mode)
+    again = CovarianceSource.from_json(small).root(c.model, c.theta, c.mode)
     stated, found = (np.linalg.norm(jacobian @ root, axis=(1, 2)) for root in (c.root, again))
     return small if np.all(np.abs(found - stated) <= AGREES * stated) else None
 

@@ -53,8 +53,8 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
+from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.torques import check_torques
-from hilcal.identification.weight import weight_note
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
@@ -309,7 +309,7 @@ def refine(
         other = other_arm_of(o.cell, o.readings) if latest is None else None
         if other is not None:
             t.show(other_arm_line(other))
-        weight = weight_note(found.fit)
+        weight = masses_note(found.fit)
         if weight is not None:
             t.show(numbers.sentence(weight))
         if found.rejected:

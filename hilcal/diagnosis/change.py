@@ -25,7 +25,7 @@ from hilcal.diagnosis.change_candidates import Candidate, candidates
 from hilcal.diagnosis.change_found import Change, Changes, ChangeSize, Limit
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.earlier import Earlier
+from hilcal.identification.earlier_fit import EarlierFit
 from hilcal.identification.later_readings import Remeasured, Setting, remeasure
 from hilcal.regression.evidence import FamilyScore, log_evidence, score_family
 from hilcal.regression.power import noncentrality_of_power
@@ -231,7 +231,7 @@ def _needed(now: Remeasured, steps: list[_Step], tested: int) -> tuple[Remeasure
     return now, steps
 
 
-def _sized(after: Remeasured, steps: Sequence[_Step], earlier: Earlier) -> tuple[Change, ...]:
+def _sized(after: Remeasured, steps: Sequence[_Step], earlier: EarlierFit) -> tuple[Change, ...]:
     noise = _least_noise(after)
     out, at = [], 0
     for candidate, p_value, evidence, same in steps:
@@ -259,7 +259,7 @@ def _sized(after: Remeasured, steps: Sequence[_Step], earlier: Earlier) -> tuple
     return tuple(sorted(out, key=lambda c: -c.log_evidence))
 
 
-def _before(earlier: Earlier, effect: str, parameter: str) -> tuple[float, float] | None:
+def _before(earlier: EarlierFit, effect: str, parameter: str) -> tuple[float, float] | None:
     """Value and standard deviation of a parameter in the earlier fit."""
     for e, mine in zip(earlier.fit.model.effects, earlier.fit.model.slices(), strict=True):
         names = [p.name for p in e.parameters]

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from hilcal.diagnosis.change_candidates import Candidate
 from hilcal.effects.changed import Changeable
-from hilcal.identification.earlier import Earlier
+from hilcal.identification.earlier_fit import EarlierFit
 from hilcal.identification.later_readings import Remeasured
 
 UNEXPLAINED = 1e-3
@@ -142,7 +142,7 @@ class Changes:
     hidden: tuple[Candidate, ...]
     unexplained: float
     scatter: float
-    earlier: Earlier
+    earlier: EarlierFit
 
     @property
     def explained(self) -> bool:

@@ -12,10 +12,10 @@ from hilcal.effects.protocol import Role
 from hilcal.effects.spec import EffectSpec
 from hilcal.identification.carried import CarriedPrior, check_prior
 from hilcal.identification.misdescription import refuse_misdescribed
+from hilcal.identification.missing_masses import loads_differ, masses_missing
 from hilcal.identification.registration import Registration, register
 from hilcal.identification.rigid_frames import TARGET_M, TELL
 from hilcal.identification.torques import require_torques
-from hilcal.identification.weight import loads_differ, weight_missing
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
@@ -52,7 +52,7 @@ def baseline(
     known = catalogue or installed()
     loaded = bool(np.any(readings.states.wrench != 0))
     names = [kind.name for kind in known.with_role("baseline") if loaded]
-    if loaded and weight_missing(cell, mode) and loads_differ(readings):
+    if loaded and masses_missing(cell, mode) and loads_differ(readings):
         names += [kind.name for kind in known.effects if kind.for_missing_weight]
     if prior is not None:
         learnt = [e.name for e in prior.posterior.effects]

@@ -9,8 +9,8 @@ from hilcal.identification.background import background_of
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import error_before, full_prediction
 from hilcal.identification.gross_errors import disagreement_words, gross_errors
+from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.registration import register
-from hilcal.identification.weight import weight_note
 
 
 def to_json(fit: Fit) -> dict[str, object]:
@@ -114,7 +114,7 @@ def notes(fit: Fit) -> tuple[str, ...]:
         )
     if fit.disagreement is not None:
         out.append(disagreement_words(fit))
-    weight = weight_note(fit)
+    weight = masses_note(fit)
     if weight is not None:
         out.append(weight)
     return tuple(out)

@@ -34,7 +34,7 @@ SETTLED = 0.02
 """Priors and rank are chosen at each step until the residual changes by less than this share from
 one step to the next, or is within the noise; then they are kept. A choice, no study set it."""
 DEPTH = 3
-"""Earlier steps that a step is combined with; a choice, there are as few weak directions."""
+"""EarlierFit steps that a step is combined with; a choice, there are as few weak directions."""
 HALVINGS = 8
 """Most step lengths of a line search; a choice, no study set it."""
 

@@ -30,7 +30,7 @@ from hilcal.effects.target_offset import TargetOffset
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import ARM
-from hilcal.identification.earlier import Earlier
+from hilcal.identification.earlier_fit import EarlierFit
 from hilcal.identification.fit import Fit
 from hilcal.identification.priors import scales_of
 from hilcal.identification.registration import register
@@ -86,7 +86,7 @@ class Setting:
         frames: number of parameters of frames that are estimated anew, the last ones.
     """
 
-    earlier: Earlier
+    earlier: EarlierFit
     readings: Readings
     w: Whitening
     model: Model
@@ -210,7 +210,7 @@ class Remeasured:
 
 
 def setting(
-    earlier: Earlier, readings: Readings, *, anew: bool, cell: Cell | None = None
+    earlier: EarlierFit, readings: Readings, *, anew: bool, cell: Cell | None = None
 ) -> Setting:
     """Prepare the comparison of later readings with an earlier fit.
 
@@ -337,7 +337,7 @@ def _visible(model: Model, mean: Floats, root: Floats, readings: Readings, w: Wh
     return np.asarray(vectors[values > LEAST * max(float(values.max(initial=0.0)), 1.0)])
 
 
-def _pose_rows(earlier: Earlier, w: Whitening) -> Floats:
+def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
     """Rows (R, L) of a misfit that is common to the measurements of a pose, with its spread."""
     shared = earlier.by_pose / earlier.noise
     poses, of = np.unique(w.group, return_inverse=True)

@@ -52,7 +52,7 @@ class Source:
 
 
 @dataclass(frozen=True, slots=True)
-class LearntEffect:
+class PosteriorEffect:
     """An effect of the arm, by name and options."""
 
     name: str
@@ -90,7 +90,7 @@ class Posterior(Brief):
     arm: str
     links: Floats
     mode: Mode
-    effects: tuple[LearntEffect, ...]
+    effects: tuple[PosteriorEffect, ...]
     names: tuple[str, ...]
     units: tuple[str, ...]
     scale: Floats
@@ -114,7 +114,7 @@ class Posterior(Brief):
             InputError: a fit of another scaling than gc.
             CannotAnswerError: a model without any effect of the arm.
         """
-        from hilcal.identification.learnt import posterior_of
+        from hilcal.identification.posterior_of_fit import posterior_of
 
         return posterior_of(fit, source)
 

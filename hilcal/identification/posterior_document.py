@@ -11,7 +11,7 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.errors import InputError
-from hilcal.identification.posterior import LearntEffect, Posterior, Source
+from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
 from hilcal.names import check_names
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.ranges import Range
@@ -115,7 +115,9 @@ def _read(content: Mapping[str, Any]) -> Posterior:
         arm=str(content["arm"]),
         links=links,
         mode=MODES[MODES.index(content["readings"])],
-        effects=tuple(LearntEffect(str(e["name"]), dict(e["options"])) for e in content["effects"]),
+        effects=tuple(
+            PosteriorEffect(str(e["name"]), dict(e["options"])) for e in content["effects"]
+        ),
         names=names,
         units=units,
         scale=scale,

@@ -15,9 +15,9 @@ from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
 from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
 from hilcal.identification.gross_errors import gross_errors
-from hilcal.identification.learnt import of_arm
+from hilcal.identification.missing_masses import masses_note
+from hilcal.identification.posterior_of_fit import of_arm
 from hilcal.identification.residual import ErrorBlock
-from hilcal.identification.weight import weight_note
 from hilcal.numbers import names
 from hilcal.present.document import Block, Table, heading, note, table
 from hilcal.present.registration import fitted_lines
@@ -76,7 +76,7 @@ def _short(fit: Fit) -> Iterator[str]:
         several = f"{len(null)} directions" if len(null) > 1 else "1 direction"
         yield f"{several} cannot be seen in these readings: {numbers.few(null, 1)}."
     yield from set_aside(fit, details=False)
-    if (weight := weight_note(fit)) is not None:
+    if (weight := masses_note(fit)) is not None:
         yield numbers.sentence(weight)
     yield from list(fitted_lines(fit))[:1]
 

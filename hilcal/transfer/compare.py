@@ -13,7 +13,7 @@ from hilcal.diagnosis.change_candidates import changing
 from hilcal.diagnosis.comparison import Comparison, error_today
 from hilcal.diagnosis.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.earlier import earlier_fit
+from hilcal.identification.earlier_fit import earlier_fit
 from hilcal.identification.fit import Fit
 from hilcal.identification.later_readings import setting
 from hilcal.identification.misdescription import refuse_misdescribed

@@ -14,8 +14,8 @@ from hilcal.effects.failure import failure_of
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.learnt import of_arm
 from hilcal.identification.posterior import Posterior, Source
+from hilcal.identification.posterior_of_fit import of_arm
 from hilcal.names import check_names
 from hilcal.readings.same_readings import prints
 from hilcal.refinement import refine

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.stats import norm
 
 from hilcal.errors import CannotAnswerError
-from hilcal.identification.posterior import LearntEffect, Posterior, Source
+from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
 from hilcal.readings.ranges import Range
 from hilcal.regression.hierarchy import (
     FALSE_ALARM,
@@ -223,7 +223,7 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
     )
 
 
-def _common(members: Sequence[Member]) -> tuple[tuple[LearntEffect, ...], tuple[str, ...]]:
+def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tuple[str, ...]]:
     """Effects that most campaigns have, with the same options, and their parameters to pool."""
     count = Counter(e.name for m in members for e in m.posterior.effects)
     effects = []
@@ -330,7 +330,7 @@ def _odd(
 
 def _prior(
     members: Sequence[Member],
-    effects: tuple[LearntEffect, ...],
+    effects: tuple[PosteriorEffect, ...],
     names: tuple[str, ...],
     scale: Floats,
     units: dict[str, str],

@@ -10,7 +10,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.learnt import Learnt
+from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.poses import band
 from hilcal.calibration.scatter import Scatter
@@ -286,7 +286,7 @@ def test_the_covariance_follows_from_the_fitted_states(effect: str, mode: Mode) 
     c = calibrated(effect, mode)
     assert c.learnt is not None
     small = json.loads(json.dumps(c.learnt.to_json()))
-    again = replace(c, root=None, learnt=Learnt.from_json(small))
+    again = replace(c, root=None, learnt=CovarianceSource.from_json(small))
     states = fresh(3)
     a, b = (x.predict(states.q, states.wrench) for x in (c, again))
     np.testing.assert_allclose(a.std_m, b.std_m, rtol=1e-5)

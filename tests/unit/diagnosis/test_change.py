@@ -19,7 +19,7 @@ from hilcal.diagnosis.change_found import Changes
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.earlier import earlier_fit
+from hilcal.identification.earlier_fit import earlier_fit
 from hilcal.identification.later_readings import setting
 from hilcal.robot.catalogue import configs_dir
 from studies.change import StudiedArm, measured, remeasured, studied_arm

@@ -18,7 +18,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 
 
-def weight_missing(cell: Cell, mode: Mode) -> bool:
+def masses_missing(cell: Cell, mode: Mode) -> bool:
     """Whether the weight of the arm pulls in these readings, and is not described."""
     return mode == "absolute" and not np.any(cell.arm.masses)
 
@@ -29,13 +29,13 @@ def loads_differ(readings: Readings) -> bool:
     return len(np.unique(states, axis=0)) > len(np.unique(readings.pose))
 
 
-def weight_note(fit: Fit) -> str | None:
+def masses_note(fit: Fit) -> str | None:
     """Return what the missing masses do to the compliances of a fit; None where nothing.
 
     One sentence, to be begun with a capital and ended with a full stop.
     """
     model, readings = fit.model, fit.readings[~fit.outlier]
-    if not weight_missing(model.cell, fit.mode) or not any(e.elastic for e in model.effects):
+    if not masses_missing(model.cell, fit.mode) or not any(e.elastic for e in model.effects):
         return None
     begin = "the arm's description has no masses"
     names = [kind.name for kind in model.catalogue.effects if kind.for_missing_weight]

@@ -18,7 +18,7 @@ from hilcal.types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Earlier:
+class EarlierFit:
     """A gc-scaled fit, and what it states of readings that it has not seen.
 
     Attributes:
@@ -41,7 +41,7 @@ class Earlier:
         return self.fit.mode
 
 
-def earlier_fit(fit: Fit) -> Earlier:
+def earlier_fit(fit: Fit) -> EarlierFit:
     """Return what a gc-scaled fit states of readings that it has not seen.
 
     Raises:
@@ -60,7 +60,7 @@ def earlier_fit(fit: Fit) -> Earlier:
     shared = beyond * _shared(fit, knows, kept)
     values, vectors = np.linalg.eigh(knows.factor * knows.covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    return Earlier(fit, knows, root[:, values > 0.0], 1.0 + beyond - shared, shared)
+    return EarlierFit(fit, knows, root[:, values > 0.0], 1.0 + beyond - shared, shared)
 
 
 def _shared(fit: Fit, knows: Predictive, kept: Readings) -> float:

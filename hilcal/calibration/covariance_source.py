@@ -1,4 +1,4 @@
-"""The covariance of a calibration's parameters by what it was learnt from: small, and exact.
+"""The covariance of a calibration's parameters, stored as what it is computed from: small, exact.
 
 A transmission error has over a thousand parameters, most of which the readings do not determine,
 and their covariance has a million numbers of very different sizes. It follows from few:
@@ -30,7 +30,7 @@ from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Learnt:
+class CovarianceSource:
     """What the covariance follows from.
 
     Attributes:
@@ -120,7 +120,7 @@ class Learnt:
         }
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Learnt":
+    def from_json(cls, content: Mapping[str, Any]) -> "CovarianceSource":
         """Return what `to_json` wrote."""
         m = int(content["elements"])
         if m not in (3, 6):

@@ -8,7 +8,7 @@ from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.gauss_newton import whitened_jacobian
-from hilcal.identification.posterior import LearntEffect, Posterior, Source, determined
+from hilcal.identification.posterior import Posterior, PosteriorEffect, Source, determined
 from hilcal.identification.predictive import parameter_factor, predictive
 from hilcal.identification.priors import scales_of
 from hilcal.readings.ranges import ranges_of
@@ -41,7 +41,7 @@ def posterior_of(fit: Fit, source: Source | None = None) -> Posterior:
         arm=cell.arm.name,
         links=cell.arm.links,
         mode=fit.mode,
-        effects=tuple(LearntEffect(e.name, dict(e.options)) for e in learnt),
+        effects=tuple(PosteriorEffect(e.name, dict(e.options)) for e in learnt),
         names=tuple(f"{e.name}.{p.name}" for e in learnt for p in e.parameters),
         units=tuple(p.unit for e in learnt for p in e.parameters),
         scale=scale,

@@ -8,7 +8,7 @@ import pytest
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.weight import loads_differ, weight_note
+from hilcal.identification.missing_masses import loads_differ, masses_note
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
 
@@ -33,7 +33,7 @@ def test_where_loads_differ_the_compliances_are_right(mode: str) -> None:
     assert ("link_mass" in f.model.names) == (mode == "absolute")
     assert ratios(f) == pytest.approx(1.0, abs=0.03)
     assert f.variance_factor == pytest.approx(1.0, abs=0.3)
-    note = weight_note(f)
+    note = masses_note(f)
     if mode == "deflection":
         assert note is None
     else:
@@ -45,11 +45,11 @@ def test_without_the_weight_they_are_too_soft_and_that_is_said() -> None:
     f = fit(with_effects(BARE, C.readings, "absolute", ("joint_compliance",)), C.readings,
             "absolute")  # fmt: skip
     assert ratios(f).max() > 1.3
-    assert "hilcal add RUN link_mass" in weight_note(f)
+    assert "hilcal add RUN link_mass" in masses_note(f)
     told = fit(with_effects(C.cell, C.readings, "absolute", ("joint_compliance",)), C.readings,
                "absolute")  # fmt: skip
     assert ratios(told) == pytest.approx(1.0, abs=0.03)
-    assert weight_note(told) is None
+    assert masses_note(told) is None
 
 
 def test_under_one_load_nothing_tells_them_apart_and_that_is_said() -> None:
@@ -58,5 +58,5 @@ def test_under_one_load_nothing_tells_them_apart_and_that_is_said() -> None:
     f = fit(baseline(BARE, light, "absolute"), light, "absolute")
     assert "link_mass" not in f.model.names
     assert ratios(f)[0] > 2.0
-    assert "no pose was read under two loads" in weight_note(f)
+    assert "no pose was read under two loads" in masses_note(f)
     assert loads_differ(under(C.readings, "none", "5kg"))
