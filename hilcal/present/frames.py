@@ -1,5 +1,6 @@
 """Results as pandas data frames: the columns that tables of files have."""
 
+import csv
 import io
 from functools import singledispatch
 from typing import TYPE_CHECKING
@@ -29,10 +30,6 @@ def frame_of(value: object) -> "pd.DataFrame":
         raise InputError(
             "to_frame needs pandas, which is not installed: pip install pandas"
         ) from error
-    if isinstance(value, CheckedPlan):
-        text = io.StringIO(plan_csv(value.plan))
-        names = {"pose": str, "load": str}
-        return pd.read_csv(text, dtype=names, keep_default_na=False, float_precision="round_trip")
     return pd.DataFrame(_columns(value))
 
 
@@ -43,6 +40,15 @@ def _columns(value: object) -> object:
 
 _columns.register(Readings, exchange_columns)
 _columns.register(Fit, residual_table)
+
+
+@_columns.register
+def _(plan: CheckedPlan) -> object:
+    head, *rows = csv.reader(io.StringIO(plan_csv(plan.plan)))
+    words = ("pose", "load")
+    return [
+        {k: v if k in words else float(v) for k, v in zip(head, row, strict=True)} for row in rows
+    ]
 
 
 @_columns.register

@@ -3,6 +3,7 @@
 import ast
 import doctest
 import inspect
+import shutil
 import socket
 import subprocess
 import sys
@@ -157,3 +158,56 @@ def test_wrong_words_are_refused_with_the_valid_ones(site: SimpleNamespace) -> N
         hc.fit(model, readings, scaling="gx")
     with pytest.raises(hc.InputError, match="valid: deflection, absolute"):
         hc.fit(model, readings, readings="relative")
+
+
+def test_what_a_console_prints_of_a_value_is_at_most_fifteen_lines(site: SimpleNamespace) -> None:
+    with hc.Campaign.open(site.run, read_only=True) as run:
+        model = hc.baseline(run.cell, run.readings)
+        found = hc.refine(model, run.readings)
+        fit, judged = found.fit, found.diagnosis
+        values = [run, run.cell, run.cell.arm, run.readings, run.readings.states, model, fit]
+        values += [fit.parameters, fit.predict(run.readings.states), judged, judged.suspects[0]]
+        for value in (*values, found, found.steps[0]):
+            text = repr(value)
+            assert text.count("\n") < 15, text
+            assert len(text) < 2500, text
+        assert judged.verdict in repr(judged)
+        assert judged.suspects[0].effect in repr(judged)
+        assert all(step.diagnosis.verdict in repr(found) for step in found.steps)
+
+
+def test_results_are_data_frames(site: SimpleNamespace, tmp_path: Path) -> None:
+    with hc.Campaign.open(site.run, read_only=True) as run:
+        frame = run.readings.to_frame()
+        frame.to_csv(tmp_path / "t.csv", index=False)
+        again = hc.read_table(tmp_path / "t.csv", run.cell)
+        np.testing.assert_allclose(again.value, run.readings.value, rtol=0, atol=1e-15)
+        fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)
+        rows = fit.to_frame()
+        assert rows["pose"].tolist() == frame["pose"].tolist()
+        assert rows["load"].tolist() == frame["load"].tolist()
+        own = rows[["residual_x_m", "residual_y_m", "residual_z_m"]].dropna().to_numpy(float)
+        assert np.linalg.norm(own) == pytest.approx(np.linalg.norm(fit.residuals()[:, :3]))
+        judged = hc.diagnose(fit)
+        assert judged.to_frame()["effect"].tolist() == [s.effect for s in judged.suspects]
+        assert fit.parameters.to_frame().index.tolist() == [p.name for p in fit.parameters]
+
+
+def test_a_plan_is_a_data_frame(site: SimpleNamespace) -> None:
+    made = hc.plan(hc.Cell.load(site.cell), poses=3, seed=1)
+    frame = made.to_frame()
+    assert frame["pose"].tolist() == [step.pose for step in made.plan.steps]
+    assert frame["load"].tolist() == [step.load for step in made.plan.steps]
+    q = frame[[f"q{j}_rad" for j in range(1, 7)]].to_numpy()
+    np.testing.assert_array_equal(q, [made.plan.joints(step.pose) for step in made.plan.steps])
+
+
+def test_the_calibration_of_a_campaign_is_loaded_by_its_name(
+    site: SimpleNamespace, tmp_path: Path
+) -> None:
+    path = Path(shutil.copy(site.run, tmp_path / "run.hilcal"))
+    with hc.Campaign.open(path) as run:
+        run.append(hc.fit(hc.baseline(run.cell, run.readings), run.readings))
+        expected = run.calibration().predict(np.full(6, 0.3), std=False)
+    found = hc.Calibration.load(path).predict(np.full(6, 0.3), std=False)
+    np.testing.assert_allclose(found.position, expected.position, rtol=0, atol=1e-12)
