@@ -13,7 +13,7 @@ export OMP_NUM_THREADS ?= 1
 # else every program that a test starts compiles all of hilcal again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test check format slow bench docs lock clean
+.PHONY: help setup demo test check format slow bench docs versions dist sbom release lock clean
 
 help:
 	@echo "make demo    the whole story on a simulated cell with a hidden effect"
@@ -22,6 +22,8 @@ help:
 	@echo "make slow    the tests that take minutes"
 	@echo "make bench   the benchmarks"
 	@echo "make docs    the site, in site/"
+	@echo "make release all steps of a release up to the upload; TESTS=... runs some tests only"
+	@echo "make versions the lowest and the newest versions of libraries (takes long)"
 	@echo "make format  ruff format and safe fixes"
 	@echo "make lock    renew both locks from pyproject.toml (needs the network)"
 	@echo "make clean   remove the environment and all caches"
@@ -65,6 +67,27 @@ slow: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pytest -q -m "slow or not slow" --benchmark-enable --benchmark-only
 
+# PYTHONS="python3.12 python3.13" tries others.
+versions:
+	set -e; for python in $(or $(PYTHONS),$(PYTHON)); do for which in lowest newest; do \
+	  .ci/versions $$python $$which; done; done
+
+dist: $(DOCS)
+	.ci/build
+
+# Of what `pip install "hilcal[all]"` brings in the versions of the lock.
+sbom: $(DOCS)
+	test -d .wheel || PYTHON=$(PYTHON) .ci/wheel
+	sed -n 's/^\([^ #]*==[^ ]*\).*/\1/p' requirements.lock > .wheel/constraints
+	.wheel/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
+	  --constraint .wheel/constraints "$$(ls $(CURDIR)/dist/*.whl)[all]"
+	$(BIN)/cyclonedx-py environment --output-reproducible --pyproject pyproject.toml \
+	  --output-file dist/hilcal.cdx.json .wheel/bin/python
+	$(BIN)/python .ci/licences dist/hilcal.cdx.json > dist/LICENCES.txt
+
+release: $(DOCS)
+	PYTHON=$(PYTHON) TESTS="$(TESTS)" .ci/release
+
 # Of the second lock only what the first one lacks is kept.
 COMPILE = .lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras \
   --no-config --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
@@ -85,6 +108,6 @@ lock:
 	rm -rf .lock
 
 clean:
-	rm -rf .venv .lock build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache \
+	rm -rf .venv .lock .wheel build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache \
 	  .hypothesis .benchmarks .import_linter_cache
 	find hilcal drivers tests -name __pycache__ -type d -prune -exec rm -rf {} +
