@@ -5,13 +5,15 @@ PYTHON ?= $(firstword $(call having,10 < sys.version_info.minor < 13,python3 pyt
   $(call having,12 < sys.version_info.minor,python3.14 python3.13 python3))
 BIN := .venv/bin
 STAMP := .venv/.installed
+DOCS := .venv/.installed-docs
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 # pytest runs in parallel; more threads in each process only slow it down
 export OMP_NUM_THREADS ?= 1
 # else every program that a test starts compiles all of hilcal again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test check format slow bench lock clean
+.PHONY: help setup demo test check format slow bench docs versions dist sbom release lock clean
 
 help:
 	@echo "make demo    the whole story on a simulated cell with a hidden effect"
@@ -19,8 +21,11 @@ help:
 	@echo "make check   ruff, mypy, import-linter"
 	@echo "make slow    the tests that take minutes"
 	@echo "make bench   the benchmarks"
+	@echo "make docs    the site, in site/"
+	@echo "make release all steps of a release up to the upload; TESTS=... runs some tests only"
+	@echo "make versions the lowest and the newest versions of libraries (takes long)"
 	@echo "make format  ruff format and safe fixes"
-	@echo "make lock    renew requirements.lock from pyproject.toml (needs the network)"
+	@echo "make lock    renew both locks from pyproject.toml (needs the network)"
 	@echo "make clean   remove the environment and all caches"
 
 setup: $(STAMP)
@@ -28,11 +33,16 @@ setup: $(STAMP)
 $(STAMP): requirements.lock pyproject.toml setup.py
 	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or later with venv found; set PYTHON=..." >&2; exit 1; }
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
-	  --require-hashes --requirement requirements.lock
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check \
-	  --no-build-isolation --no-deps --editable .
+	$(PIP) --only-binary :all: --require-hashes --requirement requirements.lock
+	$(PIP) --no-build-isolation --no-deps --editable .
 	@touch $@
+
+$(DOCS): requirements-docs.lock $(STAMP)
+	$(PIP) --only-binary :all: --no-deps --require-hashes --requirement requirements-docs.lock
+	@touch $@
+
+docs: $(DOCS)
+	$(BIN)/python -m mkdocs build --strict -d site
 
 demo: $(STAMP)
 	$(BIN)/hilcal demo
@@ -57,19 +67,47 @@ slow: $(STAMP)
 bench: $(STAMP)
 	$(BIN)/python -m pytest -q -m "slow or not slow" --benchmark-enable --benchmark-only
 
+# PYTHONS="python3.12 python3.13" tries others.
+versions:
+	set -e; for python in $(or $(PYTHONS),$(PYTHON)); do for which in lowest newest; do \
+	  .ci/versions $$python $$which; done; done
+
+dist: $(DOCS)
+	.ci/build
+
+# Of what `pip install "hilcal[all]"` brings in the versions of the lock.
+sbom: $(DOCS)
+	test -d .wheel || PYTHON=$(PYTHON) .ci/wheel
+	sed -n 's/^\([^ #]*==[^ ]*\).*/\1/p' requirements.lock > .wheel/constraints
+	.wheel/bin/python -m pip install --quiet --disable-pip-version-check --only-binary :all: \
+	  --constraint .wheel/constraints "$$(ls $(CURDIR)/dist/*.whl)[all]"
+	$(BIN)/cyclonedx-py environment --output-reproducible --pyproject pyproject.toml \
+	  --output-file dist/hilcal.cdx.json .wheel/bin/python
+	$(BIN)/python .ci/licences dist/hilcal.cdx.json > dist/LICENCES.txt
+
+release: $(DOCS)
+	PYTHON=$(PYTHON) TESTS="$(TESTS)" .ci/release
+
+# Of the second lock only what the first one lacks is kept.
+COMPILE = .lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras \
+  --no-config --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
+  --no-emit-find-links --no-emit-options --pip-args "--only-binary :all:"
+EXTRAS = report,view,workbench,cluster,compiled,tables,dev
 lock:
 	$(PYTHON) -m venv .lock
-	cp requirements.lock .lock/
 	.lock/bin/python -m pip install --quiet --disable-pip-version-check pip-tools
-	.lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras \
-	  --no-config --no-header --no-annotate --no-emit-index-url --no-emit-trusted-host \
-	  --no-emit-find-links --no-emit-options --pip-args "--only-binary :all:" \
-	  --extra dev --output-file .lock/requirements.lock pyproject.toml
+	cp requirements.lock .lock/
+	$(COMPILE) --extra $(EXTRAS) --output-file .lock/requirements.lock pyproject.toml
+	$(COMPILE) --extra $(EXTRAS),docs,release --constraint .lock/requirements.lock \
+	  --output-file .lock/both.lock pyproject.toml
 	{ head -2 requirements.lock; cat .lock/requirements.lock; } > .lock/whole
+	{ head -2 requirements-docs.lock; awk 'NR == FNR { if (/==/) has[$$1] = 1; next } \
+	  /==/ { keep = !($$1 in has) } keep' .lock/requirements.lock .lock/both.lock; } > .lock/docs
 	mv .lock/whole requirements.lock
+	mv .lock/docs requirements-docs.lock
 	rm -rf .lock
 
 clean:
-	rm -rf .venv .lock build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache \
+	rm -rf .venv .lock .wheel build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache \
 	  .hypothesis .benchmarks .import_linter_cache
 	find hilcal drivers tests -name __pycache__ -type d -prune -exec rm -rf {} +

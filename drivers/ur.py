@@ -32,6 +32,7 @@ from drivers.ur_link.worker import WorkerError
 from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report
+from hilcal.optional import install
 from hilcal.toml import check_section
 from hilcal.types import Floats
 
@@ -334,7 +335,7 @@ def _is_foreign(problem: str) -> bool:
 
 def _lacking(python: tuple[int, ...]) -> str:
     """Say what to do where ur-rtde is not installed."""
-    why, mend = "is not installed", "pip install ur-rtde"
+    why, mend = "is not installed", install("rtde_control")
     if python >= NO_WHEEL:
         why = f"has no wheel for Python {python[0]}.{python[1]}"
         mend = "use Python 3.11 or 3.12 for the cell's computer"

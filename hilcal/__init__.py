@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, cast
 
 from hilcal.shown import Presenter
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 
 _PLACES = {
     "Calibration": "hilcal.calibration.calibration",

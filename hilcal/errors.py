@@ -13,6 +13,13 @@ class InputError(HilcalError):
     exit_code = 2
 
 
+class MissingPackageError(InputError, NotImplementedError):
+    """A package is not installed: says how to install it.
+
+    A notebook that shows a value shows its `repr` then, since this is a `NotImplementedError`, too.
+    """
+
+
 class DeviceError(HilcalError):
     """A device failed or did not answer."""
 

@@ -10,9 +10,6 @@ import numpy as np
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.design.checked_plan import CheckedPlan, checked
-from hilcal.design.planner import Request, make
-from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue, installed
@@ -30,6 +27,7 @@ from hilcal.identification.full_covariance import full_readings
 from hilcal.identification.noise_estimate import with_estimated_noise
 from hilcal.identification.posterior import Posterior
 from hilcal.model.model import Model
+from hilcal.optional import needed_by
 from hilcal.present.story import build_story
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.readings import Readings
@@ -44,8 +42,9 @@ from hilcal.tables.importing import import_readings
 from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # needs Pinocchio, which a fit does not
     from drivers.simulated.rehearsal import Rehearsal, SimulationCase
+    from hilcal.design.checked_plan import CheckedPlan
 
 
 def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) -> Readings:
@@ -315,7 +314,7 @@ def plan(
     given: Fit | None = None,
     seed: int = 0,
     prior: Posterior | CarriedPrior | None = None,
-) -> CheckedPlan:
+) -> "CheckedPlan":
     """Choose poses, loads and their order by optimal design, with a certificate.
 
     >>> plan = hc.plan(hc.Cell.load(CELL), poses=6)
@@ -335,6 +334,11 @@ def plan(
         InputError: numbers or names that cannot be, or a cell without configuration.
         CannotAnswerError: the cell leaves too few poses, or the readings are too few.
     """
+    with needed_by("a plan"):
+        from hilcal.design.checked_plan import checked
+        from hilcal.design.planner import Request, make
+        from hilcal.design.summary import about, summarise
+
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:
         raise InputError("a plan after a fit has the prior of that fit; leave out one of both")

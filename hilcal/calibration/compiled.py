@@ -20,6 +20,7 @@ from hilcal.calibration.compensation import MOST_TURN, TOLERANCE
 from hilcal.calibration.form import TRIALS, CompiledForm, given_the_columns, packed, repeated
 from hilcal.calibration.tool import ToolPose, in_chain
 from hilcal.effects.protocol import FRAME_ROLES, Effect, Situation
+from hilcal.optional import install
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
@@ -109,7 +110,7 @@ def compiled(tool: ToolPose, mode: Mode) -> Compiled | tuple[str, ...]:
     try:
         import numba  # noqa: F401
     except ImportError:
-        return ("numba, which is not installed",)
+        return (f"numba, which is not installed ({install('numba')})",)
     model = tool.model
     arm, cell = model.cell.arm, model.cell
     if arm.n != 6 or arm.slides.any() or not (arm.drive is arm.coupling is None):

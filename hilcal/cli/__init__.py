@@ -26,6 +26,7 @@ from hilcal.cli.commands import (
 )
 from hilcal.cli.failing import Failures, Watched
 from hilcal.errors import DeviceError, HilcalError, StoppedError
+from hilcal.optional import lacking
 from hilcal.store.command_line import typed
 
 DEBUG = "HILCAL_DEBUG"
@@ -228,6 +229,8 @@ def _run(
         if isinstance(error, ImportError) and (lacks := _LIBRARY.match(str(error))):
             package = " (libgomp1 on Debian)" if lacks[1] == "libgomp.so.1" else ""
             words = f"the system library {lacks[1]} is missing: install its package{package}"
+            return failures.tell(error, words, _USAGE)
+        if words := lacking(error):
             return failures.tell(error, words, _USAGE)
         from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
 

@@ -43,6 +43,8 @@ GROUPS = {
     "hilcal.force_sensors": "force sensors",
     "hilcal.operators": "operators",
 }
+NOT_FOR_USERS = ("all", "dev", "docs", "release")
+"""Extras that no command needs: `all` repeats the others."""
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _BELOW = re.compile(r"""python_version\s*<\s*["'](\d+)\.(\d+)["']""")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
@@ -203,7 +205,7 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
     for requirement in requirements:
         match, extra = _NAME.match(requirement), _EXTRA.search(requirement)
         below = _BELOW.search(requirement)
-        if match is None or (extra is not None and extra[1] == "dev"):
+        if match is None or (extra is not None and extra[1] in NOT_FOR_USERS):
             continue
         name = match[0]
         try:
@@ -228,7 +230,7 @@ def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
             there.append(f"{name} {version}")
     for extra_name, names in lacking.items():
         said = f"{', '.join(names)}: not installed; what needs them says so"
-        mend = f"where it is wanted: pip install 'hilcal[{extra_name}]'"
+        mend = f'where it is wanted: pip install "hilcal[{extra_name}]"'
         out.append(Finding(PROGRAM, f"optional: {extra_name}", "ok", said, mend))
     return (Finding(PROGRAM, "packages", "ok", ", ".join(there)), *out)
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from hilcal.engine.tasks import ClusterError, Task, deadly
 from hilcal.errors import InputError
+from hilcal.optional import needed_by
 
 if TYPE_CHECKING:  # takes half a second to import
     from distributed import Client
@@ -122,8 +123,9 @@ def _check_certificates(address: str) -> None:
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Keep Dask's own words about workers that come and go from the operator's screen."""
-    import dask
-    import distributed  # its settings are complete before they are changed
+    with needed_by("a cluster"):
+        import dask
+        import distributed  # its settings are complete before they are changed
 
     loggers = [logging.getLogger(name) for name in (distributed.__name__, "tornado")]
     levels = [logger.level for logger in loggers]

@@ -11,6 +11,7 @@ import numpy as np
 
 from hilcal.errors import InputError
 from hilcal.identification.residual import ErrorBlock
+from hilcal.optional import needed_by
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
 
@@ -123,13 +124,8 @@ class Estimates(Sequence[Estimate]):
         Raises:
             InputError: pandas is not installed.
         """
-        try:
+        with needed_by("to_frame (to_dicts returns the same without pandas)"):
             import pandas as pd
-        except ImportError as error:
-            raise InputError(
-                "to_frame needs pandas, which is not installed: pip install pandas; to_dicts "
-                "returns the same without it"
-            ) from error
         return pd.DataFrame(self.to_dicts()).set_index("name")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 
 from hilcal import limits
 from hilcal.errors import InputError
+from hilcal.optional import needed_by
 from hilcal.tables import matfile
 from hilcal.tables.grid import Cell, Check, Grid, joined, unique
 from hilcal.tables.mapping import FileFormat, PointMapping
@@ -157,12 +158,8 @@ def package(path: str | Path, name: str, what: str) -> Any:
     Raises:
         InputError: it is not installed.
     """
-    try:
+    with needed_by(f"{path}: {what}"):
         return import_module(name)
-    except ImportError as e:
-        raise InputError(
-            f"{path}: {what} needs the package {name.split('.')[0]}: pip install hilcal[tables]"
-        ) from e
 
 
 def _xlsx(path: str, content: bytes, how: FileFormat, check: Check | None) -> Grid:

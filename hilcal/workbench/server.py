@@ -13,6 +13,7 @@ from pathlib import Path
 from types import FrameType
 
 from hilcal.errors import InputError
+from hilcal.optional import needed_by
 from hilcal.workbench.session import WorkbenchSession
 
 HOST = "127.0.0.1"
@@ -28,12 +29,8 @@ def require_nicegui() -> None:
     Raises:
         InputError: says how to install it.
     """
-    try:
+    with needed_by("the workbench"):
         import nicegui  # noqa: F401
-    except ImportError:
-        raise InputError(
-            "the workbench needs NiceGUI, which is not installed: pip install 'hilcal[workbench]'"
-        ) from None
 
 
 def listening(port: int | None) -> socket.socket:

@@ -1,10 +1,135 @@
-"""A library of the system that is not installed is one line, as on a minimal computer."""
+"""Libraries that are not installed: what works without them, and the line that installs each."""
 
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import openpyxl
 import pytest
 import typer
 
 from hilcal import cli
-from tests.support.cli_cases import refused
+from hilcal.optional import EXTRAS, REQUIRED
+from tests.support.cli_cases import CELL, refused, table
+
+WITHOUT = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {names}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Blocked())
+{code}
+"""
+COMMAND = "from hilcal.cli import main\nmain()"
+BARE = {*EXTRAS, "rerun_bindings", *REQUIRED} - {"sklearn"}
+"""All but what reading, fitting and diagnosing need."""
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def without(
+    names: set[str], folder: Path, *words: object, code: str = COMMAND
+) -> subprocess.CompletedProcess[str]:
+    """Run a command, or other code, in a process in which some packages cannot be imported."""
+    program = WITHOUT.format(names=sorted(names), code=code)
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, words)],
+        cwd=folder,
+        env={"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with t.csv, and with run.hilcal as it was imported and fitted without the packages."""
+    made = tmp_path_factory.mktemp("bare")
+    table(made / "t.csv", "nothing", poses=12)
+    for words in (
+        ("import", "t.csv", "--config", CELL, "-o", "run.hilcal"),
+        ("identify", "run.hilcal"),
+    ):
+        ended = without(BARE, made, *words)
+        assert (ended.returncode, "error" in ended.stderr) == (0, False), ended.stderr
+    return made
+
+
+def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folder: Path) -> None:
+    ended = without(BARE, folder, "diagnose", "run.hilcal")
+    assert ended.returncode == 0, ended.stderr
+    assert "Verdict: " in ended.stdout
+    library = without(
+        BARE,
+        folder,
+        code="import hilcal as hc\n"
+        "with hc.Campaign.open('run.hilcal') as run:\n"
+        "    print(hc.diagnose(hc.fit(hc.baseline(run.cell, run.readings), run.readings)).verdict)",
+    )
+    assert library.stdout.strip() == "adequate", library.stderr
+
+
+@pytest.mark.parametrize(
+    ("package", "words"),
+    [
+        ("jinja2", ("report", "run.hilcal")),
+        ("plotly", ("report", "run.hilcal")),
+        ("rerun", ("view", "run.hilcal")),
+        ("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
+        ("nicegui", ("workbench", "run.hilcal")),
+        ("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
+        ("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
+        ("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
+        ("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
+        ("geocompy", ("config", "tracker")),
+        ("serial", ("doctor",)),
+    ],
+)
+def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
+    package: str, words: tuple[str, ...], folder: Path
+) -> None:
+    if package == "openpyxl":
+        openpyxl.Workbook().save(folder / "t.xlsx")
+    ended = without({package}, folder, *words)
+    brought = f'"hilcal[{EXTRAS[package]}]"' if package in EXTRAS else REQUIRED[package]
+    assert ended.returncode == 2, ended.stderr
+    (line,) = [said for said in ended.stderr.splitlines() if said.startswith("error: ")]
+    assert line.endswith(f"the package {package} is not installed: pip install {brought}")
+    assert "Traceback" not in ended.stderr
+
+
+def test_the_library_names_what_it_lacks(folder: Path) -> None:
+    code = (
+        "import hilcal as hc\n"
+        "with hc.Campaign.open('run.hilcal') as run:\n"
+        "    fit = hc.fit(hc.baseline(run.cell, run.readings), run.readings)\n"
+        "try: hc.report\n"
+        "except hc.InputError as error: print(error)\n"
+        "try: fit._repr_html_()\n"
+        "except NotImplementedError as error: print(error)"  # a notebook then shows the repr
+    )
+    said = without({"plotly"}, folder, code=code)
+    line = 'the package plotly is not installed: pip install "hilcal[report]"'
+    assert said.stdout.splitlines() == [f"pages: {line}"] * 2, said.stderr
+
+
+def test_every_optional_package_is_named() -> None:
+    """What an extra for users brings has its line, and nothing else has."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    named = set(EXTRAS.items())
+    brought = {
+        ("rerun" if "rerun" in line else line.split(">")[0], extra)
+        for extra in set(extras) - {"all", "dev", "docs", "release"}
+        for line in extras[extra]
+    }
+    assert named <= brought
+    assert {package for package, _ in brought} == set(EXTRAS)
+    (everything,) = extras["all"]
+    assert set(everything[7:-1].split(",")) == set(extras) - {"all", "dev", "docs", "release"}
+    required = " ".join(project["dependencies"])
+    assert all(name in required for name in REQUIRED.values())
 
 
 def test_a_missing_system_library_is_named(

@@ -356,7 +356,7 @@ def test_what_is_wrong_is_one_line(
     assert "choose a free port" in refused(capsys, 2, *taken)
     monkeypatch.setitem(__import__("sys").modules, "nicegui", None)
     line = refused(capsys, 2, "workbench", served.run)
-    assert line.endswith("pip install 'hilcal[workbench]'")
+    assert line.endswith('pip install "hilcal[workbench]"')
 
 
 REPLACED = "Resize must be passed a displayed plot div element."

@@ -113,7 +113,7 @@ def test_an_absent_viewer_is_named(site: SimpleNamespace) -> None:
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True
     )
-    assert done.stdout.startswith("the viewer needs rerun-sdk, which is not installed")
+    assert done.stdout.startswith("the viewer: the package rerun is not installed: pip install")
 
 
 def test_a_diagnosis_as_a_dictionary_is_what_the_command_prints(site: SimpleNamespace) -> None:

@@ -148,7 +148,7 @@ def test_a_missing_package_is_named(
     else:
         parquet.write_table(pyarrow.table({"X": [1.0]}), path)
     monkeypatch.setitem(sys.modules, name, None)
-    with pytest.raises(InputError, match=r"needs the package \w+: pip install hilcal\[tables\]"):
+    with pytest.raises(InputError, match=r"\w+ is not installed: pip install .hilcal\[tables\]"):
         open_grid(path, FileFormat())
 
 

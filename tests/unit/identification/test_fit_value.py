@@ -43,7 +43,7 @@ def test_without_pandas_the_data_frame_names_it(
     found: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(InputError, match="pandas, which is not installed"):
+    with pytest.raises(InputError, match="the package pandas is not installed: pip install pandas"):
         found.parameters.to_frame()
 
 
