@@ -20,6 +20,7 @@ from studies.discover_real_command import discover_real
 from studies.few_poses_command import few_poses
 from studies.few_poses_picture import few_poses_picture
 from studies.gross_errors_command import gross_errors
+from studies.odds import odds
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -37,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("diagnosis")(diagnosis)
     app.command("discover")(discover)
     app.command("discover-real")(discover_real)
+    app.command("odds")(odds)
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)

@@ -68,6 +68,7 @@ class SearchProblem:
         self.screened = used & screen.rows
         self.seen = float(self.screened.sum() / used.sum())
         self._thin, self._thin_residual = self.model, self.residual
+        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
         if self.seen < 1.0:
             ridge = np.maximum(linear.projection.ridge, LEAST_RIDGE)
             self._thin = projection(linear.rows[self.screened], ridge)
@@ -115,6 +116,14 @@ class SearchProblem:
     def beside(self, chosen: Sequence[LawTerm]) -> "Beside":
         """Return the candidates beside chosen terms."""
         return Beside(self, tuple(chosen))
+
+    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+        """Return the short list beside chosen terms, the best odds first; kept once it is made."""
+        key = tuple((t.parts, t.common) for t in chosen)
+        if key not in self._scored:
+            beside = self.beside(chosen)
+            self._scored[key] = sorted(beside.score(beside.shortlist()), key=lambda c: -c.odds)
+        return self._scored[key]
 
 
 class Beside:
