@@ -143,9 +143,19 @@ def screen(linear: Linearisation) -> Screen:
     situation = fit.solution.prediction.situation
     poses = len(np.unique(fit.pose))
     words = grammar(variables(situation), situation, poses)
-    places, motion = site_motions(fit)
-    w = fit.whitening
-    rows, readings = _thinned(fit)
+    return screened(linear, words, *site_motions(fit), *_thinned(fit))
+
+
+def screened(
+    linear: Linearisation,
+    words: Grammar,
+    places: tuple[Site, ...],
+    motion: Floats,
+    rows: Bools,
+    readings: Ints,
+) -> Screen:
+    """Return all candidates of some amplitudes and sites, as `Screen` has them."""
+    w = linear.fit.whitening
     own = projection(linear.rows[rows], linear.projection.ridge)
     form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
     square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)

@@ -119,6 +119,7 @@ def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple
         for kind in order
         if kind in likely or kind in simplest.values()
     ]
+    made = [x for x in made if len(x.step)]  # else the model explains it
     return tuple(x for x in made if x.kind in likely or x in pareto(made))
 
 
@@ -150,7 +151,7 @@ def _met(problem: SearchProblem, selections: Iterable[Selection]) -> list[tuple[
         known = log_odds(problem, others)
         for c in problem.scored(others):
             terms = led((*others, plain(problem.screen, c.term)))
-            if sum(t.count for t in terms) > MOST_COEFFICIENTS:
+            if not c.score.rank or sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 continue
             odds = known + c.score.marginal - c.term.price - LEAST * bool(others)
             key = frozenset((t.parts, t.common) for t in (*others, c.term))
