@@ -44,9 +44,9 @@ def gplearn(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[
     """Genetic programming (Koza 1992)."""
     gp = importlib.import_module("gplearn.genetic")
     model = gp.SymbolicRegressor(
-        population_size=1000, generations=GENERATIONS, parsimony_coefficient=0.001, random_state=SEED,
+        population_size=1000, generations=GENERATIONS, parsimony_coefficient=0.001,
         function_set=("add", "sub", "mul", "div", "sqrt", "abs", "max", "min", "sin", "cos"),
-        feature_names=names, metric="mse",
+        feature_names=names, metric="mse", random_state=SEED,
     )  # fmt: skip
     model.fit(x, y, sample_weight=weight)
     return str(model._program), model.predict(x), model.predict(fresh)
@@ -58,8 +58,9 @@ def operon(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[s
     model = op.SymbolicRegressor(
         allowed_symbols="add,sub,mul,div,sqrt,square,abs,fmax,fmin,sin,cos,tanh,exp,log,"
         "constant,variable",
-        optimizer_iterations=5, max_length=25, max_evaluations=EVALUATIONS, n_threads=1, random_state=SEED,
-        objectives=["mse", "length"], uncertainty=[float(np.median(weight) ** -0.5)],
+        optimizer_iterations=5, max_length=25, max_evaluations=EVALUATIONS, n_threads=1,
+        random_state=SEED, objectives=["mse", "length"],
+        uncertainty=[float(np.median(weight) ** -0.5)],
     )  # fmt: skip
     model.fit(x, y)
     text = model.get_model_string(model.model_, precision=4, names=names)

@@ -171,12 +171,8 @@ def _situation(of: Table) -> Any:
 
 def _variable(name: str, values: Floats, before: str) -> Variable:
     kind: Any = "angle" if name[0] in "θφ" else "place" if values.min() > 0 else "torque"
-
-    def read(s: Any) -> Floats:
-        return np.asarray(1.0 / s.table[name] if before else s.table[name])
-
     symbol = f"(1/{name})" if before else name
-    return Variable(kind, (name,), symbol, symbol, "1", "", read)
+    return Variable(kind, (name,), symbol, symbol, "1", f"{before}s.table[{name!r}]")
 
 
 def asked(python: Path, peer: str, problem: dict[str, object]) -> dict[str, Any]:
@@ -209,7 +205,7 @@ def run_case(of: Formula, noise: float, seed: int, python: Path | None) -> dict[
         start = process_time()
         text, values = hilcal(x, y, std, more)
         left = [_left(values(of_table), exact) for of_table, exact in (within, beyond)]
-        out[name] = Answer(text, *left, process_time() - start)
+        out[name] = Answer(text, left[0], left[1], process_time() - start)
     both = {k: np.concatenate([within[0][k], beyond[0][k]]).tolist() for k in x}
     angles = [k for k in x if k[0] in "θφ"]
     problem = {"quantities": {k: v.tolist() for k, v in x.items()}, "angles": angles, "fresh": both,
@@ -221,7 +217,7 @@ def run_case(of: Formula, noise: float, seed: int, python: Path | None) -> dict[
             continue
         fresh = np.array(told["fresh"])
         left = [_left(fresh[:FRESH], within[1]), _left(fresh[FRESH:], beyond[1])]
-        out[peer] = Answer(told["formula"], *left, told["seconds"])
+        out[peer] = Answer(told["formula"], left[0], left[1], told["seconds"])
     return out
 
 

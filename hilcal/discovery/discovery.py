@@ -116,6 +116,12 @@ class Discovery(Shown):
             raise CannotAnswerError(f"no law was found ({self.reason}), so none is averaged")
         return averaged(self.fit, self.structures, readings)
 
+    def average_m(self) -> tuple[float, float]:
+        """Return the average's rms motion of the fitted readings, and that of its std, m."""
+        mean, std = self.average(self.fit.readings)
+        each = (np.sqrt(np.mean(np.sum(x[:, :3] ** 2, axis=1))) for x in (mean, std))
+        return float(next(each)), float(next(each))
+
 
 def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:
     """Return what the readings do not tell from a law at odds of 20 : 1, the likeliest first."""

@@ -50,6 +50,7 @@ def discovery_json(d: Discovery) -> dict[str, object]:
         ],
         "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
         "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
+        "average": dict(zip(("rms_m", "std_m"), d.average_m(), strict=True)) if d.laws else None,
         "curves": [curve_json(c) for c in d.curves],
     }
 

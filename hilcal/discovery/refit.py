@@ -91,7 +91,7 @@ def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
     """Return the coefficients by algebra, without their uncertainties."""
     x, linear = form.columns(screen, screen.linear.fit.solution.prediction.situation), screen.linear
     step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
-    return coefficients(form, step, np.nan * step)
+    return coefficients(form, np.asarray(step, dtype=float), np.full(len(step), np.nan))
 
 
 def exact(

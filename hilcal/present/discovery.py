@@ -41,6 +41,11 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
             yield from curve_tables(d.curves)
     yield ""
     yield from structures_table(d.structures)
+    moved, std = map(numbers.length, d.average_m())
+    yield (
+        f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
+        f"then predicted has a standard uncertainty of {std}, the choice of the law included."
+    )
     for what, why in (*d.refused, *d.unfitted):
         yield f"{what} {NOT_TRIED} ({why})."
 
@@ -114,8 +119,6 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
 
 def structures_table(of: Sequence[Structure]) -> Iterator[Block]:
     """Yield the likely laws: probability, complexity, share on poses left out."""
-    if not of:
-        return
     best = pareto(of)
     rows = table("law", "probability", "complexity", "on poses left out", "")
     for x in of:

@@ -79,20 +79,20 @@ def test_a_law_is_written_as_an_effect_and_told(
         (),
         (),
     )
-    one = np.ones(1)
-    likely = (
-        Structure("bent", form, 0.7, 0.8, one, np.eye(1), one[:, None], "bent"),
-        Structure("or", COMPLIANCE, 0.2, 0.8, one, np.eye(1), one[:, None]),
-        Structure("hardly", Form((LawPart(sites(6)[3], Amplitude(()), 0),)), 0.01, 0.2,
-                  one, np.eye(1), one[:, None]),
-    )  # fmt: skip
+    one, listed = np.ones(1), [3]
+    hardly = Form((LawPart(sites(6)[3], Amplitude(()), 0),))
+    drawn = ((form, 0.7, 0.8, "bent"), (COMPLIANCE, 0.2, 0.8, ""), (hardly, 0.01, 0.2, ""))
     source = source_of_form(form, "bent", law.parameters)
-    listed = [3]
 
     def search(fit: Fit, say: object, name: str) -> Discovery:
         assert name == "bent"
         d = Discovery(fit, "law", (law,), 0.9, 0.8, candidates=7, source=source)
-        return replace(d, structures=likely[: listed[0]])
+        absorbed = np.zeros((fit.solution.rows.shape[1], 1))
+        likely = [
+            Structure(x.text(), x, p, share, one, np.eye(1), absorbed, of)
+            for x, p, share, of in drawn
+        ]
+        return replace(d, structures=tuple(likely[: listed[0]]))
 
     monkeypatch.setattr("hilcal.cli.discovering.search", search)
     out = tmp_path / "bent.py"
@@ -104,6 +104,8 @@ def test_a_law_is_written_as_an_effect_and_told(
     assert [x["probability"] for x in found.document["structures"]] == [0.7, 0.2, 0.01]
     assert [x["pareto"] for x in found.document["structures"]] == [True, False, False]
     assert "best of its size" in found.err
+    assert "Averaged over them" in found.err
+    assert found.document["average"]["std_m"] > 0
     assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
     files = ("--effects-from", out, "--effects-from", other)
     plan = ("-o", tmp_path / "plan.json", "--suspects", "bent,bent_or_1", *files, "--quick")
