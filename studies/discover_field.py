@@ -34,9 +34,9 @@ from studies.discover import Asked, Simulated, error_at, simulated
 from studies.discover_command import FLOOR, ROBOTS, SAME
 from studies.foreign_laws import KINDS
 from studies.formulas import PEERS, Peers, asked
-from studies.records import Figure, Keep, keep
+from studies.records import Cases, Figure, Keep, keep, resumed
 
-POSES, LOADS = 18, 2
+POSES, LOADS = 16, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,17 +137,24 @@ def discover_field(
     strength: Annotated[float, typer.Option("--strength", help="Of the law, σ.")] = 3.0,
     seed: Annotated[int, typer.Option("--seed", help="Of the campaigns.")] = 0,
     peers: Peers = None,
+    cases: Cases = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Hide laws in an arm's readings; search them by hilcal, and by others given the site."""
     t, config = terminal(as_json), load_config(configs_dir() / "cells" / CELL)
-    names, done = law or list(KINDS), []
+    every, names = list(KINDS), law or list(KINDS)
+
+    def run(name: str) -> dict[str, object]:
+        case = Asked(ROBOTS[every.index(name) % len(ROBOTS)], "absolute", name, seed=seed,
+                     strength=strength, poses=POSES, loads=LOADS)  # fmt: skip
+        return {who: asdict(a) for who, a in run_case(config, case, peers).items()}
+
+    done: list[tuple[str, dict[str, Told]]] = []
     with counting(t.progress, "laws", len(names)) as advance:
-        for k, name in enumerate(names):
-            case = Asked(ROBOTS[k % len(ROBOTS)], "absolute", name, seed=seed, strength=strength,
-                         poses=POSES, loads=LOADS)  # fmt: skip
-            done.append((name, run_case(config, case, peers)))
+        for case in resumed(cases, names, run):
+            answers: dict[str, Any] = {k: v for k, v in case.items() if k != "case"}
+            done.append((str(case["case"]), {k: Told(**v) for k, v in answers.items()}))
             advance(1)
     rows = table("hidden", "searcher", "correlation", "fresh error", "found", left=(0, 1, 4))
     for name, answers in done:
@@ -157,10 +164,10 @@ def discover_field(
     figures = list(claims(done))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    cases = [{"law": n, "answers": {k: asdict(a) for k, a in of.items()}} for n, of in done]
+    kept = [{"law": n, "answers": {k: asdict(a) for k, a in of.items()}} for n, of in done]
     title = f"Laws in an arm's readings, by hilcal and by others ({strength:g} σ, {POSES} poses)"
-    keep(keep_file, title, figures, {"cases": cases})
-    t.document({"cases": cases, "figures": [asdict(f) for f in figures]})
+    keep(keep_file, title, figures, {"cases": kept})
+    t.document({"cases": kept, "figures": [asdict(f) for f in figures]})
 
 
 def claims(done: Sequence[tuple[str, dict[str, Told]]]) -> Iterator[Figure]:

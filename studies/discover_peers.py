@@ -28,14 +28,15 @@ def pysindy(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[
     library = ps.PolynomialLibrary(degree=2).fit(x)
     a, b = (np.asarray(library.transform(v)) for v in (x, fresh))
     scale = np.sqrt(weight)[:, None]
+    model = ps.FROLS(max_iter=MOST_TERMS, alpha=1e-10)
+    model.fit(scale * a, scale[:, 0] * y)
     found = []
-    for count in range(1, MOST_TERMS + 1):
-        model = ps.FROLS(max_iter=count, alpha=1e-10, normalize_columns=True)
-        model.fit(scale * a, scale[:, 0] * y)
-        by = np.asarray(model.coef_)[0]
+    for which in (np.flatnonzero(np.asarray(coef).ravel()) for coef in model.history_):
+        by = np.zeros(a.shape[1])
+        by[which] = np.linalg.lstsq(scale * a[:, which], scale[:, 0] * y, rcond=None)[0]
         left = float(np.sum(weight * (y - a @ by) ** 2))
-        found.append((len(y) * np.log(left) + np.count_nonzero(by) * np.log(len(y)), count, by))
-    by = min(found, key=lambda f: f[0])[2]
+        found.append((len(y) * np.log(left) + len(which) * np.log(len(y)), len(which), by))
+    by = min(found, key=lambda f: f[:2])[2]
     terms = zip(by, library.get_feature_names(names), strict=True)
     return " + ".join(f"{c:.4g}*{name}" for c, name in terms if c), a @ by, b @ by
 
@@ -44,7 +45,7 @@ def gplearn(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[
     """Genetic programming (Koza 1992)."""
     gp = importlib.import_module("gplearn.genetic")
     model = gp.SymbolicRegressor(
-        population_size=1000, generations=GENERATIONS, parsimony_coefficient=0.001,
+        population_size=500, generations=GENERATIONS, parsimony_coefficient=0.001,
         function_set=("add", "sub", "mul", "div", "sqrt", "abs", "max", "min", "sin", "cos"),
         feature_names=names, metric="mse", random_state=SEED,
     )  # fmt: skip

@@ -36,7 +36,7 @@ from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.regression.projection import projection
 from hilcal.types import Floats
-from studies.records import Figure, Keep, keep
+from studies.records import Cases, Figure, Keep, keep, resumed
 
 POINTS, FRESH = 200, 200
 VALUE = 1e-3
@@ -231,16 +231,22 @@ def formulas(
         list[float] | None, typer.Option("--noise", help="Share of the size; repeatable.")
     ] = None,
     peers: Peers = None,
+    cases: Cases = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Search formulas of physics with dummy variables, and compare with other searchers."""
     t = terminal(as_json)
-    every = [(f, n) for n in noise or (0.01, 0.1) for f in FORMULAS]
-    done = []
+    every = {f"{f.name}, noise {n}": (f, n) for n in noise or (0.01, 0.1) for f in FORMULAS}
+
+    def run(key: str) -> dict[str, object]:
+        return {who: asdict(a) for who, a in run_case(*every[key], 0, peers).items()}
+
+    done: list[tuple[Formula, float, dict[str, Answer]]] = []
     with counting(t.progress, "formulas", len(every)) as advance:
-        for of, n in every:
-            done.append((of, n, run_case(of, n, 0, peers)))
+        for case in resumed(cases, [*every], run):
+            answers: dict[str, Any] = {k: v for k, v in case.items() if k != "case"}
+            done.append((*every[str(case["case"])], {k: Answer(**v) for k, v in answers.items()}))
             advance(1)
     rows = table("formula", "noise", "searcher", "found", left=(0, 2, 3))
     for of, n, answers in done:
@@ -250,12 +256,12 @@ def formulas(
     figures = list(claims(done))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    cases = [
+    kept = [
         {"formula": f.text, "noise": n, "answers": {k: asdict(a) for k, a in answers.items()}}
         for f, n, answers in done
     ]
-    keep(keep_file, "Formulas of physics with dummy variables", figures, {"cases": cases})
-    t.document({"cases": cases, "figures": [asdict(f) for f in figures]})
+    keep(keep_file, "Formulas of physics with dummy variables", figures, {"cases": kept})
+    t.document({"cases": kept, "figures": [asdict(f) for f in figures]})
 
 
 def mark(a: Answer) -> str:

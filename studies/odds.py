@@ -1,17 +1,17 @@
 """`python -m studies odds`: whether laws said to have a probability are right as often.
 
 Laws are drawn as the priors of the search have it: complexity c with probability ∝ 2⁻ᶜ, all
-candidates of it alike, two terms in one case of four; each is added to readings of a simulated arm
-that hides nothing, at a strength from 0.5 σ to 2 σ. Where `discover` proposes a law, the structures
-that it lists are compared with what was drawn, and predictions of fresh poses by the proposed law
-alone, and averaged over the listed ones, with the truth there.
+candidates of it alike, two terms in one case of four. Each is added with noise to the linear
+problem of a simulated campaign, at a strength from 0.5 σ to 2 σ. Where the search chooses a law,
+the structures that are listed are compared with what was drawn; and so are predictions of fresh
+poses, by the chosen law alone and averaged over the listed ones, with the truth there.
 """
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
-from typing import Annotated
+from functools import cache
+from itertools import pairwise
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -20,30 +20,30 @@ from drivers.simulated.injected_effects import nothing_hidden
 from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
-from hilcal.cli.options import Jobs, Json
+from hilcal.cli.options import Json
 from hilcal.cli.terminal import terminal
-from hilcal.config import CellConfig, load_config
-from hilcal.discovery.discovery import discover
+from hilcal.config import load_config
 from hilcal.discovery.law import form_of
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.search import search
 from hilcal.discovery.sites import motions_of
-from hilcal.discovery.structures import averaged, structure_of
+from hilcal.discovery.structures import averaged, structure_of, structures
 from hilcal.discovery.terms import LawTerm
-from hilcal.engine.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
-from hilcal.identification.linearisation import linearise
-from hilcal.identification.residual import residual
+from hilcal.identification.linearisation import Linearisation, linearise
 from hilcal.present.progress import counting
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, whitening
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
 from studies.discover_command import ROBOTS
 from studies.random_campaigns import rehearsal_states
-from studies.records import Figure, Keep, keep
+from studies.records import Cases, Figure, Keep, keep, resumed
 from studies.study_cases import with_study_loads
 
-POSES, LOADS = 16, 2
+POSES, LOADS, OF_CAMPAIGN = 12, 2, 12
 STRENGTHS = (0.5, 2.0)
 SECOND = 0.25
 """Share of the drawn laws that have two terms."""
@@ -72,50 +72,60 @@ class Drawn:
     before: float = 0.0
 
 
-def run_case(config: CellConfig, seed: int) -> Drawn:
-    """Draw a law, search it, and predict fresh poses."""
-    rng = np.random.default_rng([20261126, seed])
-    own, loads = with_study_loads(config, ROBOTS[seed % len(ROBOTS)])
-    mode = MODES[(seed // len(ROBOTS)) % len(MODES)]
-    loads = loads[:LOADS]
+@cache
+def _campaign(number: int) -> tuple[Screen, Readings]:
+    """Return all candidates of a simulated campaign, and readings of as many fresh poses."""
+    rng = np.random.default_rng([20261126, number])
+    config = load_config(configs_dir() / "cells" / CELL)
+    own, loads = with_study_loads(config, ROBOTS[number % len(ROBOTS)])
+    mode, loads = MODES[number % len(MODES)], loads[:LOADS]
     cell = cell_from_config(own)
     world = nothing_hidden(
         cell, rng, noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n)
     )
     names = ("none", *(name for name, _ in loads))
-    made = rehearsal_states(cell, POSES, loads, rng)
-    readings = simulate(world, *made, names, rng)
-    bare = fit(baseline(cell, readings, mode), readings, mode)
-    if bare.outlier.any():
-        return Drawn("readings set aside")
-    s = screen(linearise(bare))
-    terms = _drawn(s, rng)
-    form, situation = form_of(s, terms), bare.solution.prediction.situation
-    x = form.columns(s, situation)
+    readings, fresh = (
+        simulate(world, *rehearsal_states(cell, POSES, loads, rng), names, rng) for _ in range(2)
+    )
+    return screen(linearise(fit(baseline(cell, readings, mode), readings, mode))), fresh
+
+
+def run_case(seed: int) -> Drawn:
+    """Draw a law and noise, search, and predict fresh poses."""
+    bare, fresh = _campaign(seed // OF_CAMPAIGN)
+    rng, linear = np.random.default_rng([20261127, seed]), bare.linear
+    base = linear.fit
+    terms = _drawn(bare, rng)
+    form, situation = form_of(bare, terms), base.solution.prediction.situation
+    x = form.columns(bare, situation)
     by = rng.standard_normal(form.count)
-    size = float(np.sqrt(np.mean(s.linear.project_out(x @ by) ** 2)))
+    size = float(np.sqrt(np.mean(linear.project_out(x @ by) ** 2)))
     by *= np.exp(rng.uniform(*np.log(STRENGTHS))) / size
-    moved = form.motion(s.sites, s.motion, situation) @ by
-    readings = replace(readings, value=readings.value + moved)
-    before = fit(baseline(cell, readings, mode), readings, mode)
-    d = discover(before)
-    out = Drawn(form.text(), d.laws[0].formula if d.laws else f"({d.reason})")
-    if not d.laws:
-        return out
-    truth = structure_of(s, terms)
-    fresh = simulate(world, *rehearsal_states(cell, POSES, loads, rng), names, rng)
-    at = bare.model.predict(fresh.states, bare.theta)
-    there = form.motion(*motions_of(bare.model, at, bare.theta, bare.whitening.m), at.situation)
-    fresh = replace(fresh, value=world.sight(fresh.states).position + there @ by)
-    w = whitening(fresh, mode)
-    left = residual(fresh, before.model.predict(fresh.states, before.theta), w)[:, :3]
-    law = next(x for x in d.structures if x.law == d.laws[0].name)
-    return replace(
-        out,
-        said=tuple((x.probability, x.kind == truth) for x in d.structures),
-        alone=_errors(left, *averaged(before, [law], fresh)),
-        average=_errors(left, *d.average(fresh)),
-        before=float(np.sqrt(np.mean(np.sum(left**2, axis=1)))),
+    noise = rng.standard_normal(len(x))
+    left = linear.project_out(x @ by + noise)
+    s = replace(bare, linear=Linearisation(replace(base, white=left), linear.projection, left))
+    problem = SearchProblem(s)
+    selections = search(problem)
+    if not selections:
+        return Drawn(form.text())
+    found = structures(problem, selections)
+    chosen = {structure_of(s, f.terms) for f in selections[-1:]}
+    (law,) = (f for f in found if f.kind in chosen)
+    truth = structure_of(bare, terms)
+    # The model was fitted with the law and the noise in the readings: it has taken part of both.
+    at = base.model.predict(fresh.states, base.theta)
+    w = whitening(fresh, base.mode)
+    there = form.motion(*motions_of(base.model, at, base.theta, w.m), at.situation)
+    known = w.raw(base.model.jacobian(at, base.theta, w.m)) @ base.solution.transform
+    taken = linear.projection.solve(linear.rows.T @ (x @ by + noise))
+    off = w.raw(there @ by) - known @ taken
+    return Drawn(
+        form.text(),
+        law.form.text(),
+        tuple((f.probability, f.kind == truth) for f in found),
+        _errors(off, *averaged(base, [law], fresh)),
+        _errors(off, *averaged(base, found, fresh)),
+        float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
     )
 
 
@@ -141,30 +151,30 @@ def _drawn(s: Screen, rng: np.random.Generator) -> tuple[LawTerm, ...]:
 
 def odds(
     laws: Annotated[int, typer.Option("--laws", help="Laws that are drawn.")] = 60,
-    first_seed: Annotated[int, typer.Option("--first-seed", help="Seeds count from here.")] = 0,
-    jobs: Jobs = None,
+    cases: Cases = None,
     keep_file: Keep = None,
     as_json: Json = False,
 ) -> None:
     """Draw laws from the priors of the search, and compare probabilities with frequencies."""
     t = terminal(as_json)
-    config = load_config(configs_dir() / "cells" / CELL)
-    seeds = range(first_seed, first_seed + laws)
-    with open_engine(jobs, None) as engine, counting(t.progress, "laws", laws) as advance:
-        done = engine.map(partial(run_case, config), seeds, advance=advance)
+    done: list[dict[str, Any]] = []
+    with counting(t.progress, "laws", laws) as advance:
+        for case in resumed(cases, [*map(str, range(laws))], lambda k: asdict(run_case(int(k)))):
+            done.append(case)
+            advance(1)
     figures = list(claims(done))
     for f in figures:
         t.show(f"{f.what}: {f.measured}")
-    keep(keep_file, "Probabilities of laws", figures, {"cases": [asdict(o) for o in done]})
-    t.document({"cases": [asdict(o) for o in done], "figures": [asdict(f) for f in figures]})
+    keep(keep_file, "Probabilities of laws", figures, {"cases": done})
+    t.document({"cases": done, "figures": [asdict(f) for f in figures]})
 
 
-def claims(done: Sequence[Drawn]) -> Iterator[Figure]:
+def claims(done: Sequence[dict[str, Any]]) -> Iterator[Figure]:
     """Yield frequencies by probability, and errors of one law and of the average."""
-    found = [o for o in done if o.said]
+    found = [o for o in done if o["said"]]
     yield Figure("laws drawn, and proposed", f"{len(done)}, {len(found)}")
-    said = np.array([p for o in found for p in o.said]).reshape(-1, 2)
-    for low, high in itertools.pairwise(BINS):
+    said = np.array([p for o in found for p in o["said"]]).reshape(-1, 2)
+    for low, high in pairwise(BINS):
         mine = said[(said[:, 0] > low) & (said[:, 0] <= high)]
         if len(mine):
             right, mean = int(mine[:, 1].sum()), float(mine[:, 0].mean())
@@ -175,7 +185,7 @@ def claims(done: Sequence[Drawn]) -> Iterator[Figure]:
             )
     if not found:
         return
-    first = [o.said[0] for o in found]
+    first = [o["said"][0] for o in found]
     expected = sum(p for p, _ in first)
     spread = float(np.sqrt(sum(p * (1 - p) for p, _ in first)))
     right = sum(hit for _, hit in first)
@@ -184,7 +194,7 @@ def claims(done: Sequence[Drawn]) -> Iterator[Figure]:
         f"right in {right} of {len(first)}; expected {expected:.1f} ± {spread:.1f}",
         "within 2 standard deviations", abs(right - expected) <= 2 * spread,
     )  # fmt: skip
-    alone, average = (np.array([getattr(o, k) for o in found]) for k in ("alone", "average"))
+    alone, average = (np.array([o[k] for o in found]) for k in ("alone", "average"))
     ratio = np.log(average[:, 0] / alone[:, 0])
     better = int(np.count_nonzero(ratio < 0))
     yield Figure(

@@ -70,15 +70,8 @@ def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -
     screen = problem.screen
     linear = screen.linear
     rows, white = linear.rows, linear.fit.white
-    x = rows
-    if selection is not None:
-        parts = [
-            screen.columns(list(t.parts)).sum(axis=1, keepdims=True)
-            if t.common
-            else screen.columns(list(t.parts))
-            for t in selection.terms
-        ]
-        x = np.hstack([rows, *parts])
+    terms = () if selection is None else selection.terms
+    x = np.hstack([rows, *map(screen.columns_of, terms)])
     used = problem.rows
     own = x[used]
     ridge = np.full(x.shape[1], RIDGE)

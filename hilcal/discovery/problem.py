@@ -14,7 +14,7 @@ import numpy as np
 from hilcal.discovery.compose import composed_terms
 from hilcal.discovery.gains import keep_largest, orthonormal, together
 from hilcal.discovery.grow import grown
-from hilcal.discovery.screen import LEAST_MOTION, SEEN, Screen
+from hilcal.discovery.screen import Screen
 from hilcal.discovery.terms import LawTerm, Scored, ScreenedTerm, Screening
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
@@ -110,8 +110,7 @@ class SearchProblem:
 
     def columns(self, term: LawTerm) -> Floats:
         """(R', P) whitened columns of a term in the rows that are used."""
-        x = self.screen.columns(list(term.parts))[self.rows]
-        return x.sum(axis=1, keepdims=True) if term.common else x
+        return self.screen.columns_of(term)[self.rows]
 
     def beside(self, chosen: Sequence[LawTerm]) -> "Beside":
         """Return the candidates beside chosen terms."""
@@ -268,22 +267,6 @@ class Beside:
             np.float32(-0.5 * self.dof) * np.log(1 - share)
             - np.float32(0.5 * count) * (np.log(per) + np.float32(1.0))
         )
-
-    def odds_of(self, s: int, values: Floats) -> Floats:
-        """(C,) log evidence of amplitudes (C, K) at a site, by their values; as in `best`."""
-        screen = self.problem.screen
-        form = screen.form[s]
-        thin = self.problem.thin
-        slope = values @ (form.T @ thin)
-        lifted = values @ screen.free[s]
-        square = np.float32(self.problem.share) * np.einsum("ck,ck->c", lifted, values)
-        for told, unit in self.taken():
-            own = values @ (form.T @ unit)
-            slope, square = slope - np.float32(told) * own, square - own**2
-        moved = values**2 @ np.sum(form**2, axis=0)
-        seen = square > SEEN * moved + LEAST_MOTION
-        gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
-        return np.where(seen, self.evidence(gain, 1), -np.inf)
 
     def score(self, terms: Sequence[LawTerm]) -> list[Scored]:
         """Score terms exactly beside the chosen ones."""

@@ -18,6 +18,7 @@ from hilcal.discovery.amplitudes import Amplitude
 from hilcal.discovery.bends import Bends, bends
 from hilcal.discovery.grammar import Grammar, grammar
 from hilcal.discovery.sites import Site, site_motions
+from hilcal.discovery.terms import LawTerm
 from hilcal.discovery.variables import variables
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import Linearisation
@@ -135,6 +136,11 @@ class Screen:
         site, amplitude = np.array(which).T
         raw = self.motion[:, :, site] * self.grammar.rows(amplitude.tolist()).T[:, None, :]
         return w.whiten_readings(raw)
+
+    def columns_of(self, term: LawTerm) -> Floats:
+        """(R, P) whitened columns of a term."""
+        x = self.columns(list(term.parts))
+        return x.sum(axis=1, keepdims=True) if term.common else x
 
 
 def screen(linear: Linearisation) -> Screen:
