@@ -124,8 +124,8 @@ def _angles(s: Situation) -> Iterator[Variable]:
         # The turn of a link against another one: of consecutive joints.
         if not arm.slides[a:b].any():
             text = f"({' + '.join(f'q_{j + 1}' for j in range(a, b))})"
-            names = tuple(f"joint {j + 1} angle" for j in range(a, b))
-            yield Variable("sum", names, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
+            mine = tuple(f"joint {j + 1} angle" for j in range(a, b))
+            yield Variable("sum", mine, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
 
 
 def _wrenches(n: int) -> Iterator[Variable]:
