@@ -32,6 +32,8 @@ def pysindy(x: Any, y: Any, weight: Any, fresh: Any, names: list[str]) -> tuple[
     x, fresh, names = x[:, kept], fresh[:, kept], [names[k] for k in kept]
     library = ps.PolynomialLibrary(degree=2).fit(x)
     a, b = (np.asarray(library.transform(v)) for v in (x, fresh))
+    # It stops at columns that depend on those chosen, as cos² on sin² and one.
+    a = a * (1.0 + 1e-9 * np.random.default_rng(SEED).standard_normal(a.shape))
     scale = np.sqrt(weight)[:, None]
     model = ps.FROLS(max_iter=MOST_TERMS, alpha=1e-10)
     model.fit(scale * a, scale[:, 0] * y)
