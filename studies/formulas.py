@@ -230,6 +230,7 @@ def formulas(
     noise: Annotated[
         list[float] | None, typer.Option("--noise", help="Share of the size; repeatable.")
     ] = None,
+    first: Annotated[int, typer.Option("--first", help="So many formulas.")] = len(FORMULAS),
     peers: Peers = None,
     cases: Cases = None,
     keep_file: Keep = None,
@@ -237,7 +238,8 @@ def formulas(
 ) -> None:
     """Search formulas of physics with dummy variables, and compare with other searchers."""
     t = terminal(as_json)
-    every = {f"{f.name}, noise {n}": (f, n) for n in noise or (0.01, 0.1) for f in FORMULAS}
+    levels = noise or [0.01, 0.1]
+    every = {f"{f.name}, noise {n}": (f, n) for n in levels for f in FORMULAS[:first]}
 
     def run(key: str) -> dict[str, object]:
         return {who: asdict(a) for who, a in run_case(*every[key], 0, peers).items()}

@@ -150,7 +150,9 @@ def _drawn(s: Screen, rng: np.random.Generator) -> tuple[LawTerm, ...]:
 
 
 def odds(
-    laws: Annotated[int, typer.Option("--laws", help="Laws that are drawn.")] = 60,
+    laws: Annotated[
+        int, typer.Option("--laws", help="Laws that are drawn; 0 for those of --cases.")
+    ] = 60,
     cases: Cases = None,
     keep_file: Keep = None,
     as_json: Json = False,

@@ -30,10 +30,13 @@ Cases = Annotated[
 def resumed(
     path: Path | None, keys: Sequence[str], run: Callable[[str], dict[str, object]]
 ) -> Iterator[dict[str, object]]:
-    """Yield what each case came to; with a file, one that is in it is not run again."""
+    """Yield what each case came to; one that is in the file is not run again.
+
+    Without keys, all that are in the file.
+    """
     lines = path.read_text(encoding="utf-8").splitlines() if path and path.exists() else []
     known: dict[str, dict[str, object]] = {c["case"]: c for c in map(json.loads, lines)}
-    for key in keys:
+    for key in keys or [*known]:
         if key not in known:
             known[key] = {"case": key, **run(key)}
             if path:
