@@ -78,7 +78,7 @@ def test_frequencies_are_counted_by_what_was_said() -> None:
     assert figures["laws drawn, and proposed"].measured == "4, 3"
     right = "structures said to have a probability of 80 % to 95 %"
     assert figures[right].measured.startswith("right 2 of 2 (100 %)")
-    first = figures["the likeliest structure of each law"]
+    first = figures["the likeliest structure of drawn laws of one term"]
     assert first.measured == "right in 2 of 3; expected 2.4 ± 0.6"
     assert first.met is True
     error = figures["error at fresh poses, averaged over that of the first law alone"]
