@@ -1,10 +1,11 @@
 """`python -m studies odds`: whether laws said to have a probability are right as often.
 
 Laws are drawn as the priors of the search have it: complexity c with probability ∝ 2⁻ᶜ, all
-candidates of it alike; in one case of four two of them, which it holds for 1 in 21. Each is added with noise to the linear
-problem of a simulated campaign, at a strength from 0.5 σ to 2 σ. Where the search chooses a law,
-the structures that are listed are compared with what was drawn; and so are predictions of fresh
-poses, by the chosen law alone and averaged over the listed ones, with the truth there.
+candidates of it alike; in one case of four two of them, which it holds for 1 in 21. Each is added
+with noise to the linear problem of a simulated campaign, at a strength from 0.5 σ to 2 σ. Where the
+search chooses a law, the structures that are listed are compared with what was drawn; and so are
+predictions of fresh poses, by the chosen law alone and averaged over the listed ones, with the
+truth there.
 """
 
 from collections.abc import Iterator, Sequence
