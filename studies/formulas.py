@@ -36,6 +36,7 @@ from hilcal.present.document import table
 from hilcal.present.progress import counting
 from hilcal.regression.projection import projection
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 from studies.records import Cases, Figure, Keep, keep, resumed
 
 POINTS, FRESH = 200, 200
@@ -182,7 +183,7 @@ def asked(python: Path, peer: str, problem: dict[str, object]) -> dict[str, Any]
     """
     with tempfile.TemporaryDirectory() as folder:
         given, out = Path(folder, "problem.json"), Path(folder, "answer.json")
-        given.write_text(json.dumps(problem))
+        replace_file(given, json.dumps(problem))
         script = Path(__file__).with_name("discover_peers.py")
         words = [str(python), str(script), peer, str(given), str(out)]
         before = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
