@@ -125,7 +125,7 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         return out
     off = error_at(before, c.fresh)
     if d.reason == "catalogue":
-        return _with_catalogue(replace(out, before=off), law, before, d.catalogue, c)
+        return with_catalogue(replace(out, before=off), law, before, d.catalogue, c)
     if not d.laws or d.after is None:
         return replace(out, before=off, after=off)
     return replace(
@@ -184,7 +184,7 @@ def _same_quantities(names: Iterable[str]) -> frozenset[str]:
     return frozenset("flange attitude" if n == LAST_AXIS else n for n in names)
 
 
-def _with_catalogue(
+def with_catalogue(
     out: Outcome,
     law: Foreign,
     before: Fit,

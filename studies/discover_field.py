@@ -30,7 +30,7 @@ from hilcal.present.progress import counting
 from hilcal.readings.whitening import whitening
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Floats
-from studies.discover import Asked, Simulated, error_at, simulated
+from studies.discover import Asked, Outcome, Simulated, error_at, simulated, with_catalogue
 from studies.discover_command import FLOOR, ROBOTS, SAME
 from studies.foreign_laws import KINDS
 from studies.formulas import PEERS, Peers, asked
@@ -64,7 +64,10 @@ def run_case(config: CellConfig, case: Asked, python: Path | None) -> dict[str, 
     seconds, alone = process_time() - start, error_at(c.before, c.fresh)
     out = {"without a law": Told("", 0.0, alone, 0.0)}
     out["hilcal"] = Told(f"({d.reason})", 0.0, alone, seconds)
-    if d.after is not None:
+    if d.reason == "catalogue" and c.law is not None:
+        o = with_catalogue(Outcome(case), c.law, c.before, d.catalogue, c)
+        out["hilcal"] = Told(o.formula, o.correlation, o.after, seconds)
+    elif d.after is not None:
         same = agreement(c.before, d.after, c.first.moved)
         out["hilcal"] = Told(d.laws[0].formula, same, error_at(d.after, c.fresh), seconds)
     for peer in PEERS if python else ():
