@@ -350,7 +350,7 @@ def plan(
 
 def simulate(
     cell: "Cell | SimulationCase",
-    plan: CheckedPlan | Plan,
+    plan: "CheckedPlan | Plan",
     hide: str = "nothing",
     seed: int = 0,
     catalogue: Catalogue | None = None,
@@ -383,9 +383,10 @@ def simulate(
     Raises:
         InputError: an effect that cannot be hidden; lists the valid ones.
     """
-    from drivers.simulated import rehearsal  # the simulated world is of no use but here
+    with needed_by("a simulated cell"):
+        from drivers.simulated import rehearsal  # the simulated world is of no use but here
 
-    what = plan.plan if isinstance(plan, CheckedPlan) else plan
+    what = plan if isinstance(plan, Plan) else plan.plan
     if not isinstance(cell, Cell):
         return rehearsal.read_plan(cell, what, [seed])
     if hide == rehearsal.INVENTED:

@@ -15,10 +15,13 @@ from studies.corrected import corrected
 from studies.descriptions_command import descriptions
 from studies.diagnosis_command import diagnosis
 from studies.discover_command import discover
+from studies.discover_field import discover_field
 from studies.discover_real_command import discover_real
 from studies.few_poses_command import few_poses
+from studies.formulas import formulas
 from studies.gross_errors_command import gross_errors
 from studies.made_of_command import made_of
+from studies.odds import odds
 from studies.plans_command import plans
 from studies.real_command import real
 from studies.records import results
@@ -36,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     app.command("diagnosis")(diagnosis)
     app.command("discover")(discover)
     app.command("discover-real")(discover_real)
+    app.command("discover-field")(discover_field)
+    app.command("formulas")(formulas)
+    app.command("odds")(odds)
     app.command("plans")(plans)
     app.command("descriptions")(descriptions)
     app.command("gross-errors")(gross_errors)

@@ -43,7 +43,10 @@ CLEAR = 3.0
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """What is hidden: a law of `KINDS`, an effect of the catalogue, or nothing."""
+    """What is hidden: a law of `KINDS`, an effect of the catalogue, or nothing.
+
+    `loads` counts those of the study that are used; None for all.
+    """
 
     robot: str
     mode: Mode
@@ -53,6 +56,7 @@ class Asked:
     strength: float = 3.0
     stated: float = 1.0
     poses: int = POSES
+    loads: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +91,7 @@ class Outcome:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Campaign:
+class Campaign:
     """Readings with the law in them; what law and noise did, (N, 3); where the arm rested."""
 
     readings: Readings
@@ -96,8 +100,50 @@ class _Campaign:
     scene: Scene
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulated:
+    """Campaigns with the same law in them, None for none, and the fit that the law is hidden in."""
+
+    law: Foreign | None
+    before: Fit
+    first: Campaign
+    fresh: Campaign
+
+
 def run_case(config: CellConfig, asked: Asked) -> Outcome:
     """Simulate, search, and measure the error at fresh poses."""
+    try:
+        c = simulated(config, asked)
+    except InputError as error:
+        return Outcome(asked, impossible=str(error))
+    law, before = c.law, c.before
+    d = discover(before)
+    out = Outcome(asked, d.reason, truth=asked.effect if law is None else law.words)
+    if d.laws:
+        out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
+    if law is None:
+        return out
+    off = error_at(before, c.fresh)
+    if d.reason == "catalogue":
+        return with_catalogue(replace(out, before=off), law, before, d.catalogue, c)
+    if not d.laws or d.after is None:
+        return replace(out, before=off, after=off)
+    return replace(
+        out,
+        site=_right_site(law, d.laws[0]),
+        variables=_same_quantities(d.laws[0].variables) == _same_quantities(law.variables),
+        correlation=agreement(before, d.after, c.first.moved),
+        before=off,
+        after=error_at(d.after, c.fresh),
+    )
+
+
+def simulated(config: CellConfig, asked: Asked) -> Simulated:
+    """Simulate two campaigns, and fit the first one.
+
+    Raises:
+        InputError: there is no such campaign.
+    """
     rng = np.random.default_rng(
         [
             asked.seed,
@@ -105,6 +151,7 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         ]
     )
     own, loads = with_study_loads(config, asked.robot)
+    loads = loads[: asked.loads]
     cell = cell_from_config(own)
     world = nothing_hidden(
         cell, rng, noise=measurement_noise(own), joint_std=own.repeatability.per_joint(cell.arm.n)
@@ -113,13 +160,10 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
     made = rehearsal_states(cell, asked.poses, loads, rng)
     if asked.effect:
         states, pose, _, cycle = made
-        try:
-            world = hide(
-                asked.effect, cell, states, asked.strength, asked.mode, rng,
-                world=world, pose=pose, cycle=cycle,
-            )  # fmt: skip
-        except InputError as error:
-            return Outcome(asked, impossible=str(error))
+        world = hide(
+            asked.effect, cell, states, asked.strength, asked.mode, rng,
+            world=world, pose=pose, cycle=cycle,
+        )  # fmt: skip
     names = ("none", *(name for name, _ in loads))
     first = _measured(world, made, names, rng, law, asked.stated)
     size = 1.0
@@ -130,27 +174,9 @@ def run_case(config: CellConfig, asked: Asked) -> Outcome:
         first = _scaled(first, size)
     readings = first.readings
     before = fit(baseline(cell, readings, asked.mode), readings, asked.mode)
-    d = discover(before)
-    out = Outcome(asked, d.reason, truth=asked.effect if law is None else law.words)
-    if d.laws:
-        out = replace(out, formula=d.laws[0].formula, p_value=d.laws[0].p_value)
-    if law is None:
-        return out
     again = rehearsal_states(cell, asked.poses, loads, rng)
     fresh = _scaled(_measured(world, again, names, rng, law, before=first.scene), size)
-    off = _error(before, fresh)
-    if d.reason == "catalogue":
-        return _with_catalogue(replace(out, before=off), law, before, d.catalogue, first, fresh)
-    if not d.laws or d.after is None:
-        return replace(out, before=off, after=off)
-    return replace(
-        out,
-        site=_right_site(law, d.laws[0]),
-        variables=_same_quantities(d.laws[0].variables) == _same_quantities(law.variables),
-        correlation=agreement(before, d.after, first.moved),
-        before=off,
-        after=_error(d.after, fresh),
-    )
+    return Simulated(law, before, first, fresh)
 
 
 def _same_quantities(names: Iterable[str]) -> frozenset[str]:
@@ -158,13 +184,12 @@ def _same_quantities(names: Iterable[str]) -> frozenset[str]:
     return frozenset("flange attitude" if n == LAST_AXIS else n for n in names)
 
 
-def _with_catalogue(
+def with_catalogue(
     out: Outcome,
     law: Foreign,
     before: Fit,
     names: Sequence[str],
-    first: _Campaign,
-    fresh: _Campaign,
+    c: Simulated,
 ) -> Outcome:
     """The error after adding what the answer names: effects of the catalogue."""
     model = before.model
@@ -185,8 +210,8 @@ def _with_catalogue(
         site=bool(clear) and all(f"joint {n[-1]}" in law.sites for n in clear),
         variables=law.variables
         == {f"joint {n[-1]} {c}" for n in clear for c in CAUSES.get(n.partition(".")[0], ())},
-        correlation=agreement(before, after, first.moved),
-        after=_error(after, fresh),
+        correlation=agreement(before, after, c.first.moved),
+        after=error_at(after, c.fresh),
     )
 
 
@@ -198,17 +223,17 @@ def _measured(
     law: Foreign | None,
     stated: float = 1.0,
     before: Scene | None = None,
-) -> _Campaign:
+) -> Campaign:
     states, pose, load, cycle = made
     readings = simulate(world, states, pose, load, cycle, names, rng)
     s = scene(world, states, before)
     moved = np.zeros_like(s.seen) if law is None else law.displaced(s)
     noise = readings.value - s.seen
     stated_so = replace(readings, covariance=stated**2 * readings.covariance)
-    return _Campaign(stated_so, moved, noise, s)
+    return Campaign(stated_so, moved, noise, s)
 
 
-def _scaled(c: _Campaign, size: float) -> _Campaign:
+def _scaled(c: Campaign, size: float) -> Campaign:
     moved = size * c.moved
     return replace(c, readings=replace(c.readings, value=c.readings.value + moved), moved=moved)
 
@@ -218,7 +243,7 @@ def _right_site(law: Foreign, found: Law) -> bool:
     return all(any(words.startswith(site) for site in law.sites) for words in found.acts_on)
 
 
-def _error(of: Fit, fresh: _Campaign) -> float:
+def error_at(of: Fit, fresh: Campaign) -> float:
     """Rms error at fresh readings over that of their noise."""
     w = whitening(fresh.readings, of.mode)
     prediction = of.model.predict(fresh.readings.states, of.theta)

@@ -3,7 +3,7 @@
 import json
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -19,6 +19,30 @@ Keep = Annotated[
     Path | None,
     typer.Option("--keep", metavar="F.json", help="Keep what was measured, for `results`."),
 ]
+
+
+Cases = Annotated[
+    Path | None,
+    typer.Option("--cases", help="File of cases, a JSON line each: added to; none is run twice."),
+]
+
+
+def resumed(
+    path: Path | None, keys: Sequence[str], run: Callable[[str], dict[str, object]]
+) -> Iterator[dict[str, object]]:
+    """Yield what each case came to; one that is in the file is not run again.
+
+    Without keys, all that are in the file.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines() if path and path.exists() else []
+    known: dict[str, dict[str, object]] = {c["case"]: c for c in map(json.loads, lines)}
+    for key in keys or [*known]:
+        if key not in known:
+            known[key] = {"case": key, **run(key)}
+            if path:
+                with path.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(known[key]) + "\n")
+        yield known[key]
 
 
 @dataclass(frozen=True, slots=True)

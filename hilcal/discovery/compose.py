@@ -84,10 +84,11 @@ class _Bent:
         return self.evidence - self.price
 
 
-class _Site:
+class SiteSums:
     """Sums of squares of one site beside the model and chosen terms, for any amplitude."""
 
     def __init__(self, beside: Beside, s: int) -> None:
+        """Project the chosen terms out."""
         screen = beside.problem.screen
         form = screen.form[s]
         self.evidence = beside.evidence
@@ -103,13 +104,13 @@ class _Site:
         self.constant = self.one > SEEN * float(self.moved.sum()) + LEAST_MOTION
         self.told = float(self.slope.sum())
 
-    def odds(self, values: Floats) -> Floats:
+    def odds(self, values: Floats, constant: bool = True) -> Floats:
         """(C,) evidence of amplitudes (C, K), the better of without and with a constant."""
         square = np.einsum("ck,ck->c", values @ self.free, values)
         seen = square > SEEN * (values**2 @ self.moved) + LEAST_MOTION
         slope, across = values @ self.slope, values @ self.ones
         return _better(self.evidence, slope, np.where(seen, square, 0.0), across,
-                       self.told, self.one if self.constant else 0.0)  # fmt: skip
+                       self.told, self.one if constant and self.constant else 0.0)  # fmt: skip
 
 
 def _better(
@@ -135,7 +136,7 @@ def composed_terms(beside: Beside) -> list[LawTerm]:
         beside: the candidates beside chosen terms.
     """
     found = _screened(beside)
-    at = {s: _Site(beside, s) for s in {b.s for b in found}}
+    at = {s: SiteSums(beside, s) for s in {b.s for b in found}}
     sums: list[_Bent] = []
     frontier = found
     for _ in range(LARGEST_SUM - 1):
@@ -209,7 +210,7 @@ def _values(beside: Beside, which: tuple[int, ...]) -> Floats:
     return np.asarray(values, dtype=float)
 
 
-def _extended(beside: Beside, site: _Site, b: _Bent) -> list[_Bent]:
+def _extended(beside: Beside, site: SiteSums, b: _Bent) -> list[_Bent]:
     """Return the argument with the best of further products added, at the best level."""
     grammar = beside.problem.screen.grammar
     own = frozenset[str]().union(*(grammar.depends[k] for k in b.which))
@@ -241,7 +242,7 @@ def _extended(beside: Beside, site: _Site, b: _Bent) -> list[_Bent]:
     return out
 
 
-def _gains(site: _Site, x: Floats) -> tuple[Floats, Floats]:
+def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
     """Gain of each further column of X (2 + P, K) beside the first two, and coefficients.
 
     Returns:
@@ -264,7 +265,7 @@ def _gains(site: _Site, x: Floats) -> tuple[Floats, Floats]:
 
 
 def _leveled(
-    beside: Beside, site: _Site, b: _Bent, more: int, weight: float, choices: int
+    beside: Beside, site: SiteSums, b: _Bent, more: int, weight: float, choices: int
 ) -> _Bent:
     """Return the sum with a further product, its weight and level the best of some."""
     grammar = beside.problem.screen.grammar
@@ -288,7 +289,7 @@ def _leveled(
     )
 
 
-def _terms(beside: Beside, site: _Site, b: _Bent) -> list[LawTerm]:
+def _terms(beside: Beside, site: SiteSums, b: _Bent) -> list[LawTerm]:
     """Return a function with its numbers refined, and with an exponent, each with a constant."""
     screen = beside.problem.screen
     each = 0.5 * float(np.log(beside.dof))
@@ -309,7 +310,7 @@ def _terms(beside: Beside, site: _Site, b: _Bent) -> list[LawTerm]:
     return out
 
 
-def _refined(beside: Beside, site: _Site, b: _Bent) -> Amplitude:
+def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
     """Return the amplitude with weights, levels and exponent where it explains most."""
     from scipy.optimize import minimize  # slow to import
 

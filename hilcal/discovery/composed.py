@@ -25,6 +25,10 @@ class Composed(Variable):
 
     terms: tuple[tuple[float, Amplitude], ...] = ()
 
+    def read(self, s: Situation) -> Floats:
+        """(N,) it in the states."""
+        return np.asarray(sum(w * a.values(s) for w, a in self.terms))
+
     @property
     def needs(self) -> tuple[str, ...]:
         """Columns of the readings that it needs."""
@@ -52,10 +56,6 @@ def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
     Args:
         terms: (weight, product); the first weight is 1, and all products have one unit.
     """
-
-    def read(s: Situation) -> Floats:
-        return np.asarray(sum(w * a.values(s) for w, a in terms))
-
     products = [a for _, a in terms]
     slots = [f.variable.slot for a in products for f in a.factors if f.variable.slot is not None]
     joints = {f.variable.joint for a in products for f in a.factors}
@@ -66,7 +66,6 @@ def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
         _sum([(w, a.latex()) for w, a in terms], r"\,"),
         products[0].unit(),
         _code(terms),
-        read,
         slot=slots[0] if slots else None,
         joint=joints.pop() if len(joints) == 1 else -1,
         terms=terms,

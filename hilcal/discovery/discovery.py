@@ -12,7 +12,7 @@
 6. What a generic regression predicts of the misfit says how much could be explained at all.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -22,17 +22,19 @@ from scipy.stats import chi2
 from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
-from hilcal.discovery.folds import FoldSearch, found_again, search_by_folds, stability
+from hilcal.discovery.folds import FoldSearch, found_again, search_by_folds
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
 from hilcal.discovery.law import Coefficient, Form, Law, form_of
 from hilcal.discovery.problem import SearchProblem
-from hilcal.discovery.refit import at_linearisation, exact, refine
+from hilcal.discovery.refit import exact, refine
 from hilcal.discovery.screen import Screen, screen
-from hilcal.discovery.search import MOST_TERMS, Selection, alternatives, search
+from hilcal.discovery.search import LEAST, MOST_TERMS, Selection, search
+from hilcal.discovery.structures import Structure, averaged, structure_of, structures
 from hilcal.discovery.write_effect import source_of_form
-from hilcal.errors import HilcalError, InputError
+from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import left_out_by_pose, linearise
+from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import score_family
 from hilcal.shown import Shown
 from hilcal.types import Floats
@@ -76,6 +78,8 @@ class Discovery(Shown):
         refused: laws that predict the misfit and are not proposed, and why: their exact refits
             failed.
         unfitted: effects of the catalogue that the exact model could not be fitted with, and why.
+        structures: likely laws with their posterior probabilities, the likeliest first, and the
+            best of each complexity; see `structures`.
     """
 
     fit: Fit
@@ -91,6 +95,38 @@ class Discovery(Shown):
     carried: tuple[Dependence, ...] = ()
     refused: tuple[tuple[str, str], ...] = ()
     unfitted: tuple[tuple[str, str], ...] = ()
+    structures: tuple[Structure, ...] = ()
+
+    def __repr__(self) -> str:
+        """Return the reason, and the formulas with their probabilities."""
+        rows = [f"\n  {x.probability:.3f}  {x.form.text()}" for x in self.structures]
+        return f"Discovery({self.reason!r}{''.join(rows)})"
+
+    def average(self, readings: Readings) -> tuple[Floats, Floats]:
+        """Return what the likely laws add to the fit's prediction of D measurements.
+
+        Returns:
+            (D, m) mean over the laws by their probability, and (D, m) standard deviation of the
+            prediction with it, without the noise; see `averaged`.
+
+        Raises:
+            CannotAnswerError: there is no law.
+        """
+        if not self.structures:
+            raise CannotAnswerError(f"no law was found ({self.reason}), so none is averaged")
+        return averaged(self.fit, self.structures, readings)
+
+    def average_m(self) -> tuple[float, float]:
+        """Return the average's rms motion of the fitted readings, and that of its std, m."""
+        mean, std = self.average(self.fit.readings)
+        each = (np.sqrt(np.mean(np.sum(x[:, :3] ** 2, axis=1))) for x in (mean, std))
+        return float(next(each)), float(next(each))
+
+
+def alternatives(d: Discovery, law: Law) -> tuple[Structure, ...]:
+    """Return what the readings do not tell from a law at odds of 20 : 1, the likeliest first."""
+    least = law.probability * float(np.exp(-LEAST))
+    return tuple(x for x in d.structures if x.probability > least and x.law != law.name)
 
 
 def discover(
@@ -145,10 +181,10 @@ def rival_sources(d: Discovery) -> dict[str, str]:
     if not d.laws:
         return {}
     law, out = d.laws[0], {}
-    for k, (form, values) in enumerate(law.rivals, start=1):
+    for k, x in enumerate(alternatives(d, law)[:MOST_RIVALS], start=1):
         own = f"{law.name}_or_{k}"
         evidence = f"These readings do not tell it from {law.name}: {law.formula}"
-        out[own] = source_of_form(form, own, values, evidence, f"{own}.py")
+        out[own] = source_of_form(x.form, own, x.parameters, evidence, f"{own}.py")
     return out
 
 
@@ -166,14 +202,6 @@ def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float
     )
 
 
-def curve(problem: SearchProblem, s: Selection) -> Floats:
-    """(R,) what a law explains of the residual, the model projected out."""
-    x = np.hstack([problem.columns(t) for t in s.terms])
-    free = problem.model.project_out(x)
-    step = np.linalg.lstsq(free, problem.residual, rcond=1e-8)[0]
-    return np.asarray(free @ step)
-
-
 def _laws(
     fit: Fit,
     problem: SearchProblem,
@@ -188,7 +216,10 @@ def _laws(
     before = left_out_by_pose(fit)
     rank = fit.whitening.rank
     misfit = max(float(before.sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
+    likely = structures(problem, selections)
+    chance = {x.kind: x.probability for x in likely}
     made: list[tuple[Law, Fit, Floats, str]] = []
+    kinds: list[Hashable] = []
     refused: list[tuple[str, str]] = []
     for s in selections:
         form = refine(found, form_of(found, s.terms))
@@ -201,9 +232,12 @@ def _laws(
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
         law = _law(problem, s, form, name, coefficients, share, after, folds, known)
+        kinds.append(structure_of(found, s.terms))
+        law = replace(law, probability=chance[kinds[-1]])
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
-            f"{law.p_value:.1g}, the search\npaid for."
+            f"{law.p_value:.1g}, the search\npaid for. The probability of its structure, of those "
+            f"that were met, is {law.probability:.2f}."
         )
         source = source_of_form(form, name, coefficients, evidence, f"{name}.py")
         made.append((law, after, left, source))
@@ -218,6 +252,7 @@ def _laws(
         replace(made[k][0], name=name if not rank else f"{name}_{rank + 1}")
         for rank, k in enumerate(kept)
     )
+    named = {kinds[k]: law.name for k, law in reversed([*zip(kept, laws, strict=True)])}
     return Discovery(
         fit,
         "law",
@@ -230,6 +265,7 @@ def _laws(
         made[kept[0]][3],
         curves(made[kept[0]][1], laws[0].form),
         refused=tuple(refused),
+        structures=tuple(replace(x, law=named.get(x.kind, "")) for x in likely),
     )
 
 
@@ -263,12 +299,6 @@ def _law(
     for symbol, v in read.items():
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
-    others: dict[str, Form] = {}
-    for terms in alternatives(problem, s):
-        other = form_of(problem.screen, terms)
-        if other.text() != form.text():
-            others.setdefault(other.text(), other)
-    rivals = [(f, at_linearisation(problem.screen, f)) for f in [*others.values()][:MOST_RIVALS]]
     return Law(
         name=name,
         form=form,
@@ -277,10 +307,8 @@ def _law(
         odds=s.total,
         holdout_share=share,
         left=after.variance_factor,
-        stability=stability(problem.screen, folds, curve(problem, s)),
-        alternatives=tuple(others),
+        probability=0.0,
         resembles=near[:3],
         ranges=tuple(ranges),
-        rivals=tuple(rivals),
         again=found_again(problem.screen, folds, s.terms),
     )

@@ -3,9 +3,10 @@
 from dataclasses import asdict
 
 from hilcal.discovery.curve import Curve
-from hilcal.discovery.discovery import Discovery
+from hilcal.discovery.discovery import Discovery, alternatives
 from hilcal.discovery.law import Law
 from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.structures import pareto
 
 
 def laws_json(s: LawSearch) -> dict[str, object]:
@@ -35,14 +36,26 @@ def discovery_json(d: Discovery) -> dict[str, object]:
         "carried_by": [
             {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
         ],
-        "laws": [law_json(law) for law in d.laws],
+        "laws": [law_json(law, d) for law in d.laws],
+        "structures": [
+            {
+                "formula": x.form.text(),
+                "probability": x.probability,
+                "complexity": x.form.complexity,
+                "holdout_share": x.holdout_share,
+                "pareto": x in pareto(d.structures),
+                "law": x.law or None,
+            }
+            for x in d.structures
+        ],
         "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
         "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
+        "average": dict(zip(("rms_m", "std_m"), d.average_m(), strict=True)) if d.laws else None,
         "curves": [curve_json(c) for c in d.curves],
     }
 
 
-def law_json(law: Law) -> dict[str, object]:
+def law_json(law: Law, d: Discovery) -> dict[str, object]:
     """Return a law as JSON."""
     return {
         "name": law.name,
@@ -54,9 +67,9 @@ def law_json(law: Law) -> dict[str, object]:
         "holdout_share": law.holdout_share,
         "p_value": law.p_value,
         "variance_factor": law.left,
-        "stability": law.stability,
+        "probability": law.probability,
         "found_again": [{**asdict(a), "variables": list(a.variables)} for a in law.again],
-        "alternatives": list(law.alternatives),
+        "alternatives": [x.form.text() for x in alternatives(d, law)],
         "resembles": [asdict(r) for r in law.resembles],
         "ranges": [
             {"quantity": symbol, "min": low, "max": high, "unit": unit}

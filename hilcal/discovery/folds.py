@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.discovery.law import Again
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import Screen
-from hilcal.discovery.search import SAME, Selection, search
+from hilcal.discovery.search import Selection, search
 from hilcal.discovery.terms import LawTerm
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose
@@ -70,15 +70,8 @@ def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -
     screen = problem.screen
     linear = screen.linear
     rows, white = linear.rows, linear.fit.white
-    x = rows
-    if selection is not None:
-        parts = [
-            screen.columns(list(t.parts)).sum(axis=1, keepdims=True)
-            if t.common
-            else screen.columns(list(t.parts))
-            for t in selection.terms
-        ]
-        x = np.hstack([rows, *parts])
+    terms = () if selection is None else selection.terms
+    x = np.hstack([rows, *map(screen.columns_of, terms)])
     used = problem.rows
     own = x[used]
     ridge = np.full(x.shape[1], RIDGE)
@@ -106,25 +99,3 @@ def _causes(
     return {
         (place, frozenset(names)): names for place, names in named if names or place not in moved
     }
-
-
-def stability(screen: Screen, folds: FoldSearch, fitted: Floats) -> float:
-    """Share of the folds whose law is the same: their curves over all readings correlate.
-
-    Args:
-        screen: all candidates.
-        folds: the repeated search.
-        fitted: (R,) what the law explains, the model projected out.
-    """
-    same = 0
-    for f in folds.found:
-        if f is None:
-            continue
-        problem = SearchProblem(screen)
-        x = np.hstack([problem.columns(t) for t in f.terms])
-        free = screen.linear.project_out(x)
-        step = np.linalg.lstsq(free, screen.linear.residual, rcond=1e-8)[0]
-        curve = free @ step
-        size = float(np.linalg.norm(curve) * np.linalg.norm(fitted))
-        same += size > 0 and float(curve @ fitted) / size >= SAME
-    return same / max(len(folds.found), 1)

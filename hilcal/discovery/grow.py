@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hilcal.discovery.amplitudes import Amplitude, Factor, different
+from hilcal.discovery.compose import SiteSums
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
@@ -102,7 +103,7 @@ def _terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[Law
         good = np.isfinite(size[:, 0]) & (size[:, 0] > 0)
         values = (values[good] / size[good]).astype(np.float32)
         some = [m for m, ok in zip(mine, good.tolist(), strict=True) if ok]
-        odds = beside.odds_of(s, values)
+        odds = SiteSums(beside, s).odds(values, constant=False)
         ranked += [
             (float(x) - price, s, a, price)
             for x, (a, price) in zip(odds, some, strict=True)

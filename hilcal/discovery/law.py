@@ -106,15 +106,18 @@ class Form:
             out.setdefault(symbol(p.site), []).append(write(LETTERS[p.coefficient], p.amplitude))
         return out
 
+    def motion(self, sites: tuple[Site, ...], motion: Floats, s: Situation) -> Floats:
+        """(N, m, P) motion of each reading, by ordinary motions (N, m, S) of the sites."""
+        out = np.zeros((*motion.shape[:2], self.count))
+        for p in self.parts:
+            by = p.amplitude.values(s)[:, None]
+            out[:, :, p.coefficient] += motion[:, :, sites.index(p.site)] * by
+        return out
+
     def columns(self, screen: Screen, s: Situation) -> Floats:
         """(R, P) whitened columns by ordinary motions, at the fit of a screen."""
         w = screen.linear.fit.whitening
-        raw = np.zeros((*screen.motion.shape[:2], self.count))
-        place = {site: k for k, site in enumerate(screen.sites)}
-        for p in self.parts:
-            by = p.amplitude.values(s)[:, None]
-            raw[:, :, p.coefficient] += screen.motion[:, :, place[p.site]] * by
-        return w.whiten_readings(raw)
+        return w.whiten_readings(self.motion(screen.sites, screen.motion, s))
 
 
 def _amplitude_text(letter: str, a: Amplitude) -> str:
@@ -171,6 +174,15 @@ class Coefficient:
     unit: str
 
 
+def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ...]:
+    """Return the coefficients of a law, SI, from (P,) means and uncertainties, ordinary motions."""
+    size = ordinary(form)
+    return tuple(
+        Coefficient(LETTERS[k], float(v), float(e), form.unit(k))
+        for k, (v, e) in enumerate(zip(step * size, std * size, strict=True))
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class Again:
     """How often a cause was found again.
@@ -211,12 +223,10 @@ class Law:
         odds: logarithm of the odds against no law, the search paid for.
         holdout_share: share of the misfit that it explains on poses left out.
         left: variance factor that is left.
-        stability: share of the resampled searches whose whole law has the same curve.
         again: for each site and its quantities, the share of them that find these.
-        alternatives: formulas that these readings do not tell from it, at odds of 20 : 1.
+        probability: posterior, of its structure.
         resembles: effects of the catalogue that are near, the nearest first.
         ranges: least and largest of each quantity in the readings.
-        rivals: forms of `alternatives`, with coefficients by algebra.
     """
 
     name: str
@@ -226,11 +236,9 @@ class Law:
     odds: float
     holdout_share: float
     left: float
-    stability: float
-    alternatives: tuple[str, ...]
+    probability: float
     resembles: tuple[Resemblance, ...]
     ranges: tuple[tuple[str, float, float, str], ...]
-    rivals: tuple[tuple[Form, tuple[Coefficient, ...]], ...] = ()
     again: tuple[Again, ...] = ()
 
     @property

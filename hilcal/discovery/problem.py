@@ -14,7 +14,7 @@ import numpy as np
 from hilcal.discovery.compose import composed_terms
 from hilcal.discovery.gains import keep_largest, orthonormal, together
 from hilcal.discovery.grow import grown
-from hilcal.discovery.screen import LEAST_MOTION, SEEN, Screen
+from hilcal.discovery.screen import Screen
 from hilcal.discovery.terms import LawTerm, Scored, ScreenedTerm, Screening
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
@@ -68,6 +68,7 @@ class SearchProblem:
         self.screened = used & screen.rows
         self.seen = float(self.screened.sum() / used.sum())
         self._thin, self._thin_residual = self.model, self.residual
+        self._scored: dict[tuple[tuple[tuple[tuple[int, int], ...], bool], ...], list[Scored]] = {}
         if self.seen < 1.0:
             ridge = np.maximum(linear.projection.ridge, LEAST_RIDGE)
             self._thin = projection(linear.rows[self.screened], ridge)
@@ -109,12 +110,19 @@ class SearchProblem:
 
     def columns(self, term: LawTerm) -> Floats:
         """(R', P) whitened columns of a term in the rows that are used."""
-        x = self.screen.columns(list(term.parts))[self.rows]
-        return x.sum(axis=1, keepdims=True) if term.common else x
+        return self.screen.columns_of(term)[self.rows]
 
     def beside(self, chosen: Sequence[LawTerm]) -> "Beside":
         """Return the candidates beside chosen terms."""
         return Beside(self, tuple(chosen))
+
+    def scored(self, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+        """Return the short list beside chosen terms, the best odds first; kept once it is made."""
+        key = tuple((t.parts, t.common) for t in chosen)
+        if key not in self._scored:
+            beside = self.beside(chosen)
+            self._scored[key] = sorted(beside.score(beside.shortlist()), key=lambda c: -c.odds)
+        return self._scored[key]
 
 
 class Beside:
@@ -259,22 +267,6 @@ class Beside:
             np.float32(-0.5 * self.dof) * np.log(1 - share)
             - np.float32(0.5 * count) * (np.log(per) + np.float32(1.0))
         )
-
-    def odds_of(self, s: int, values: Floats) -> Floats:
-        """(C,) log evidence of amplitudes (C, K) at a site, by their values; as in `best`."""
-        screen = self.problem.screen
-        form = screen.form[s]
-        thin = self.problem.thin
-        slope = values @ (form.T @ thin)
-        lifted = values @ screen.free[s]
-        square = np.float32(self.problem.share) * np.einsum("ck,ck->c", lifted, values)
-        for told, unit in self.taken():
-            own = values @ (form.T @ unit)
-            slope, square = slope - np.float32(told) * own, square - own**2
-        moved = values**2 @ np.sum(form**2, axis=0)
-        seen = square > SEEN * moved + LEAST_MOTION
-        gain = np.where(seen, slope**2 / np.where(seen, square, 1.0), 0.0)
-        return np.where(seen, self.evidence(gain, 1), -np.inf)
 
     def score(self, terms: Sequence[LawTerm]) -> list[Scored]:
         """Score terms exactly beside the chosen ones."""

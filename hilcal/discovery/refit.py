@@ -17,7 +17,7 @@ from hilcal.discovery.law import (
     LETTERS,
     Coefficient,
     Form,
-    ordinary,
+    coefficients,
     with_coefficients,
     with_factors,
 )
@@ -87,20 +87,11 @@ def left_by(screen: Screen, form: Form, s: Situation) -> float:
     return linear.rss - float(x.T @ linear.residual @ step)
 
 
-def by_algebra(screen: Screen, form: Form, s: Situation) -> Floats:
-    """(P,) coefficients at the linearisation, in ordinary motions."""
-    x, linear = form.columns(screen, s), screen.linear
-    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
-    return np.asarray(step, dtype=float)
-
-
 def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
     """Return the coefficients by algebra, without their uncertainties."""
-    s = screen.linear.fit.solution.prediction.situation
-    step = by_algebra(screen, form, s) * ordinary(form)
-    return tuple(
-        Coefficient(LETTERS[k], float(v), float("nan"), form.unit(k)) for k, v in enumerate(step)
-    )
+    x, linear = form.columns(screen, screen.linear.fit.solution.prediction.situation), screen.linear
+    step = np.linalg.lstsq(linear.information(x), x.T @ linear.residual, rcond=SPANNED)[0]
+    return coefficients(form, np.asarray(step, dtype=float), np.full(len(step), np.nan))
 
 
 def exact(

@@ -18,6 +18,7 @@ from hilcal.discovery.amplitudes import Amplitude
 from hilcal.discovery.bends import Bends, bends
 from hilcal.discovery.grammar import Grammar, grammar
 from hilcal.discovery.sites import Site, site_motions
+from hilcal.discovery.terms import LawTerm
 from hilcal.discovery.variables import variables
 from hilcal.identification.fit import Fit
 from hilcal.identification.linearisation import Linearisation
@@ -136,6 +137,11 @@ class Screen:
         raw = self.motion[:, :, site] * self.grammar.rows(amplitude.tolist()).T[:, None, :]
         return w.whiten_readings(raw)
 
+    def columns_of(self, term: LawTerm) -> Floats:
+        """(R, P) whitened columns of a term."""
+        x = self.columns(list(term.parts))
+        return x.sum(axis=1, keepdims=True) if term.common else x
+
 
 def screen(linear: Linearisation) -> Screen:
     """Prepare the search beside a fit."""
@@ -143,9 +149,19 @@ def screen(linear: Linearisation) -> Screen:
     situation = fit.solution.prediction.situation
     poses = len(np.unique(fit.pose))
     words = grammar(variables(situation), situation, poses)
-    places, motion = site_motions(fit)
-    w = fit.whitening
-    rows, readings = _thinned(fit)
+    return screened(linear, words, *site_motions(fit), *_thinned(fit))
+
+
+def screened(
+    linear: Linearisation,
+    words: Grammar,
+    places: tuple[Site, ...],
+    motion: Floats,
+    rows: Bools,
+    readings: Ints,
+) -> Screen:
+    """Return all candidates of some amplitudes and sites, as `Screen` has them."""
+    w = linear.fit.whitening
     own = projection(linear.rows[rows], linear.projection.ridge)
     form: Floats = np.empty((len(places), int(rows.sum()), len(readings)), dtype=np.float32)
     square: Floats = np.empty((len(places), len(words.size)), dtype=np.float32)

@@ -12,9 +12,10 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.gains import SHORT_LIST
-from hilcal.discovery.problem import Beside, SearchProblem
+from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.terms import LawTerm, Scored
+from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 
@@ -60,8 +61,7 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
         most: terms at most.
         beam: first terms that are followed.
     """
-    beside = problem.beside(())
-    found = _ordered(beside)
+    found = _ordered(problem)
     if not found or not _sure(found[0], problem):
         return []
     starts = _distinct(problem, found, beam)
@@ -70,15 +70,14 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
         s = Selection((start.term,), (start.odds,))
         _keep(problem, best, s)
         while len(s.terms) < most:
-            after = problem.beside(s.terms)
-            further = _ordered(after)
+            further = _ordered(problem, s.terms)
             if not further or further[0].odds < LEAST:
                 break
             more = further[0]
             terms = (*s.terms, more.term)
             if sum(t.count for t in terms) > MOST_COEFFICIENTS:
                 break
-            grown = _pruned(problem, replace(s, terms=terms, odds=_chain(problem, terms)))
+            grown = _pruned(problem, replace(s, terms=terms, odds=chain(problem, terms)))
             if grown.total < s.total + LEAST:
                 break
             # What was added last is the best beside the others already.
@@ -96,41 +95,13 @@ def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
     return out
 
 
-def alternatives(problem: SearchProblem, s: Selection) -> list[tuple[LawTerm, ...]]:
-    """Return laws with another term that the rows do not tell from it, at odds of 20 : 1."""
-    found: list[tuple[float, tuple[LawTerm, ...]]] = []
-    for k in range(len(s.terms)):
-        others = (*s.terms[:k], *s.terms[k + 1 :])
-        beside = problem.beside(others)
-        own = beside.score([s.terms[k]])[0].odds
-        found += [
-            (c.odds - own, (*s.terms[:k], _plain(problem.screen, c.term), *s.terms[k + 1 :]))
-            for c in _ordered(beside)
-            if c.odds > own - LEAST and c.term.parts != s.terms[k].parts
-        ]
-    own_kind = _kind(problem.screen, s.terms)
-    kinds = {own_kind: s.terms}
-    for _, terms in sorted(found, key=lambda x: -x[0]):
-        kinds.setdefault(_kind(problem.screen, terms), terms)
-    return [*kinds.values()][1:]
-
-
-def _kind(screen: Screen, terms: tuple[LawTerm, ...]) -> frozenset[tuple[object, ...]]:
-    """Sites and functions of a law, without the numbers in these."""
-    return frozenset(
-        (s, frozenset((f.variable.symbol, f.shape.name) for f in screen.grammar.at(a).factors))
-        for t in terms
-        for s, a in t.parts
-    )
-
-
-def _ordered(beside: Beside) -> list[Scored]:
-    """Score the short list, best first; the simplest of those that odds of 20 : 1 do not tell."""
-    found = sorted(beside.score(beside.shortlist()), key=lambda c: -c.odds)
+def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[Scored]:
+    """Return the short list, best first; the simplest of those that odds of 20 : 1 do not tell."""
+    found = problem.scored(chosen)
     if not found:
         return []
     as_good = [c for c in found if c.odds > found[0].odds - LEAST]
-    first = min(as_good, key=lambda c: _preference(beside.problem.screen, c))
+    first = min(as_good, key=lambda c: _preference(problem.screen, c))
     return [first, *(c for c in found if c is not first)]
 
 
@@ -180,10 +151,11 @@ def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> N
 
 def _plainly(screen: Screen, s: Selection) -> Selection:
     """Name the simplest of the sites that move all readings alike."""
-    return replace(s, terms=tuple(_plain(screen, t) for t in s.terms))
+    return replace(s, terms=tuple(plain(screen, t) for t in s.terms))
 
 
-def _plain(screen: Screen, t: LawTerm) -> LawTerm:
+def plain(screen: Screen, t: LawTerm) -> LawTerm:
+    """Name the simplest site that moves all readings alike; terms of several sites keep theirs."""
     places = {place for place, _ in t.parts}
     if len(places) > 1:
         return t
@@ -234,10 +206,10 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
             worth.append(problem.beside(others).score([term])[0].odds)
         weakest = int(np.argmin(worth))
         if worth[weakest] >= LEAST:
-            return replace(s, odds=_chain(problem, s.terms))
+            return replace(s, odds=chain(problem, s.terms))
         terms = (*s.terms[:weakest], *s.terms[weakest + 1 :])
-        terms = (replace(terms[0], price=terms[0].alone), *terms[1:])
-        s = replace(s, terms=terms, odds=_chain(problem, terms))
+        terms = led(terms)
+        s = replace(s, terms=terms, odds=chain(problem, terms))
     return s
 
 
@@ -248,16 +220,21 @@ def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
     """
     for k in range(last):
         others = (*s.terms[:k], *s.terms[k + 1 :])
-        found = _ordered(problem.beside(others))
+        found = _ordered(problem, others)
         if not found or found[0].term.parts == s.terms[k].parts:
             continue
-        terms = (replace(others[0], price=others[0].alone), *others[1:], found[0].term)
+        terms = led((*others, found[0].term))
         if sum(t.count for t in terms) > MOST_COEFFICIENTS:
             continue
-        other = replace(s, terms=terms, odds=_chain(problem, terms))
+        other = replace(s, terms=terms, odds=chain(problem, terms))
         if _better(problem, other, s):
             s = other
     return s
+
+
+def led(terms: tuple[LawTerm, ...]) -> tuple[LawTerm, ...]:
+    """Return terms of which the first pays the price of one that stands alone."""
+    return (replace(terms[0], price=terms[0].alone), *terms[1:])
 
 
 def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
@@ -269,11 +246,17 @@ def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, 
     return len(names), len({s for s, _ in parts}), *each.tolist()
 
 
-def _chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
+def chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
     """Odds of each term beside those before it, whose coefficients keep their priors.
 
     So they add up to the odds of the whole law, and compare with those of effects.
     """
+    scores = chained(problem, terms)
+    return tuple(s.log_evidence - t.price for s, t in zip(scores, terms, strict=True))
+
+
+def chained(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> list[FamilyScore]:
+    """Score each term beside those before it."""
     x = [problem.columns(t) for t in terms]
     ends = np.cumsum([0, *(c.shape[1] for c in x)])
     places = {str(k): slice(int(a), int(b)) for k, (a, b) in enumerate(pairwise(ends))}
@@ -282,9 +265,8 @@ def _chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, .
         problem.model.information(whole), problem.residual, problem.dof, whole, places, {}
     )
     out = []
-    for k, term in enumerate(terms):
-        score = families.scores()[str(k)]
-        out.append(score.log_evidence - term.price)
-        if score.rank:
-            families = families.with_family(str(k), score)
-    return tuple(out)
+    for name in places:
+        out.append(families.scores()[name])
+        if out[-1].rank:
+            families = families.with_family(name, out[-1])
+    return out

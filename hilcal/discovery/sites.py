@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.effects.force_sensor import acting_columns
 from hilcal.effects.protocol import Columns, Effect, Field, Parameter, Situation
 from hilcal.identification.fit import Fit
+from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
@@ -175,9 +175,13 @@ class UnitMotions(Effect):
 
 def site_motions(fit: Fit) -> tuple[tuple[Site, ...], Floats]:
     """Return the sites and (N, m, S) motion of each reading by an ordinary motion of each."""
-    cell: Cell = fit.model.cell
-    states = fit.solution.prediction.situation.states
-    unit = UnitMotions(cell, states)
-    jacobian = fit.model.jacobian_of((unit,), fit.solution.prediction, fit.theta, fit.whitening.m)
+    return motions_of(fit.model, fit.solution.prediction, fit.theta, fit.whitening.m)
+
+
+def motions_of(
+    model: Model, at: Prediction, theta: Floats, m: int
+) -> tuple[tuple[Site, ...], Floats]:
+    """Return the same of any readings of m elements, at a prediction of them."""
+    unit = UnitMotions(model.cell, at.situation.states)
     scale = np.array([p.scale for p in unit.parameters])
-    return unit.sites, jacobian * scale
+    return unit.sites, model.jacobian_of((unit,), at, theta, m) * scale

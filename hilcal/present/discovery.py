@@ -10,13 +10,16 @@ from hilcal.discovery.curve import Curve
 from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Coefficient, Law
 from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.structures import Structure, pareto
 from hilcal.present.diagnosis import binned_table, curves
-from hilcal.present.document import Block, Words, heading
+from hilcal.present.document import Block, Words, heading, table
 from hilcal.present.fit import model_name
 
 FEW = 3
 LEAST_BINS = 3
 """Bins that make a curve; a choice."""
+RARE = 0.01
+"""Probability below which no figure is written."""
 NOT_TRIED = "could not be tried in the exact model"
 
 
@@ -36,6 +39,13 @@ def discovery_report(d: Discovery) -> Iterator[Block]:
         yield from _law(law, d, first=k == 0)
         if k == 0:
             yield from curve_tables(d.curves)
+    yield ""
+    yield from structures_table(d.structures)
+    moved, std = map(numbers.length, d.average_m())
+    yield (
+        f"Averaged over them by their probability, laws move the readings by {moved} rms; what is "
+        f"then predicted has a standard uncertainty of {std}, the choice of the law included."
+    )
     for what, why in (*d.refused, *d.unfitted):
         yield f"{what} {NOT_TRIED} ({why})."
 
@@ -96,8 +106,6 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
     for a in law.again:
         causes = f" by {', '.join(a.variables)}" if a.variables else ""
         yield f"    {a.acts_on}{causes}: {numbers.percent(a.share)}"
-    if law.alternatives:
-        yield f"  or           {'; or '.join(law.alternatives[:FEW])}: not told apart here"
     near = [f"{r.effect} (cosine {r.cosine:.2f})" for r in law.resembles[:FEW]]
     if near:
         yield f"  resembles    {', '.join(near)}"
@@ -107,6 +115,19 @@ def _law(law: Law, d: Discovery, first: bool) -> Iterator[Block]:
     ]
     if seen:
         yield f"  seen for     {', '.join(seen)}; nothing is known outside"
+
+
+def structures_table(of: Sequence[Structure]) -> Iterator[Block]:
+    """Yield the likely laws: probability, complexity, share on poses left out."""
+    best = pareto(of)
+    rows = table("law", "probability", "complexity", "on poses left out", "")
+    for x in of:
+        said = [x.law] if x.law else []
+        said += ["best of its size"] if x in best else []
+        share = numbers.percent(x.holdout_share)
+        chance = numbers.percent(x.probability) if x.probability >= RARE else f"< {100 * RARE:g} %"
+        rows.add(x.form.text(), chance, str(x.form.complexity), share, ", ".join(said))
+    yield rows
 
 
 def curve_tables(of: Sequence[Curve]) -> Iterator[Block]:

@@ -31,7 +31,7 @@ Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, v
 Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -65,6 +65,7 @@ class FamilyScore:
         spectrum: of S; None where no direction is visible.
         noise: ‖r‖²_t / ν.
         bounded: whether a larger strength than is plausible has more evidence.
+        by_strength: (T,) log evidence at each of `STRENGTHS`; empty for no visible direction.
     """
 
     p_value: float
@@ -79,6 +80,17 @@ class FamilyScore:
     spectrum: Spectrum | None
     noise: float
     bounded: bool = False
+    by_strength: Floats = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def marginal(self) -> float:
+        """Log evidence averaged over the strengths, each order of magnitude as likely a priori.
+
+        Under no effect exp(marginal) is 1 on average; that of the best strength is more, and the
+        more the more families are tried.
+        """
+        t = self.by_strength
+        return float(np.logaddexp.reduce(t) - np.log(len(t))) if len(t) else 0.0
 
     @property
     def root(self) -> Floats:
@@ -181,4 +193,5 @@ def score_family(
         spectrum=of,
         noise=max(rss - gain, ROUNDING * rss) / dof,
         bounded=best != freely,
+        by_strength=evidence,
     )

@@ -18,6 +18,7 @@ from hilcal.discovery.discovery import Discovery
 from hilcal.discovery.law import Coefficient, Form, LawPart
 from hilcal.discovery.law import Law as FoundLaw
 from hilcal.discovery.sites import sites
+from hilcal.discovery.structures import Structure
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import source_of_form
 from hilcal.effects.check import check_effect
@@ -74,17 +75,24 @@ def test_a_law_is_written_as_an_effect_and_told(
         30.0,
         0.8,
         1.1,
-        1.0,
+        0.7,
         (),
         (),
-        (),
-        ((COMPLIANCE, (Coefficient("a", 2e-6, float("nan"), "rad/(N·m)"),)),),
     )
+    one, listed = np.ones(1), [3]
+    hardly = Form((LawPart(sites(6)[3], Amplitude(()), 0),))
+    drawn = ((form, 0.7, 0.8, "bent"), (COMPLIANCE, 0.2, 0.8, ""), (hardly, 0.01, 0.2, ""))
     source = source_of_form(form, "bent", law.parameters)
 
     def search(fit: Fit, say: object, name: str) -> Discovery:
         assert name == "bent"
-        return Discovery(fit, "law", (law,), 0.9, 0.8, candidates=7, source=source)
+        d = Discovery(fit, "law", (law,), 0.9, 0.8, candidates=7, source=source)
+        absorbed = np.zeros((fit.solution.rows.shape[1], 1))
+        likely = [
+            Structure(x.text(), x, p, share, one, np.eye(1), absorbed, of)
+            for x, p, share, of in drawn
+        ]
+        return replace(d, structures=tuple(likely[: listed[0]]))
 
     monkeypatch.setattr("hilcal.cli.discovering.search", search)
     out = tmp_path / "bent.py"
@@ -92,6 +100,12 @@ def test_a_law_is_written_as_an_effect_and_told(
     found = ok(capsys, "discover", campaign, *asked, "--alternatives")
     other = tmp_path / "bent_or_1.py"
     assert found.document["alternatives"] == [{"name": "bent_or_1", "written": str(other)}]
+    assert found.document["laws"][0]["alternatives"] == ["dq_3 = a·cos(q_5)·τ_3"]
+    assert [x["probability"] for x in found.document["structures"]] == [0.7, 0.2, 0.01]
+    assert [x["pareto"] for x in found.document["structures"]] == [True, False, False]
+    assert "best of its size" in found.err
+    assert "Averaged over them" in found.err
+    assert found.document["average"]["std_m"] > 0
     assert f"--suspects bent,bent_or_1 --effects-from {out} --effects-from {other}" in found.err
     files = ("--effects-from", out, "--effects-from", other)
     plan = ("-o", tmp_path / "plan.json", "--suspects", "bent,bent_or_1", *files, "--quick")
@@ -107,6 +121,7 @@ def test_a_law_is_written_as_an_effect_and_told(
     creeping.write_bytes(campaign.read_bytes())
     ok(capsys, "identify", creeping, "--effects", "joint_compliance, creep")
     ok(capsys, "export", creeping, "--calibration", calibration)
+    listed[0] = 1
     for model, names in (("baseline", BASELINE), (calibration, [*BASELINE, "creep"])):
         found = ok(capsys, "discover", campaign, "-o", out, "--against", model, "--json")
         assert found.document["model"] == names

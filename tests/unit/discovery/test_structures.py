@@ -1,0 +1,148 @@
+"""Probabilities of structures, the Pareto list, and the average: against what is known exactly."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.discovery.discovery import Discovery, alternatives
+from hilcal.discovery.document import discovery_json
+from hilcal.discovery.structures import Structure, averaged, pareto, posterior
+from hilcal.errors import CannotAnswerError
+from hilcal.identification.residual import residual
+from hilcal.readings.whitening import whitening
+from hilcal.regression.evidence import STRENGTHS, score_family
+from tests.unit.discovery.test_discover import LAW, campaign, found
+
+
+def test_probabilities_sum_to_one_with_that_of_no_law() -> None:
+    """Two members of one structure, one of another, no law: weights 3 + 1, 4 and 1 of 9."""
+    told = posterior({"a": [np.log(3.0), 0.0], "b": [np.log(4.0)]})
+    assert told["a"] == pytest.approx(4 / 9, rel=1e-12)
+    assert told["b"] == pytest.approx(4 / 9, rel=1e-12)
+    assert posterior({"a": [2000.0], "b": [1990.0]})["b"] == pytest.approx(np.exp(-10), rel=1e-3)
+
+
+def columns(rng: np.random.Generator) -> np.ndarray[Any, Any]:
+    """Five causes of which no two are told apart for sure: correlation 0.9."""
+    common = rng.standard_normal((30, 1))
+    x = 0.9**0.5 * common + 0.1**0.5 * rng.standard_normal((30, 5))
+    return np.asarray(x)
+
+
+def told(x: np.ndarray[Any, Any], y: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    rss = float(y @ y)
+    odds = {}
+    for k in range(x.shape[1]):
+        score = score_family(x[:, [k]].T @ x[:, [k]], x[:, [k]].T @ y, rss, len(y))
+        odds[k] = [score.marginal - np.log(x.shape[1])]
+    chance = posterior(odds)
+    return np.array([chance[k] for k in range(x.shape[1])])
+
+
+def test_probabilities_are_frequencies_where_laws_are_drawn_from_the_priors() -> None:
+    """400 draws of none or one of five causes, its size log-uniform over the prior's range.
+
+    What is said sums to the number of right ones to within its binomial error, in each third.
+    """
+    rng = np.random.default_rng(8)
+    said, right = [], []
+    for _ in range(400):
+        x, y = columns(rng), rng.standard_normal(30)
+        k = int(rng.integers(-5, 5))  # none in half of the cases, as `posterior` has it
+        if k >= 0:
+            y = y + x[:, k] * rng.standard_normal() * rng.choice(STRENGTHS)
+        said += told(x, y).tolist()
+        right += [j == k for j in range(5)]
+    p, hit = np.array(said), np.array(right)
+    for low, high in ((0.0, 0.1), (0.1, 0.5), (0.5, 1.0)):
+        mine = (p > low) & (p <= high)
+        spread = np.sqrt(np.sum(p[mine] * (1 - p[mine])))
+        assert mine.sum() > 50
+        assert abs(hit[mine].sum() - p[mine].sum()) < 3 * spread
+
+
+def test_probabilities_are_those_of_bayes_rule_by_integration() -> None:
+    """Known noise and size τ: p(y | k) = N(y; 0, 1 + τ² x xᵀ), integrated over the same τ."""
+    rng = np.random.default_rng(3)
+    x = np.vstack([columns(rng) for _ in range(20)])  # 600 rows: the noise is known well
+    y = rng.standard_normal(len(x)) + 0.3 * x[:, 2]
+    square, along = np.sum(x**2, axis=0), x.T @ y
+    t2 = STRENGTHS[:, None] ** 2
+    log = -0.5 * np.log1p(t2 * square) + 0.5 * t2 * along**2 / (1 + t2 * square)
+    weight = np.exp(log).mean(axis=0) / 5
+    exact = weight / (1 + weight.sum())
+    assert told(x, y) == pytest.approx(exact, abs=0.03)
+    assert np.argmax(exact) == 2
+
+
+def listed(*rows: tuple[int, float]) -> list[Structure]:
+    empty = np.zeros(0)
+    return [
+        Structure(k, SimpleNamespace(complexity=size), 0.1, share, empty, empty, empty)  # type: ignore[arg-type]
+        for k, (size, share) in enumerate(rows)
+    ]
+
+
+def test_the_pareto_list_has_what_no_other_one_beats() -> None:
+    of = listed((3, 0.9), (2, 0.5), (4, 0.9), (2, 0.4), (6, 0.95), (7, 0.2))
+    assert [(x.form.complexity, x.holdout_share) for x in pareto(of)] == [
+        (2, 0.5), (3, 0.9), (6, 0.95)
+    ]  # fmt: skip
+    for x in of:
+        beaten = any(
+            o.form.complexity <= x.form.complexity and o.holdout_share >= x.holdout_share
+            for o in of if o is not x
+        )  # fmt: skip
+        assert beaten == (x not in pareto(of))
+
+
+def test_a_discovery_says_how_likely_its_laws_are() -> None:
+    d = found()
+    (law,) = [x for x in d.structures if x.law]
+    assert law.form.text() == d.laws[0].formula == "dq_3 = a·cos(q_4)·τ_3"
+    assert law.probability == d.laws[0].probability > 0.9
+    assert sum(x.probability for x in d.structures) <= 1.0
+    assert [x.probability for x in d.structures] == sorted(
+        (x.probability for x in d.structures), reverse=True
+    )
+    assert alternatives(d, d.laws[0]) == ()
+    assert law in pareto(d.structures)
+    assert law.holdout_share == pytest.approx(d.laws[0].holdout_share, abs=0.02)
+    (coefficient,) = law.parameters
+    assert coefficient.value == pytest.approx(d.laws[0].parameters[0].value, rel=0.02)
+    # Formal; that of a fit is the largest of it and two jackknives.
+    assert 0.5 * d.laws[0].parameters[0].std < coefficient.std <= d.laws[0].parameters[0].std
+    assert "dq_3 = a·cos(q_4)·τ_3" in repr(d)
+    rows = discovery_json(d)["structures"]
+    assert rows[0]["law"] == "bent"  # type: ignore[index]
+    assert {"formula", "probability", "complexity", "holdout_share"} <= {*rows[0]}  # type: ignore[index]
+
+
+def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
+    d = found()
+    assert d.after is not None
+    readings = d.fit.readings
+    w = whitening(readings, d.fit.mode)
+    before, after = (
+        residual(readings, f.model.predict(readings.states, f.theta), w) for f in (d.fit, d.after)
+    )
+    one = next(x for x in d.structures if x.law)
+    mean, std = averaged(d.fit, [one], readings)
+    size = np.sqrt(np.mean((before - after) ** 2))
+    assert np.sqrt(np.mean((mean - (before - after)) ** 2)) < 0.05 * size
+    other = replace(one, step=-one.step)
+    flat, wide = averaged(d.fit, [replace(one, probability=0.5), replace(other, probability=0.5)],
+                          readings)  # fmt: skip
+    assert np.abs(flat).max() < 1e-12
+    assert wide == pytest.approx(np.hypot(std, mean), rel=1e-9)
+    assert np.all(std > 0)
+    again, _ = d.average(readings)
+    assert np.sqrt(np.mean((again - mean) ** 2)) < 0.1 * size
+
+
+def test_nothing_is_averaged_without_a_law() -> None:
+    with pytest.raises(CannotAnswerError, match="no law was found"):
+        Discovery(campaign(LAW), "no_law").average(campaign(LAW).readings)
