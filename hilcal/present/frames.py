@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 from hilcal.design.checked_plan import CheckedPlan
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.residual_table import residual_table
+from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings
 from hilcal.tables.table import exchange_columns
 from hilcal.tables.write import plan_csv
@@ -22,14 +22,11 @@ def frame_of(value: object) -> "pd.DataFrame":
     """Return a result as a data frame.
 
     Raises:
-        InputError: pandas is not installed.
+        MissingPackageError: pandas is not installed.
     """
-    try:
+    with needed_by("to_frame"):
         import pandas as pd
-    except ImportError as error:
-        raise InputError(
-            "to_frame needs pandas, which is not installed: pip install pandas"
-        ) from error
+
     return pd.DataFrame(_columns(value))
 
 
