@@ -13,7 +13,7 @@ from pathlib import Path
 from setuptools import find_packages, setup
 from setuptools.command.sdist import sdist
 
-CODE = ("hilcal", "hilcal.*", "drivers", "drivers.*")
+CODE = ("hilcal", "hilcal.*")  # hilcal/drivers is a link to drivers/
 CONFIGS = ("hilcal.configs.cells", "hilcal.configs.mappings", "hilcal.configs.robots")
 HOME = tomllib.loads(Path("pyproject.toml").read_text(encoding="utf-8"))["tool"]["hilcal"]["home"]
 DATE = int(os.environ.get("SOURCE_DATE_EPOCH", "315532800"))
@@ -21,6 +21,11 @@ DATE = int(os.environ.get("SOURCE_DATE_EPOCH", "315532800"))
 
 class Sdist(sdist):
     """An archive of sorted names that tells no owner, umask or time of the build."""
+
+    def make_release_tree(self, base_dir: str, files: list[str]) -> None:
+        """Copy the files, and make the link by which drivers/ is hilcal.drivers."""
+        super().make_release_tree(base_dir, files)
+        os.symlink("../drivers", f"{base_dir}/hilcal/drivers")
 
     def make_archive(self, base_name: str, *_: object, base_dir: str, **__: object) -> str:
         """Write base_name.tar.gz of the tree base_dir."""

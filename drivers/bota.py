@@ -7,11 +7,11 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 
 import numpy as np
 
-from drivers.force_sensor import checked_config, open_streaming
-from drivers.force_stream import SensorFormat
-from drivers.frame_losses import ByDeviceClock
-from drivers.frames import FrameFormat, crc_x25
 from hilcal.config import CellConfig
+from hilcal.drivers.force_sensor import checked_config, open_streaming
+from hilcal.drivers.force_stream import SensorFormat
+from hilcal.drivers.frame_losses import ByDeviceClock
+from hilcal.drivers.frames import FrameFormat, crc_x25
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 

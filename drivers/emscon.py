@@ -20,10 +20,10 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from drivers import emscon_packets as es
-from drivers.network import network_failures, own_axes
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
+from hilcal.drivers import emscon_packets as es
+from hilcal.drivers.network import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
 from hilcal.readings.covariance import tracker_covariance, tracker_noise

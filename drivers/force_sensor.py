@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from drivers.force_stream import DEVICE, ForceStream, Port, SensorFormat
-from drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.config import CellConfig
 from hilcal.config.rig import PORT
 from hilcal.config.rig import ForceSensor as Section
+from hilcal.drivers.force_stream import DEVICE, ForceStream, Port, SensorFormat
+from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.errors import InputError
 from hilcal.measuring.devices import Losses, Report, WrenchSample
 

@@ -13,9 +13,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from drivers.frame_losses import LossCounter
-from drivers.frames import Deframer, FrameFormat
-from drivers.serial_line import line_failures
+from hilcal.drivers.frame_losses import LossCounter
+from hilcal.drivers.frames import Deframer, FrameFormat
+from hilcal.drivers.serial_line import line_failures
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import Losses, WrenchSample
 from hilcal.types import Floats, Ints

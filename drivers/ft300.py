@@ -12,13 +12,13 @@ import termios
 import numpy as np
 import serial
 
-from drivers.force_sensor import StreamingSensor, checked_config, serial_port
-from drivers.force_stream import DEVICE, ForceStream, SensorFormat
-from drivers.frame_losses import ByArrival
-from drivers.frames import FrameFormat, crc_modbus
-from drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
-from drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.config import CellConfig
+from hilcal.drivers.force_sensor import StreamingSensor, checked_config, serial_port
+from hilcal.drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from hilcal.drivers.frame_losses import ByArrival
+from hilcal.drivers.frames import FrameFormat, crc_modbus
+from hilcal.drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
+from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats

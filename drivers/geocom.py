@@ -14,10 +14,10 @@ from typing import Any, NoReturn
 import numpy as np
 from pydantic import Field
 
-from drivers import geocom_codes as geo
-from drivers.geocom_line import ANSWER_S, DEVICE, Link, Reply
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
+from hilcal.drivers import geocom_codes as geo
+from hilcal.drivers.geocom_line import ANSWER_S, DEVICE, Link, Reply
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance

@@ -18,8 +18,8 @@ import serial
 from geocompy.communication import SerialConnection
 from geocompy.geo import GeoCom
 
-from drivers.geocom_codes import BUSY, GARBLED, NULL, words
-from drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.drivers.geocom_codes import BUSY, GARBLED, NULL, words
+from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 
 DEVICE = "tracker"

@@ -9,7 +9,7 @@ from typing import TypeVar
 import minimalmodbus
 import serial
 
-from drivers.serial_line import drain
+from hilcal.drivers.serial_line import drain
 from hilcal.errors import DeviceError
 
 T = TypeVar("T")

@@ -17,10 +17,10 @@ import numpy as np
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
-from drivers import natnet_frames as nn
-from drivers.network import network_failures, own_axes
 from hilcal.config import CellConfig
 from hilcal.config.rig import Whole
+from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers.network import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
 from hilcal.toml import Section, check_section

@@ -19,13 +19,13 @@ import time
 import numpy as np
 from pydantic import Field
 
-from drivers.force_sensor import FIRST_FRAME_S, StreamingSensor, checked_config
-from drivers.force_stream import DEVICE, ForceStream, SensorFormat
-from drivers.frame_losses import ByDeviceClock
-from drivers.frames import FrameFormat
-from drivers.network import address, network_failures
 from hilcal.config import CellConfig
 from hilcal.config.rig import Whole
+from hilcal.drivers.force_sensor import FIRST_FRAME_S, StreamingSensor, checked_config
+from hilcal.drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from hilcal.drivers.frame_losses import ByDeviceClock
+from hilcal.drivers.frames import FrameFormat
+from hilcal.drivers.network import address, network_failures
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.toml import Positive, Section, check_section

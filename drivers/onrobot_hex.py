@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.force_sensor import checked_config, open_streaming
-from drivers.force_stream import SensorFormat
-from drivers.frame_losses import ByDeviceClock
-from drivers.frames import FrameFormat
 from hilcal.config import CellConfig
+from hilcal.drivers.force_sensor import checked_config, open_streaming
+from hilcal.drivers.force_stream import SensorFormat
+from hilcal.drivers.frame_losses import ByDeviceClock
+from hilcal.drivers.frames import FrameFormat
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats

@@ -16,20 +16,20 @@ from typing import NoReturn
 
 import numpy as np
 
-from drivers.ur_link import cause, probe, states
-from drivers.ur_link.brakes import Brakes
-from drivers.ur_link.control import Control, take
-from drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.motion import MotionInProgress, deceleration, stands
-from drivers.ur_link.options import UrOptions
-from drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
-from drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
-from drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
-from drivers.ur_link.survey import survey
-from drivers.ur_link.torque_reader import TORQUE, TorqueReader
-from drivers.ur_link.worker import WorkerError
 from hilcal.config import CellConfig
+from hilcal.drivers.ur_link import cause, probe, states
+from hilcal.drivers.ur_link.brakes import Brakes
+from hilcal.drivers.ur_link.control import Control, take
+from hilcal.drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.motion import MotionInProgress, deceleration, stands
+from hilcal.drivers.ur_link.options import UrOptions
+from hilcal.drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
+from hilcal.drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
+from hilcal.drivers.ur_link.survey import survey
+from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
+from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
 from hilcal.measuring.devices import ArmSample, Report
 from hilcal.optional import install

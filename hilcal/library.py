@@ -43,8 +43,8 @@ from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
 if TYPE_CHECKING:  # needs Pinocchio, which a fit does not
-    from drivers.simulated.rehearsal import Rehearsal, SimulationCase
     from hilcal.design.checked_plan import CheckedPlan
+    from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase
 
 
 def read_table(path: str | Path, cell: Cell, mapping: str | Path | None = None) -> Readings:
@@ -384,7 +384,7 @@ def simulate(
         InputError: an effect that cannot be hidden; lists the valid ones.
     """
     with needed_by("a simulated cell"):
-        from drivers.simulated import rehearsal  # the simulated world is of no use but here
+        from hilcal.drivers.simulated import rehearsal  # the simulated world is of no use but here
 
     what = plan if isinstance(plan, Plan) else plan.plan
     if not isinstance(cell, Cell):

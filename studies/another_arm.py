@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.whole_file import replace_file
 from studies.random_campaigns import rehearsal_states
 

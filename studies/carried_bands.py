@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.injected_effects import Draw, nothing_hidden, typical_torque
-from drivers.simulated.rehearsal import measurement_noise
-from drivers.simulated.world import World, stand
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.injected_effects import Draw, nothing_hidden, typical_torque
+from hilcal.drivers.simulated.rehearsal import measurement_noise
+from hilcal.drivers.simulated.world import World, stand
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.carried import carried_prior

@@ -13,20 +13,20 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.simulated.injected_effects import (
-    Draw,
-    joint_compliance,
-    nothing_hidden,
-    typical_torque,
-)
-from drivers.simulated.rehearsal import measurement_noise, simulate
-from drivers.simulated.world import World, stand
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.diagnosis.change import LEVEL, POWER, STATED_DOF, find_changes
 from hilcal.diagnosis.change_candidates import changing
 from hilcal.diagnosis.change_found import Changes
 from hilcal.diagnosis.completed import completed
+from hilcal.drivers.simulated.injected_effects import (
+    Draw,
+    joint_compliance,
+    nothing_hidden,
+    typical_torque,
+)
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.drivers.simulated.world import World, stand
 from hilcal.errors import HilcalError
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.earlier_fit import EarlierFit, earlier_fit

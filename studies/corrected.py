@@ -26,7 +26,6 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from drivers.simulated.rehearsal import as_told
 from hilcal.calibration.improvement import Improvement
 from hilcal.cell import cell_from_config
 from hilcal.cli.calibrating import CalibrationOperator
@@ -34,6 +33,7 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.config.loads import CellLoad
+from hilcal.drivers.simulated.rehearsal import as_told
 from hilcal.effects.catalogue import installed
 from hilcal.engine.engine import open_engine
 from hilcal.errors import DeviceError

@@ -6,14 +6,14 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.simulated.injected_effects import hide, nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
-from drivers.simulated.world import World
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.discovery.agreement import agreement
 from hilcal.discovery.discovery import discover
 from hilcal.discovery.law import Law
+from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.drivers.simulated.world import World
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.mechanics import Equilibrium
-from drivers.simulated.world import World
+from hilcal.drivers.simulated.mechanics import Equilibrium
+from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 

@@ -17,8 +17,6 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.cli.options import Json
@@ -31,6 +29,8 @@ from hilcal.discovery.search import search
 from hilcal.discovery.sites import motions_of
 from hilcal.discovery.structures import averaged, structure_of, structures
 from hilcal.discovery.terms import LawTerm
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.identification.linearisation import Linearisation, linearise

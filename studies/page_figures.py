@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 import plotly.graph_objects as go
 
-from drivers.simulated.rehearsal import NOTHING, case_of_plan, read_plan
 from hilcal.cell import Cell
 from hilcal.config.cell import Repeatability, Tracker
 from hilcal.design.planner import Planned, Request, make
 from hilcal.design.summary import summarise
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.rehearsal import NOTHING, case_of_plan, read_plan
 from hilcal.identification.baseline import baseline
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.identification.fit import fit

@@ -8,15 +8,15 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
-from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.cli.options import Jobs, Json, Scheduler
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.nominal_model import nominal_tracker_place
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.drivers.simulated.world import World
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.present.progress import counting

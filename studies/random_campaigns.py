@@ -5,16 +5,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.simulated.mechanics import build, elasticity, equilibrium
-from drivers.simulated.rehearsal import (
+from hilcal.cell import Cell
+from hilcal.config import CellConfig
+from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium
+from hilcal.drivers.simulated.rehearsal import (
     CampaignStates,
     Rehearsal,
     measurement_noise,
     simulate,
     simulation_case,
 )
-from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats, Ints

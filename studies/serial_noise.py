@@ -4,8 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.rehearsal import simulate
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import predictive

@@ -6,11 +6,16 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
-from drivers.simulated.rehearsal import as_told, measurement_noise, simulate
-from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.injected_effects import (
+    DEFLECTION_EFFECTS,
+    EFFECTS,
+    hide,
+    nothing_hidden,
+)
+from hilcal.drivers.simulated.rehearsal import as_told, measurement_noise, simulate
+from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from drivers.simulated.truth import AIR
+from hilcal.drivers.simulated.truth import AIR
 from hilcal.types import Floats
 
 _RISE = (5.0, 20.0)  # °C that a joint warms up by, in a rehearsal

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.simulated.world import World
+from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats, Ints

@@ -1,8 +1,8 @@
-"""The simulated arm of any make and number of joints, driver `drivers.simulated.arm:open_arm`.
+"""The simulated arm of any make: driver `hilcal.drivers.simulated.arm:open_arm`.
 
-For rehearsals: the controller is `drivers.simulated.arm_server`, which moves the commanded arm of a
-simulated cell in real time. Arms of Universal Robots have a simulated controller of their own,
-which speaks their protocols.
+For rehearsals: the controller is `hilcal.drivers.simulated.arm_server`, which moves
+the commanded arm of a simulated cell, of any number of joints, in real time. Arms of
+Universal Robots have a simulated controller of their own, which speaks their protocols.
 """
 
 import contextlib
@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated import admin
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import ArmSample, Report
 from hilcal.types import Floats

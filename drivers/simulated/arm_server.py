@@ -1,9 +1,10 @@
 """A simulated controller of an arm of any number of joints, also of slides; admin `arm.sock`.
 
-    python -m drivers.simulated.arm_server --directory DIR [--seed N]
+    python -m hilcal.drivers.simulated.arm_server --directory DIR [--seed N]
 
-DIR/world.json says which arm. It speaks no maker's protocol: `drivers.simulated.arm` asks it on its
-admin line, so that any arm can be rehearsed. Operations: `sample`, `move {q, speed, acceleration}`,
+DIR/world.json says which arm. It speaks no maker's protocol: `hilcal.drivers.simulated.arm` asks it
+on its admin line, so that any arm can be rehearsed. Operations:
+`sample`, `move {q, speed, acceleration}`,
 `stop`, `payload {mass, com}`, `state`, `jog {q}` as somebody who moves the arm by hand,
 `protective_stop`, `release`, `die`. A motion stops where nobody asks for half a second.
 """
@@ -15,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur.state import Kinematics, Trajectory, WorldClock, pose
-from drivers.simulated.world_server import read_world
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.ur.state import Kinematics, Trajectory, WorldClock, pose
+from hilcal.drivers.simulated.world_server import read_world
 from hilcal.errors import DeviceError, HilcalError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats

@@ -14,11 +14,11 @@ from typing import Any, Self
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.world import World
-from drivers.simulated.world_server import open_board, write_world
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.world import World
+from hilcal.drivers.simulated.world_server import open_board, write_world
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
@@ -130,7 +130,7 @@ START_TIMEOUT = 20.0
 
 UR_PORTS = (29999, 30001, 30003, 30004)
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
-ARM_DRIVER = "drivers.simulated.arm:open_arm"
+ARM_DRIVER = "hilcal.drivers.simulated.arm:open_arm"
 """Of every other arm, by its place: it is of use in a simulated cell alone."""
 EMSCON_PORT = 7000
 """Of the simulated tracker: the real one, 700, is for the administrator alone."""
@@ -390,7 +390,7 @@ def _devices(
     }[tracker]
 
     def device(name: str, server: str, *arguments: str) -> DeviceProcess:
-        return DeviceProcess(name, f"drivers.simulated.{server}", directory, arguments)
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, arguments)
 
     out = {
         "world": device("world", "world_server", "--seed", str(seed)),
@@ -438,7 +438,7 @@ def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> Cell
 
     What it gives stays, but for the driver of an arm whose own protocol is not simulated.
     """
-    from drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
+    from hilcal.drivers.simulated.ur_server import API, POLYSCOPE_X  # loads asyncio
 
     options: dict[str, Any] = {**config.robot.options}
     if int(config.simulation.controller_version.partition(".")[0]) >= POLYSCOPE_X:

@@ -1,6 +1,6 @@
 """A simulated laser tracker that speaks emScon on TCP; admin `tracker.sock`.
 
-    python -m drivers.simulated.emscon_server --directory DIR --host 127.A.B.C [--port 7000]
+    python -m hilcal.drivers.simulated.emscon_server --directory DIR --host 127.A.B.C [--port 7000]
         --range-std A B --transverse-std C E --orientation-std S --seed N
 
 One client at a time, as an AT40x. Admin operations: `beam {on}` blocks it, `hide {targets}`,
@@ -9,7 +9,7 @@ another one at the controller, `fail {command, status, count}`, `change {number}
 state, `transform {on}` sets an object's coordinate system, `drop` closes the connection,
 `mute {on}`, `rubbish {data}` sends what is no packet, `log`, `state`.
 
-Source: as `drivers.emscon_packets`. CESAPI, a client of others, is tested against it.
+Source: as `hilcal.drivers.emscon_packets`. CESAPI, a client of others, is tested against it.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers import emscon_packets as es
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard, settled_truth
-from drivers.simulated.geocom_station import Beam, PolarPoint, Station
-from drivers.simulated.world import SimulatedNoise
+from hilcal.drivers import emscon_packets as es
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
+from hilcal.drivers.simulated.geocom_station import Beam, PolarPoint, Station
+from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.types import Floats
 
 NAME, SERIAL = "SIM AT401", 391234

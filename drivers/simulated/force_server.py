@@ -1,6 +1,6 @@
 """A simulated force sensor on a pseudo-terminal: `DIR/force`, admin `force.sock`.
 
-    python -m drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
+    python -m hilcal.drivers.simulated.force_server --directory DIR --kind ft300|bota|hex --seed N
         [--rate HZ] [--on S]
 
 Admin operations besides those of the line (`PtyPort.faults`): `overload {force}` adds a wrench
@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.pty_port import PtyPort, crc16
 from hilcal.types import Floats
 
 TICK_S = 0.004

@@ -1,6 +1,6 @@
 """A simulated GeoCOM laser station on a pseudo-terminal: `DIR/tracker`, admin `tracker.sock`.
 
-    python -m drivers.simulated.geocom_server --directory DIR --range-std A B
+    python -m hilcal.drivers.simulated.geocom_server --directory DIR --range-std A B
         --transverse-std C E --seed N [--baud 115200]
 
 Admin operations besides those of the line (`PtyPort.faults`): `beam {on}` blocks it, `hide
@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.geocom_station import AIM_S, Beam, Station
-from drivers.simulated.pty_port import PtyPort, crc16
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.geocom_station import AIM_S, Beam, Station
+from hilcal.drivers.simulated.pty_port import PtyPort, crc16
 
 OK = 0
 CANNOT_DECODE = 3080  # COM_CANT_DECODE_REQ

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard, settled_truth
+from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
 
 

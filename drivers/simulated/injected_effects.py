@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.mechanics import rotation_vector
-from drivers.simulated.own_law import OwnLaw
-from drivers.simulated.truth import Truth, joint_temperature, long_links
-from drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.mechanics import rotation_vector
+from hilcal.drivers.simulated.own_law import OwnLaw
+from hilcal.drivers.simulated.truth import Truth, joint_temperature, long_links
+from hilcal.drivers.simulated.world import IdealReading, SimulatedNoise, World, stand
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.arm import Arm

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from drivers.simulated.truth import Misreading, long_links
+from hilcal.drivers.simulated.truth import Misreading, long_links
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats, Ints

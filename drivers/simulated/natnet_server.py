@@ -1,6 +1,6 @@
 """Simulated OptiTrack cameras: NatNet on UDP; admin `tracker.sock`.
 
-    python -m drivers.simulated.natnet_server --directory DIR --host 127.A.B.C [--port 1510]
+    python -m hilcal.drivers.simulated.natnet_server --directory DIR --host 127.A.B.C [--port 1510]
         [--version 4.1] [--multicast GROUP] [--frame-std M] [--distortion M] --seed N
 
 Its errors are those of a camera system: a frame scatters by `--frame-std`, and waves of the
@@ -11,7 +11,7 @@ Admin operations: `beam {on}` hides the rigid body, `stall {on}` sends no frames
 same one again and again, `lose {share}` of the frames, `forget` all clients, `rename {name}`,
 `bodies {count}` others beside it, `insist {on}` on its version when a client connects, `state`.
 
-Source: as `drivers.natnet_frames`. natnet, a client of others, is tested against it.
+Source: as `hilcal.drivers.natnet_frames`. natnet, a client of others, is tested against it.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers.natnet_frames import (
+from hilcal.drivers.natnet_frames import (
     CONNECT,
     DATA_PORT,
     DESCRIPTIONS,
@@ -41,8 +41,8 @@ from drivers.natnet_frames import (
     message,
     opened,
 )
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard, settled_truth
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
 
 NAME, BODY = "SIM Motive", 7

@@ -1,6 +1,6 @@
 """A simulated ATI Net F/T: RDT on UDP, its page on HTTP; admin `force.sock`.
 
-    python -m drivers.simulated.netft_server --directory DIR --host 127.A.B.C [--port 49152]
+    python -m hilcal.drivers.simulated.netft_server --directory DIR --host 127.A.B.C [--port 49152]
         [--web-port 8081] --seed N [--rate HZ] [--on S]
 
 Admin operations: `overload {force}` adds a wrench (6 numbers, N and N·m), `freeze {on}` repeats one
@@ -9,7 +9,7 @@ counts anew and waits for a request, `lose {share}` of the datagrams, `twice {sh
 again later, `cut {share}` of them short, `status {word}` sends this status, `page {words}` other
 elements of its page, `state`.
 
-Source: as `drivers.netft`. pynetft, a client of others, is tested against it.
+Source: as `hilcal.drivers.netft`. pynetft, a client of others, is tested against it.
 """
 
 import contextlib
@@ -25,9 +25,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.force_server import LATE_S, TICK_S, StrainGauge
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.force_server import LATE_S, TICK_S, StrainGauge
 
 COUNTS = np.repeat((1_000_000.0, 1_000_000.0), 3)
 NOISE = (0.02, 0.0005)

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from drivers.simulated import admin
-from drivers.terminal_operator import TerminalOperator
 from hilcal.config import CellConfig, CellLoad
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report
 

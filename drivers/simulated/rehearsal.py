@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.injected_effects import (
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.injected_effects import (
     ALL_EFFECTS,
     DEFLECTION_EFFECTS,
     OF_SLIDES,
@@ -17,11 +19,9 @@ from drivers.simulated.injected_effects import (
     nothing_hidden,
     softened,
 )
-from drivers.simulated.own_law import own_law, own_names
-from drivers.simulated.truth import warm_up
-from drivers.simulated.world import SimulatedNoise, World
-from hilcal.cell import Cell, cell_from_config
-from hilcal.config import CellConfig
+from hilcal.drivers.simulated.own_law import own_law, own_names
+from hilcal.drivers.simulated.truth import warm_up
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError
 from hilcal.measuring.route import approach_sides, home, route

@@ -1,6 +1,6 @@
 """A simulated Universal Robots controller on an address of its own; admin `arm.sock`.
 
-    python -m drivers.simulated.ur_server --directory DIR --host 127.A.B.C --robot ur10e
+    python -m hilcal.drivers.simulated.ur_server --directory DIR --host 127.A.B.C --robot ur10e
         [--version 5.11.6.1010327] [--api-port 8080] [--calibration FILE] [--seed N]
 
 Ports as on a real one: RTDE 30004, primary 30001, dashboard 29999 and script 30003; PolyScope X
@@ -28,14 +28,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur.controller import Controller, DashboardServer
-from drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
-from drivers.simulated.ur.programs import ScriptStream
-from drivers.simulated.ur.robot_api import RobotApiServer
-from drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
-from drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.ur.controller import Controller, DashboardServer
+from hilcal.drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
+from hilcal.drivers.simulated.ur.programs import ScriptStream
+from hilcal.drivers.simulated.ur.robot_api import RobotApiServer
+from hilcal.drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
+from hilcal.drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm

@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.simulated.mechanics import (
+from hilcal.cell import Cell
+from hilcal.drivers.simulated.mechanics import (
     Elasticity,
     ElasticTree,
     Equilibrium,
@@ -17,8 +18,8 @@ from drivers.simulated.mechanics import (
     rotation_vector,
     turned,
 )
-from drivers.simulated.own_law import OwnLaw
-from drivers.simulated.truth import (
+from hilcal.drivers.simulated.own_law import OwnLaw
+from hilcal.drivers.simulated.truth import (
     Misreading,
     Truth,
     crossing_torque,
@@ -27,7 +28,6 @@ from drivers.simulated.truth import (
     guide_motion,
     link_growth,
 )
-from hilcal.cell import Cell
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints

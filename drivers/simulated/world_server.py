@@ -1,6 +1,6 @@
 """The process of the physical world: reads what the arm does, writes what is true.
 
-`python -m drivers.simulated.world_server --directory DIR --seed N`, with DIR/world.json of
+`python -m hilcal.drivers.simulated.world_server --directory DIR --seed N`, with DIR/world.json of
 `write_world`. Requests at DIR/world.sock:
 
     hang {name}       hang a load, null: take it off; returns the name of what truly hangs
@@ -24,14 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.own_law import OwnLaw
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import SimulatedNoise, World
-from drivers.simulated.world_state import WorldState
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.own_law import OwnLaw
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import SimulatedNoise, World
+from hilcal.drivers.simulated.world_state import WorldState
 from hilcal.errors import HilcalError, InputError
 from hilcal.types import Floats
 from hilcal.whole_file import replace_file

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.blackboard import MOST_TARGETS, Blackboard
-from drivers.simulated.mechanics import turned
-from drivers.simulated.truth import AIR, warm_up
-from drivers.simulated.world import World
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.blackboard import MOST_TARGETS, Blackboard
+from hilcal.drivers.simulated.mechanics import turned
+from hilcal.drivers.simulated.truth import AIR, warm_up
+from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.toml import suggest

@@ -4,14 +4,14 @@ import contextlib
 import time
 from dataclasses import dataclass, replace
 
-from drivers.ur_link import script_port, states
-from drivers.ur_link.control import Control
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.motion import stands
-from drivers.ur_link.reading import Reading
-from drivers.ur_link.receiver import STALE_S, Receiver
-from drivers.ur_link.supervision import Generation
-from drivers.ur_link.worker import WorkerError
+from hilcal.drivers.ur_link import script_port, states
+from hilcal.drivers.ur_link.control import Control
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.motion import stands
+from hilcal.drivers.ur_link.reading import Reading
+from hilcal.drivers.ur_link.receiver import STALE_S, Receiver
+from hilcal.drivers.ur_link.supervision import Generation
+from hilcal.drivers.ur_link.worker import WorkerError
 
 ASK_S = 0.25
 """Deadline of each way to stop, real s."""

@@ -2,14 +2,14 @@
 
 import contextlib
 
-from drivers.ur_link import states
-from drivers.ur_link.brakes import ASK_S, Halt
-from drivers.ur_link.control_worker import WATCHDOG_HZ
-from drivers.ur_link.failure import CHECK_LINK, RESUME
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.reading import Reading
-from drivers.ur_link.supervision import Supervision
-from drivers.ur_link.worker import WorkerError
+from hilcal.drivers.ur_link import states
+from hilcal.drivers.ur_link.brakes import ASK_S, Halt
+from hilcal.drivers.ur_link.control_worker import WATCHDOG_HZ
+from hilcal.drivers.ur_link.failure import CHECK_LINK, RESUME
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.reading import Reading
+from hilcal.drivers.ur_link.supervision import Supervision
+from hilcal.drivers.ur_link.worker import WorkerError
 
 UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
 

@@ -4,12 +4,12 @@ import contextlib
 import time
 from dataclasses import dataclass
 
-from drivers.ur_link import probe, states
-from drivers.ur_link.failure import CHECK_LINK, failure
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.receiver import Receiver
-from drivers.ur_link.supervision import PRIMARY_PORT, Generation
-from drivers.ur_link.worker import Worker, WorkerError
+from hilcal.drivers.ur_link import probe, states
+from hilcal.drivers.ur_link.failure import CHECK_LINK, failure
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats
 
 LEASE_S = 0.5
@@ -127,7 +127,7 @@ def _start(host: str, generation: Generation, end: float) -> Worker:
     """Start the worker; the registers may be ours for a moment longer, from being asked for."""
     relayed = str(int(generation.script_port == PRIMARY_PORT))
     arguments = (host, repr(_HZ), repr(LEASE_S), relayed, str(int(generation.upper)))
-    module = "drivers.ur_link.control_worker"
+    module = "hilcal.drivers.ur_link.control_worker"
     try:
         return Worker(module, arguments, end - time.monotonic())
     except WorkerError as error:

@@ -11,8 +11,8 @@ import os
 import time
 from typing import Any
 
-from drivers.ur_link import relay
-from drivers.ur_link.child import Line, outliving, start, words
+from hilcal.drivers.ur_link import relay
+from hilcal.drivers.ur_link.child import Line, outliving, start, words
 
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0

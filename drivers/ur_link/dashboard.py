@@ -6,7 +6,7 @@ e-Series", port 29999. PolyScope X has a Robot API in its place.
 
 from dataclasses import dataclass
 
-from drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.lines import Connection, LinkError
 
 PORT = 29999
 NOT_UNDERSTOOD = "could not understand"

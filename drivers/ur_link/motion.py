@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 
-from drivers.ur_link.reading import Reading
+from hilcal.drivers.ur_link.reading import Reading
 from hilcal.types import Floats
 
 STANDS_RAD_S = 0.01

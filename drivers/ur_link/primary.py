@@ -11,7 +11,7 @@ import struct
 
 import numpy as np
 
-from drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.lines import Connection, LinkError
 from hilcal.errors import InputError
 from hilcal.robot.factory import FactoryKinematics, of_rows
 

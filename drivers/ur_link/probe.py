@@ -9,7 +9,7 @@ found out here first, with a deadline. Frames: big-endian size (u16, header incl
 import struct
 from dataclasses import dataclass
 
-from drivers.ur_link.lines import Connection, LinkError
+from hilcal.drivers.ur_link.lines import Connection, LinkError
 
 PORT = 30004
 NOT_FOUND = "NOT_FOUND"

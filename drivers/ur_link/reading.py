@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.ur_link import states
-from drivers.ur_link.receive_worker import GETTERS
+from hilcal.drivers.ur_link import states
+from hilcal.drivers.ur_link.receive_worker import GETTERS
 from hilcal.measuring.devices import ArmSample
 from hilcal.types import Floats
 

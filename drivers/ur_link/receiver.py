@@ -2,10 +2,10 @@
 
 import time
 
-from drivers.ur_link import probe
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.reading import Reading, ReadingError, read
-from drivers.ur_link.worker import Worker, WorkerError
+from hilcal.drivers.ur_link import probe
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.reading import Reading, ReadingError, read
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
 
 STALE_S = 0.2
 """In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
@@ -80,6 +80,6 @@ class Receiver:
 
     def _start(self, seconds: float) -> Worker:
         try:
-            return Worker("drivers.ur_link.receive_worker", self._arguments, seconds)
+            return Worker("hilcal.drivers.ur_link.receive_worker", self._arguments, seconds)
         except WorkerError as error:
             raise LinkError(f"no data over RTDE: {error}") from None

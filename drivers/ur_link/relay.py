@@ -1,6 +1,6 @@
 """Process between ur_rtde and a controller of PolyScope X: programs go by the primary port.
 
-    python -m drivers.ur_link.relay HOST
+    python -m hilcal.drivers.ur_link.relay HOST
 
 ur_rtde sends its program to port 30003 alone, which PolyScope X does not open; its primary port,
 30001, takes the same programs, and sends the robot's state to everyone who connects, which ur_rtde
@@ -19,7 +19,7 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.lines import LinkError
 
 _RTDE, _REALTIME, _PRIMARY = 30004, 30003, 30001
 _TRIES = 50
@@ -37,7 +37,7 @@ def start(host: str) -> tuple[subprocess.Popen[str], str]:
         LinkError: it did not get ready.
     """
     process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
-        [sys.executable, "-P", "-m", "drivers.ur_link.relay", host],
+        [sys.executable, "-P", "-m", "hilcal.drivers.ur_link.relay", host],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlsplit
 
-from drivers.ur_link.dashboard import RobotFacts
-from drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.dashboard import RobotFacts
+from hilcal.drivers.ur_link.lines import LinkError
 
 BASE = "/universal-robots/robot-api"
 _LONGEST = 1 << 20

@@ -7,7 +7,7 @@ PolyScope X opens.
 
 import time
 
-from drivers.ur_link.lines import Connection
+from hilcal.drivers.ur_link.lines import Connection
 
 PORT = 30003
 _TAKEN_S = 0.05

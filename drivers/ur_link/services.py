@@ -1,10 +1,10 @@
 """What the driver needs of a UR controller, by TCP port."""
 
-from drivers.ur_link import dashboard, probe, script_port
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.options import UrOptions
-from drivers.ur_link.supervision import POLYSCOPE_X, PRIMARY_PORT
 from hilcal.config import CellConfig
+from hilcal.drivers.ur_link import dashboard, probe, script_port
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.options import UrOptions
+from hilcal.drivers.ur_link.supervision import POLYSCOPE_X, PRIMARY_PORT
 from hilcal.toml import check_section
 
 RTDE = {probe.PORT: "real-time interface (RTDE)"}

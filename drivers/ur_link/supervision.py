@@ -7,9 +7,9 @@ the same. They differ, too, in where programs go and in the registers that a cli
 from dataclasses import dataclass
 from typing import Protocol
 
-from drivers.ur_link.dashboard import Dashboard, RobotFacts
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.robot_api import RobotApi
+from hilcal.drivers.ur_link.dashboard import Dashboard, RobotFacts
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.robot_api import RobotApi
 
 POLYSCOPE_X = 10
 """Major version of the first controllers with a Robot API in place of the dashboard server."""

@@ -4,13 +4,13 @@ import math
 import re
 from collections.abc import Callable
 
-from drivers.ur_link import primary, states
-from drivers.ur_link.dashboard import RobotFacts
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.probe import ControllerFacts
-from drivers.ur_link.reading import Reading
-from drivers.ur_link.receiver import Receiver
-from drivers.ur_link.supervision import Supervision
+from hilcal.drivers.ur_link import primary, states
+from hilcal.drivers.ur_link.dashboard import RobotFacts
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.probe import ControllerFacts
+from hilcal.drivers.ur_link.reading import Reading
+from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.measuring.devices import Report
 
 _RATE_S = (0.4, 2.0)

@@ -11,10 +11,10 @@ import struct
 
 import numpy as np
 
-from drivers.ur_link import probe
-from drivers.ur_link.child import start, words
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.worker import Worker, WorkerError
+from hilcal.drivers.ur_link import probe
+from hilcal.drivers.ur_link.child import start, words
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats
 
 TORQUE = "actual_current_as_torque"
@@ -44,7 +44,9 @@ class TorqueReader:
         """Connect again where the link is lost."""
         if self._worker is None:
             with contextlib.suppress(WorkerError):
-                self._worker = Worker("drivers.ur_link.torque_reader", self._arguments, _CONNECT_S)
+                self._worker = Worker(
+                    "hilcal.drivers.ur_link.torque_reader", self._arguments, _CONNECT_S
+                )
 
     def mean(self) -> Floats | None:
         """(6,) mean torque of each drive since the last call, N·m; of the last second at most.

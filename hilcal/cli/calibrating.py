@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fits import PriorOptions
 from hilcal.cli.options import (
@@ -28,6 +27,7 @@ from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.nominal_model import check_effects
+from hilcal.drivers.simulated.rehearsal import NOTHING, as_told
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import (
     CannotAnswerError,

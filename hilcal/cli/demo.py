@@ -10,17 +10,6 @@ from typing import Annotated
 
 import numpy as np
 
-from drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
-from drivers.simulated.rehearsal import (
-    INVENTED,
-    NOTHING,
-    RANDOM,
-    Rehearsal,
-    case_of_plan,
-    check_choice,
-    invented_law,
-    read_plan,
-)
 from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
@@ -51,6 +40,17 @@ from hilcal.discovery.agreement import agreement
 from hilcal.discovery.document import laws_json
 from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.search import SAME
+from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
+from hilcal.drivers.simulated.rehearsal import (
+    INVENTED,
+    NOTHING,
+    RANDOM,
+    Rehearsal,
+    case_of_plan,
+    check_choice,
+    invented_law,
+    read_plan,
+)
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline

@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Annotated
 
 import hilcal
-from drivers.ur_link.services import services
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, argument, option
 from hilcal.cli.terminal import terminal
@@ -13,6 +12,7 @@ from hilcal.config import CellConfig, load_config
 from hilcal.doctor.computer import computer, program
 from hilcal.doctor.finding import Finding
 from hilcal.doctor.ports import adapters, reachable, serial_ports
+from hilcal.drivers.ur_link.services import services
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.present.preparing import doctor_report, doctor_summary
 from hilcal.present.progress import working

@@ -9,11 +9,6 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from drivers.emscon import EmsconOptions as EmsconOptions
-from drivers.geocom import GeoComOptions as GeoComOptions
-from drivers.natnet import NatNetOptions as NatNetOptions
-from drivers.netft import NetFtOptions as NetFtOptions
-from drivers.ur_link.options import UrOptions
 from hilcal.cli.options import (
     EffectsFrom,
     Json,
@@ -27,6 +22,11 @@ from hilcal.cli.options import (
 )
 from hilcal.cli.terminal import terminal
 from hilcal.config import reference
+from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
+from hilcal.drivers.geocom import GeoComOptions as GeoComOptions
+from hilcal.drivers.natnet import NatNetOptions as NatNetOptions
+from hilcal.drivers.netft import NetFtOptions as NetFtOptions
+from hilcal.drivers.ur_link.options import UrOptions
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME

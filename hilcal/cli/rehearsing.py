@@ -12,16 +12,6 @@ from typing import Annotated
 
 import numpy as np
 
-from drivers.simulated.rehearsal import (
-    NOTHING,
-    RANDOM,
-    Rehearsal,
-    SimulationCase,
-    as_told,
-    case_of_plan,
-    read_plan,
-    simulated_cell,
-)
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import (
     POSES,
@@ -38,6 +28,16 @@ from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.config import CellConfig
 from hilcal.config.write import to_toml
 from hilcal.design.checked_plan import refuse
+from hilcal.drivers.simulated.rehearsal import (
+    NOTHING,
+    RANDOM,
+    Rehearsal,
+    SimulationCase,
+    as_told,
+    case_of_plan,
+    read_plan,
+    simulated_cell,
+)
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identification.full_covariance import full_readings

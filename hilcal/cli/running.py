@@ -88,7 +88,7 @@ def run(
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
     if rehearse:
-        from drivers.simulated.rehearsal import NOTHING, as_told
+        from hilcal.drivers.simulated.rehearsal import NOTHING, as_told
 
         # Refuses what cannot be hidden before anything is planned.
         as_told(config, config.simulation.hide or NOTHING, catalogue)
@@ -115,7 +115,7 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
-                from drivers.simulated.rehearsal import case_of_plan, simulated_cell
+                from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 
                 choice = config.simulation.hide or NOTHING
                 seed = config.simulation.seed

@@ -4,9 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.simulated.injected_effects import Draw, joint_compliance, typical_torque
-from drivers.simulated.world import stand
 from hilcal.calibration.handover import urdf
+from hilcal.drivers.simulated.injected_effects import Draw, joint_compliance, typical_torque
+from hilcal.drivers.simulated.world import stand
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats

@@ -1,12 +1,12 @@
-"""Track elastic: effects hidden in the world of `drivers.simulated` (Pinocchio, nonlinear)."""
+"""Track elastic: effects hidden in the world of `hilcal.drivers.simulated` (Pinocchio statics)."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.simulated.injected_effects import hide, nothing_hidden, softened
-from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden, softened
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from studies.benchmark.campaign import (
     SIGMA,
     TARGET_SCATTER,

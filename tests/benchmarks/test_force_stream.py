@@ -20,7 +20,7 @@ SECONDS = 60.0
 CORE_SHARE = 0.10
 READ = """
 import json, os, sys, time
-from drivers.bota import open_force_sensor
+from hilcal.drivers.bota import open_force_sensor
 from hilcal.config import CellConfig
 
 config = CellConfig.model_validate_json(sys.argv[1])

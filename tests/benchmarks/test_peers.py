@@ -19,13 +19,13 @@ import numpy as np
 import pytest
 import scipy.optimize as so
 
-from drivers.simulated.injected_effects import Draw
 from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell
 from hilcal.design.approximate_design import relax
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.criteria import D
 from hilcal.design.optimum import best
+from hilcal.drivers.simulated.injected_effects import Draw
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.gauss_newton import solve, whitened_jacobian

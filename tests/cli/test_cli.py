@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import simulate
 from hilcal import __version__
+from hilcal.drivers.simulated.rehearsal import simulate
 from hilcal.effects.catalogue import installed
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import read_table

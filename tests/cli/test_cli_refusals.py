@@ -305,7 +305,7 @@ def test_a_ur_arm_without_ur_rtde(
     cell = tmp_path / "cell.toml"
     cell.write_text(text + '[operator]\ndriver = "terminal"\n', encoding="utf-8")
     monkeypatch.setitem(sys.modules, "rtde_control", None)
-    monkeypatch.setattr("drivers.ur.NO_WHEEL", no_wheel)
+    monkeypatch.setattr("hilcal.drivers.ur.NO_WHEEL", no_wheel)
     line = refused(capsys, 2, "check", cell)
     assert line == f"error: arm: driver ur needs ur-rtde, which {said}".format(sys.version_info[1])
 

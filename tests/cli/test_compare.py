@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.world import World, stand
 from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.world import World, stand
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import (
+from hilcal.cli.rehearsing import RehearsalSettings, first_plan
+from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.rehearsal import (
     INVENTED,
     check_choice,
     choices,
     invented_law,
     own_choices,
 )
-from hilcal.cli.rehearsing import RehearsalSettings, first_plan
-from hilcal.config import CellConfig, load_config
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.present.progress import Say

@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.config.write import to_toml
@@ -21,6 +19,8 @@ from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure
 from hilcal.discovery.variables import variables
 from hilcal.discovery.write_effect import source_of_form
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects

@@ -18,10 +18,15 @@ import pytest
 from scipy.stats import chi2
 
 import hilcal as hc
-from drivers.simulated.mechanics import displacement
-from drivers.simulated.rehearsal import SimulationCase, case_of_plan, measurement_noise, read_plan
 from hilcal.calibration.urscript import waypoints
 from hilcal.config import load_config
+from hilcal.drivers.simulated.mechanics import displacement
+from hilcal.drivers.simulated.rehearsal import (
+    SimulationCase,
+    case_of_plan,
+    measurement_noise,
+    read_plan,
+)
 from hilcal.readings.readings import States
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.se3 import inverse, of_six, rotation

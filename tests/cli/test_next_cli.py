@@ -5,8 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from drivers.simulated.injected_effects import HARD_TO_SEPARATE
-from drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.cli import demo
 from hilcal.cli.rehearsing import RehearsalSettings
 from hilcal.config import load_config
@@ -14,6 +12,8 @@ from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import judge
+from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE
+from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

@@ -13,12 +13,12 @@ import numpy as np
 import openpyxl
 import pytest
 
-from drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.cli import planning
 from hilcal.cli.commands import COMMANDS
 from hilcal.config import CellConfig, load_config
 from hilcal.design.planner import Request, make
+from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.measuring.connect import ConnectionResult
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.ur_link import dashboard, lines, primary, probe, reading
-from drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link import dashboard, lines, primary, probe, reading
+from hilcal.drivers.ur_link.lines import LinkError
 from tests.fuzz.damage import bytes_damaged
 from tests.fuzz.harness import Accepted, Parser
 from tests.fuzz.stand_ins import Socket, finite, instead

@@ -7,13 +7,13 @@ from random import Random
 
 import numpy as np
 
-from drivers import emscon, netft
-from drivers import emscon_packets as es
-from drivers import natnet_frames as nn
-from drivers.emscon import EmsconConnection, EmsconTracker
-from drivers.natnet import NatNetTracker
-from drivers.simulated.natnet_server import BODY, Cameras
 from hilcal.config.cell import Tracker
+from hilcal.drivers import emscon, netft
+from hilcal.drivers import emscon_packets as es
+from hilcal.drivers import natnet_frames as nn
+from hilcal.drivers.emscon import EmsconConnection, EmsconTracker
+from hilcal.drivers.natnet import NatNetTracker
+from hilcal.drivers.simulated.natnet_server import BODY, Cameras
 from tests.fuzz.damage import bytes_damaged
 from tests.fuzz.harness import Accepted, Parser
 from tests.fuzz.stand_ins import Socket

@@ -17,11 +17,11 @@ import numpy as np
 from geocompy import geo
 from geocompy.geo import GeoCom
 
-from drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
-from drivers.force_stream import RING, ForceStream, SensorFormat
-from drivers.geocom import GeoComOptions, GeoComTracker
-from drivers.geocom_line import Link
 from hilcal.config.cell import Tracker
+from hilcal.drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
+from hilcal.drivers.force_stream import RING, ForceStream, SensorFormat
+from hilcal.drivers.geocom import GeoComOptions, GeoComTracker
+from hilcal.drivers.geocom_line import Link
 from hilcal.measuring.devices import Clock
 from tests.fuzz import controller, network
 from tests.fuzz.damage import NUMBERS, bytes_damaged

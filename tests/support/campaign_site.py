@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.rehearsal import case_of_plan, simulated_cell
-from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
 from hilcal.config.write import to_toml
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
+from hilcal.drivers.simulated.world import World
 from hilcal.measuring.dry_run import dry_run
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan

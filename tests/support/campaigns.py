@@ -5,11 +5,11 @@ from functools import cache
 
 import numpy as np
 
-from drivers.simulated.injected_effects import hide, nothing_hidden
-from drivers.simulated.rehearsal import simulate
-from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.rehearsal import simulate
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3

@@ -10,9 +10,9 @@ from typing import Any
 
 import pytest
 
-from drivers.simulated.rehearsal import Rehearsal
 from hilcal.cli import main
 from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.rehearsal import Rehearsal
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
 from hilcal.tables.table import write_table

@@ -9,8 +9,8 @@ from contextlib import ExitStack, contextmanager, suppress
 import numpy as np
 import pytest
 
-from drivers import bota, ft300, onrobot_hex
 from hilcal.config import CellConfig
+from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.errors import DeviceError
 from tests.support.sim_serial_cases import force_sensor
 

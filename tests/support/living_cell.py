@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import World
-from drivers.simulated.world_state import WorldState
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import World
+from hilcal.drivers.simulated.world_state import WorldState
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 from tests.support.arm_cases import arm_of

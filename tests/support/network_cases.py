@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, free_host
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import EMSCON_PORT, WEB_PORT, free_host
 from tests.support.sim_serial_cases import TRACKER_NOISE, Instrument, start
 
 TARGET = (0.5, 2.8, 0.4)

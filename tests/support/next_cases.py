@@ -5,7 +5,6 @@ from functools import cache
 
 import numpy as np
 
-from drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.design.next import Next, measure_next
@@ -13,6 +12,7 @@ from hilcal.design.planner import Request, make
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_of_plan, read_plan
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings, States

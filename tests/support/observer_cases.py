@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.injected_effects import hide
-from drivers.simulated.world import World
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.config.observers import Gauge, Point
+from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.world import World
 from hilcal.readings.covariance import WHOLE  # noqa: F401 - for the tests
 from hilcal.readings.readings import ObserverName, Readings
 from hilcal.robot import se3

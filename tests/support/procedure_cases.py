@@ -3,9 +3,9 @@
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from drivers.simulated.rehearsal import SimulationCase, case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.procedure.procedure import Procedure
 from hilcal.procedure.state import ProcedureStep, Settings

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.simulated.injected_effects import hide
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints
 from tests.support.campaigns import NOTHING, Campaign, Plan, cell_of, measured, plan, world_of

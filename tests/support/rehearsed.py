@@ -4,11 +4,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise, simulate
-from drivers.simulated.world import World
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import load_config
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
+from hilcal.drivers.simulated.world import World
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from hilcal.types import Ints

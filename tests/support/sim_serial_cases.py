@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated.admin import ask
-from drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.admin import ask
+from hilcal.drivers.simulated.blackboard import Blackboard
 
 START_S = 30.0
 TRACKER_NOISE = (
@@ -60,11 +60,18 @@ class Instrument:
 
 
 def start(module: str, name: str, directory: Path, scale: float, *options: str) -> Instrument:
-    """Start `python -m drivers.simulated.<module>` and wait until it is ready."""
+    """Start `python -m hilcal.drivers.simulated.<module>` and wait until it is ready."""
     world = directory / "world.bin"
     board = Blackboard.attach(world) if world.exists() else Blackboard.create(world, scale)
     process = subprocess.Popen(
-        [sys.executable, "-m", f"drivers.simulated.{module}", "--directory", directory, *options],
+        [
+            sys.executable,
+            "-m",
+            f"hilcal.drivers.simulated.{module}",
+            "--directory",
+            directory,
+            *options,
+        ],
         stdin=subprocess.PIPE,
     )
     instrument = Instrument(directory / name, directory / f"{name}.sock", board, process)

@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from drivers.simulated import admin
-from drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.blackboard import Blackboard
 
 ROOT = Path(__file__).resolve().parents[2]
 PORTS = (29999, 30001, 30003, 30004)
@@ -74,7 +74,7 @@ class SimulatedUr:
 
 def command(directory: Path, host: str, *arguments: str) -> list[str]:
     return [
-        *(sys.executable, "-m", "drivers.simulated.ur_server"),
+        *(sys.executable, "-m", "hilcal.drivers.simulated.ur_server"),
         *("--directory", str(directory), "--host", host, "--robot", "ur10e", *arguments),
     ]
 

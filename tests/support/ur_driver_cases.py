@@ -9,13 +9,13 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers.simulated.ur_server import API
-from drivers.ur import UrArm, open_arm
-from drivers.ur_link import dashboard
-from drivers.ur_link.dashboard import Dashboard
-from drivers.ur_link.robot_api import RobotApi
-from drivers.ur_link.supervision import Supervision
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.ur_server import API
+from hilcal.drivers.ur import UrArm, open_arm
+from hilcal.drivers.ur_link import dashboard
+from hilcal.drivers.ur_link.dashboard import Dashboard
+from hilcal.drivers.ur_link.robot_api import RobotApi
+from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 

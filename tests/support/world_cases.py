@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.truth import Truth
 from tests.support.example_cell import ur10e_arm
 
 

@@ -65,6 +65,7 @@ from setuptools.build_meta import build_sdist, build_wheel
 os.umask(0o022)
 print(build_sdist("dist") if sys.argv[1] == "sdist" else build_wheel("dist"))
 """
+NAME = f"hilcal-{hilcal.__version__}"
 NOT_TRACKED = shutil.ignore_patterns(
     *(".git", ".venv", ".*_cache", "__pycache__", "*.egg-info", "dist", "build", "site", ".lock"),
     *(".hypothesis", ".benchmarks", "out", ".benchmark-envs"),
@@ -92,7 +93,9 @@ def _sha256(path: Path) -> str:
 def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path: Path) -> None:
     sources = [tmp_path / "one", tmp_path / "elsewhere" / "other"]
     for source, mode in zip(sources, (0o644, 0o664), strict=True):
-        shutil.copytree(ROOT, source, ignore=NOT_TRACKED, copy_function=shutil.copyfile)
+        shutil.copytree(
+            ROOT, source, symlinks=True, ignore=NOT_TRACKED, copy_function=shutil.copyfile
+        )
         for path in source.rglob("*.*"):
             if path.is_file():
                 path.chmod(mode)  # as umasks of two people leave it
@@ -115,9 +118,10 @@ def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path: Path) -> N
     installed = tmp_path / "installed"
     with zipfile.ZipFile(wheels[0]) as wheel:
         wheel.extractall(installed)
+    assert {path.name for path in installed.iterdir()} == {"hilcal", f"{NAME}.dist-info"}
     for top in ("hilcal", "drivers", "configs"):
         files = [path for kind in ("*.py", "*.toml") for path in (ROOT / top).rglob(kind)]
-        target = installed / "hilcal" / "configs" if top == "configs" else installed / top
+        target = installed / top if top == "hilcal" else installed / "hilcal" / top
         assert all((target / path.relative_to(ROOT / top)).is_file() for path in files)
     script = (
         "from hilcal.robot.catalogue import configs_dir, load_arm, robot_names\n"
@@ -140,7 +144,7 @@ def test_two_builds_are_the_same_and_bring_what_they_should(tmp_path: Path) -> N
 @pytest.mark.parametrize("home", ["", "https://example.org/hilcal"])
 def test_the_address_of_the_project_is_one_setting(home: str, tmp_path: Path) -> None:
     source = tmp_path / "source"
-    shutil.copytree(ROOT, source, ignore=NOT_TRACKED)
+    shutil.copytree(ROOT, source, symlinks=True, ignore=NOT_TRACKED)
     settings = (source / "pyproject.toml").read_text(encoding="utf-8")
     (source / "pyproject.toml").write_text(
         re.sub('^home = ".*"', f'home = "{home}"', settings, flags=re.M)

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.injected_effects import hide
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
+from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import Rehearsal
 from hilcal.campaign.revisions import chain, restore, restore_model, to_record
 from hilcal.diagnosis.document import to_json as diagnosis_json
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.rehearsal import Rehearsal
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

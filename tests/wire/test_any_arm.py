@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.arm import open_arm
-from drivers.simulated.rehearsal import SimulationCase, case_of_plan, simulated_cell
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.arm import open_arm
+from hilcal.drivers.simulated.rehearsal import SimulationCase, case_of_plan, simulated_cell
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.connect import connect
 from hilcal.robot.chain import evaluate
@@ -107,7 +107,7 @@ def test_the_simulated_arm_keeps_the_rules_of_a_real_one(fr3) -> None:
 
 def test_a_simulated_arm_outside_of_its_cell_is_refused() -> None:
     config = config_of("fr3")
-    robot = config.robot.model_copy(update={"driver": "drivers.simulated.arm:open_arm"})
+    robot = config.robot.model_copy(update={"driver": "hilcal.drivers.simulated.arm:open_arm"})
     with pytest.raises(InputError, match=r"lacks socket.*a real arm needs the driver of its maker"):
         open_arm(config.model_copy(update={"robot": robot}))
 

@@ -5,11 +5,11 @@ import time
 import numpy as np
 import pytest
 
-from drivers.ft300 import open_force_sensor
-from drivers.geocom import open_tracker
-from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.operator import open_operator
-from drivers.ur import open_arm
+from hilcal.drivers.ft300 import open_force_sensor
+from hilcal.drivers.geocom import open_tracker
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.operator import open_operator
+from hilcal.drivers.ur import open_arm
 from hilcal.readings.readings import States
 from tests.support.living_cell import WEIGHT, Q, config, world_of
 

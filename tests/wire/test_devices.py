@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.connect import ConnectionResult, Rig, connect
 from hilcal.measuring.devices import Clock, ForceSensorDevice

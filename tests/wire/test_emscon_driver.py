@@ -12,8 +12,8 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from drivers import emscon_packets as es
-from drivers.emscon import EmsconTracker, open_tracker
+from hilcal.drivers import emscon_packets as es
+from hilcal.drivers.emscon import EmsconTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import PointingTracker, TargetLostError
 from tests.support.network_cases import TARGET, TURNED, cell, emscon

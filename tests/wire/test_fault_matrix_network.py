@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers import emscon_packets as es
+from hilcal.drivers import emscon_packets as es
 from tests.support.campaign_cases import (
     Fault,
     act,

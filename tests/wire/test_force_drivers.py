@@ -12,10 +12,10 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from drivers import bota, ft300, onrobot_hex
-from drivers.modbus_rtu import write_register
-from drivers.serial_line import close_port, open_port
 from hilcal.config import CellConfig
+from hilcal.drivers import bota, ft300, onrobot_hex
+from hilcal.drivers.modbus_rtu import write_register
+from hilcal.drivers.serial_line import close_port, open_port
 from hilcal.errors import DeviceError, InputError
 from tests.support.force_cases import (
     ALL,

@@ -8,12 +8,12 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from drivers.simulated.cell_processes import SimulatedCell
-from drivers.simulated.ur.rtde import outputs_since
-from drivers.ur import open_arm
-from drivers.ur_link.probe import controller
-from drivers.ur_link.torque_reader import TORQUE
 from hilcal.config.write import to_toml
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.ur.rtde import outputs_since
+from hilcal.drivers.ur import open_arm
+from hilcal.drivers.ur_link.probe import controller
+from hilcal.drivers.ur_link.torque_reader import TORQUE
 from hilcal.identification.torques import check_torques
 from hilcal.store.campaign_file import CampaignFile
 from tests.support import ur_driver_cases as cases

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.natnet import NatNetTracker, open_tracker
+from hilcal.drivers.natnet import NatNetTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import TargetLostError
 from tests.support.network_cases import TARGET, TURNED, cell, natnet

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from drivers.netft import open_force_sensor
 from hilcal.config import CellConfig
+from hilcal.drivers.netft import open_force_sensor
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import ForceSensorDevice
 from tests.support.force_cases import fails, readers, settled, steady

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.cell_processes import SimulatedCell
 from hilcal.campaign.campaign import estimated_noise
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.errors import InputError
 from hilcal.measuring.connect import connect
 from hilcal.store.campaign_file import CampaignFile

@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from drivers.simulated import admin
-from drivers.simulated.operator import open_operator as open_simulated
-from drivers.terminal_operator import open_operator as open_terminal
+from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated.operator import open_operator as open_simulated
+from hilcal.drivers.terminal_operator import open_operator as open_terminal
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring import devices
 from tests.support.living_cell import config
@@ -102,7 +102,7 @@ def test_wrong_options_of_the_simulated_person_are_refused(options, message):
 
 PROGRAM = """
 import json, sys
-from drivers.terminal_operator import open_operator
+from hilcal.drivers.terminal_operator import open_operator
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
 made = CellConfig.model_validate_json(sys.argv[2])

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.frames import crc_modbus, crc_x25
-from drivers.simulated.force_server import Ft300
-from drivers.simulated.pty_port import crc16
+from hilcal.drivers.frames import crc_modbus, crc_x25
+from hilcal.drivers.simulated.force_server import Ft300
+from hilcal.drivers.simulated.pty_port import crc16
 from tests.support.sim_ur_cases import ClientError, SimulatedUr, Wire, client, start
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.cell_processes import SimulatedCell
 from hilcal.config import CellConfig
 from hilcal.config.write import to_toml
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import flange_difference, of_dict, read_factory, with_factory
 from hilcal.store.campaign_file import CampaignFile

@@ -10,11 +10,11 @@ from contextlib import contextmanager, suppress
 import numpy as np
 import pytest
 
-from drivers.simulated.ur_server import API
-from drivers.ur import open_arm
-from drivers.ur_link import primary
-from drivers.ur_link.lines import LinkError
-from drivers.ur_link.robot_api import RobotApi
+from hilcal.drivers.simulated.ur_server import API
+from hilcal.drivers.ur import open_arm
+from hilcal.drivers.ur_link import primary
+from hilcal.drivers.ur_link.lines import LinkError
+from hilcal.drivers.ur_link.robot_api import RobotApi
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import nominal_rows
 from tests.support import sim_ur_cases

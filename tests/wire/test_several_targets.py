@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers import emscon, geocom
-from drivers.simulated.cell_processes import SimulatedCell
 from hilcal.campaign.campaign import Campaign
+from hilcal.drivers import emscon, geocom
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.measuring.devices import PointingTracker, TargetLostError
 from hilcal.robot.catalogue import configs_dir
 from tests.support.cli_cases import Capsys

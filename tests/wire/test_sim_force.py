@@ -11,8 +11,8 @@ import serial
 from pymodbus.client import ModbusSerialClient
 from pymodbus.exceptions import ModbusIOException
 
-from drivers.ft300 import STREAM
-from drivers.simulated.force_server import DRIFT_STD, ROOM
+from hilcal.drivers.ft300 import STREAM
+from hilcal.drivers.simulated.force_server import DRIFT_STD, ROOM
 from tests.support.force_cases import ALL, WRENCH, fails, instruments, opened, simulated, steady
 from tests.support.sim_serial_cases import force_sensor
 

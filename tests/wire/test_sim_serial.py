@@ -15,9 +15,9 @@ from geocompy.geo import GeoCom
 from geocompy.geo.gctypes import GeoComCode
 from scipy import stats
 
-from drivers.simulated.admin import Operations
-from drivers.simulated.geocom_station import Beam, PolarPoint
-from drivers.simulated.pty_port import PtyPort
+from hilcal.drivers.simulated.admin import Operations
+from hilcal.drivers.simulated.geocom_station import Beam, PolarPoint
+from hilcal.drivers.simulated.pty_port import PtyPort
 from tests.support.sim_serial_cases import Instrument, tracker
 
 BAUD = 115200

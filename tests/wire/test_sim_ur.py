@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.blackboard import Blackboard
 from hilcal.calibration.urscript import movej_program, waypoints, with_joints
+from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.errors import DeviceError
 from hilcal.robot.catalogue import load_arm
 from tests.support.sim_ur_cases import (

@@ -13,11 +13,16 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers.simulated import cell_processes
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.cell_processes import UR_PORTS, DeviceProcess, SimulatedCell, free_host
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import World
+from hilcal.drivers.simulated import cell_processes
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import (
+    UR_PORTS,
+    DeviceProcess,
+    SimulatedCell,
+    free_host,
+)
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import World
 from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import WEIGHT, config, same, states, world_of
@@ -171,7 +176,7 @@ PARENT = """
 import sys, time
 from pathlib import Path
 from tests.support.living_cell import config, world_of
-from drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
 made = config(force_sensor={"driver": "bota", "port": "x"})
 cell = SimulatedCell.start(world_of(made), made, Path(sys.argv[1]), 3)
 print(*cell.processes().values(), flush=True)
@@ -223,7 +228,7 @@ def broken(monkeypatch, module, *arguments):
 
 def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeypatch):
     before = children()
-    broken(monkeypatch, "drivers.simulated.no_such_device")
+    broken(monkeypatch, "hilcal.drivers.simulated.no_such_device")
     with pytest.raises(DeviceError, match=r"tracker: ended with exit code 1: .*No module"):
         start(tmp_path)
     assert children() == before

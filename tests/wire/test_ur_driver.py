@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from drivers.ur import open_arm
-from drivers.ur_link.control import Control
-from drivers.ur_link.worker import WorkerError
+from hilcal.drivers.ur import open_arm
+from hilcal.drivers.ur_link.control import Control
+from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import DeviceError, InputError
 from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases

@@ -11,7 +11,7 @@ import numpy as np
 import psutil
 import pytest
 
-from drivers.ur_link import dashboard
+from hilcal.drivers.ur_link import dashboard
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
@@ -243,7 +243,7 @@ _PARENT = """
 import sys, time
 import numpy as np
 from tests.support import ur_driver_cases as cases
-from drivers.ur import open_arm
+from hilcal.drivers.ur import open_arm
 arm = open_arm(cases.config(sys.argv[1]))
 arm.take_control(1.0, np.array([0.0, 0.0, 0.1]))
 arm.start_move(cases.away(arm, 2.0), cases.SPEED, cases.ACCELERATION)
@@ -285,7 +285,7 @@ def test_kill_9_of_the_program_stops_the_arm_and_leaves_no_process(sim):
 _TAKING = """
 import sys
 from tests.support import ur_driver_cases as cases
-from drivers.ur import open_arm
+from hilcal.drivers.ur import open_arm
 open_arm(cases.config(sys.argv[1])).take_control(cases.MASS, cases.COM)
 """
 
@@ -321,9 +321,9 @@ def _runs(pid):
 
 _HANGING = """
 import sys, threading
-from drivers.ur_link.worker import Worker
+from hilcal.drivers.ur_link.worker import Worker
 arguments = (sys.argv[1], "125.0", "timestamp")
-start = lambda: Worker("drivers.ur_link.receive_worker", arguments, 60.0)
+start = lambda: Worker("hilcal.drivers.ur_link.receive_worker", arguments, 60.0)
 thread = threading.Thread(target=start)
 thread.start()
 thread.join()

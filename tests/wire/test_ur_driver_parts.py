@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.simulated.ur.state import line
-from drivers.ur_link import states
-from drivers.ur_link.cause import program_ended
-from drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
-from drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
-from drivers.ur_link.survey import settled_rate
-from drivers.ur_link.worker import Worker, WorkerError
+from hilcal.drivers.simulated.ur.state import line
+from hilcal.drivers.ur_link import states
+from hilcal.drivers.ur_link.cause import program_ended
+from hilcal.drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
+from hilcal.drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
+from hilcal.drivers.ur_link.survey import settled_rate
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
 
 FIELDS = {
     **{name: [0.1 * k for k in range(6)] for name in OUTPUTS},
@@ -99,7 +99,7 @@ def test_a_pause_that_the_watchdog_bears_does_not_hide_another_program():
 
 def test_worker_that_cannot_start_says_so():
     with pytest.raises(WorkerError, match="exit code 1"):
-        Worker("drivers.ur_link.no_such_worker", (), 10.0)
+        Worker("hilcal.drivers.ur_link.no_such_worker", (), 10.0)
 
 
 def test_a_moment_without_packets_is_no_slow_line() -> None:

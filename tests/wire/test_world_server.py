@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from drivers.simulated.admin import ask
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.cell_processes import DeviceProcess
-from drivers.simulated.world_server import write_world
+from hilcal.drivers.simulated.admin import ask
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.cell_processes import DeviceProcess
+from hilcal.drivers.simulated.world_server import write_world
 from hilcal.errors import DeviceError
 from tests.support.living_cell import config, world_of
 
@@ -24,7 +24,7 @@ def process(tmp_path):
     made = config()
     write_world(tmp_path / "world.json", world_of(made), made)
     arguments = ("--seed", "5")
-    process = DeviceProcess("world", "drivers.simulated.world_server", tmp_path, arguments)
+    process = DeviceProcess("world", "hilcal.drivers.simulated.world_server", tmp_path, arguments)
     process.start()
     wait_until(lambda: process.socket.exists() or process.ended)
     process.check()
@@ -61,7 +61,9 @@ def test_requests_that_cannot_be_are_answered_with_what_is_valid(process):
 
 
 def test_a_process_without_a_world_says_so_in_one_line(tmp_path):
-    process = DeviceProcess("world", "drivers.simulated.world_server", tmp_path, ("--seed", "5"))
+    process = DeviceProcess(
+        "world", "hilcal.drivers.simulated.world_server", tmp_path, ("--seed", "5")
+    )
     process.start()
     wait_until(lambda: process.ended)
     with pytest.raises(DeviceError, match=r"world: ended with exit code 2: .*world\.json"):

@@ -12,15 +12,15 @@ from enum import Enum
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur.programs import (
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.ur.programs import (
     PROGRAM_STOP,
     ControlScript,
     ProtectiveStop,
     WaypointProgram,
 )
-from drivers.simulated.ur.rtde import Faults
-from drivers.simulated.ur.state import ArmState, RobotMode, Runtime, SafetyMode
+from hilcal.drivers.simulated.ur.rtde import Faults
+from hilcal.drivers.simulated.ur.state import ArmState, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
 
 SAFETY_STOP = 15.0

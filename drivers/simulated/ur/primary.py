@@ -11,9 +11,9 @@ import asyncio
 import struct
 import time
 
-from drivers.simulated.ur.controller import Controller
-from drivers.simulated.ur.programs import ScriptStream
-from drivers.simulated.ur.state import Runtime
+from hilcal.drivers.simulated.ur.controller import Controller
+from hilcal.drivers.simulated.ur.programs import ScriptStream
+from hilcal.drivers.simulated.ur.state import Runtime
 from hilcal.types import Floats
 
 STATE, MESSAGE = 16, 20

@@ -26,7 +26,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from drivers.simulated.ur.state import ArmState, pose, transform
+from hilcal.drivers.simulated.ur.state import ArmState, pose, transform
 from hilcal.types import Floats
 
 PROGRAM_STOP = 4.0

@@ -11,8 +11,8 @@ import json
 from collections.abc import Callable
 from typing import Any
 
-from drivers.simulated.ur.controller import SERIAL_NUMBER, ClientServer, OrderResult
-from drivers.simulated.ur.state import RobotMode, Runtime
+from hilcal.drivers.simulated.ur.controller import SERIAL_NUMBER, ClientServer, OrderResult
+from hilcal.drivers.simulated.ur.state import RobotMode, Runtime
 
 BASE = "/universal-robots/robot-api"
 _API_VERSIONS = (((10, 14), "5.0.107"), ((10, 12), "3.1.4"), ((10, 11), "2.0.0"))

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from drivers.simulated.blackboard import Blackboard
-from drivers.simulated.ur.state import (
+from hilcal.drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.ur.state import (
     GRAVITY,
     REGISTERS,
     ArmState,

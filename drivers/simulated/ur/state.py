@@ -11,7 +11,7 @@ from enum import IntEnum, IntFlag
 import numpy as np
 import pinocchio as pin
 
-from drivers.simulated.blackboard import Blackboard
+from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.robot.arm import Arm
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats

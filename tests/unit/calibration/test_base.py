@@ -11,12 +11,12 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.world import World
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.corrected import corrected
 from hilcal.calibration.dh_table import dh_rows, to_toml
 from hilcal.calibration.handover import UR_JOINTS, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
+from hilcal.drivers.simulated.world import World
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import fit
 from hilcal.identification.fit_document import frames_to_json

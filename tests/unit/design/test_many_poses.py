@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.design.many_poses import measure_poses
 from hilcal.diagnosis.more_poses import pose_powers
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.rehearsal import planned_states, simulate
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.rehearsal import measurement_noise
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import stand
 from hilcal.cell import Cell
 from hilcal.config import load_config
 from hilcal.diagnosis.change import find_changes
 from hilcal.diagnosis.change_candidates import candidates
 from hilcal.diagnosis.change_found import Changes
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.rehearsal import measurement_noise
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import stand
 from hilcal.effects.spec import effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import with_effects

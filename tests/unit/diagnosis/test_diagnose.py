@@ -7,13 +7,13 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import kstest, poisson
 
-from drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.diagnosis.noise import pure_error
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.injected_effects import DEFLECTION_EFFECTS
 from hilcal.effects.catalogue import BUILT_IN
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline

@@ -7,13 +7,13 @@ import pytest
 from scipy.stats import f as f_distribution
 from scipy.stats import ncf
 
-from drivers.simulated.injected_effects import hide
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import CHANCE, backward_elimination
 from hilcal.diagnosis.minimum_detectable_effect import POWER, least_strength
 from hilcal.diagnosis.stepwise import add, exchange, remove
 from hilcal.diagnosis.stepwise_alternatives import PRICE, Alternative, StepwiseAlternatives
+from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns

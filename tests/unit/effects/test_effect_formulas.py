@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated import truth
+from hilcal.drivers.simulated import truth
 from hilcal.effects.link_compliance import long_links
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains

@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.protocol import Situation
 from hilcal.model.model import Model
 from hilcal.readings.readings import States

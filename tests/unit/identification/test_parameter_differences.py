@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import hilcal as hc
-from drivers.simulated.world import stand
 from hilcal.config import load_config
+from hilcal.drivers.simulated.world import stand
 from hilcal.identification.parameter_differences import Differences, parameter_differences
 from hilcal.identification.posterior import Posterior
 from hilcal.robot.catalogue import configs_dir

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from drivers.simulated.injected_effects import hide
-from drivers.simulated.world import World
 from hilcal.cell import Cell
+from hilcal.drivers.simulated.injected_effects import hide
+from hilcal.drivers.simulated.world import World
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import Rehearsal
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LeftOut
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.rehearsal import Rehearsal
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

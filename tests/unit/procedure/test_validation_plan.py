@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from drivers.simulated.rehearsal import planned_states
 from hilcal.cell import cell_from_config
 from hilcal.design.feasible import Space
 from hilcal.design.run_order import LoadBlock, PlannedStop, assembled
+from hilcal.drivers.simulated.rehearsal import planned_states
 from hilcal.procedure.validation_plan import fewer_returns
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

@@ -4,12 +4,12 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from drivers.simulated.mechanics import rotation_vector
-from drivers.simulated.truth import Truth
-from drivers.simulated.ur.state import GRAVITY, Kinematics
-from drivers.simulated.world import SimulatedNoise, World
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.mechanics import rotation_vector
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.ur.state import GRAVITY, Kinematics
+from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.protocol import Situation
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model

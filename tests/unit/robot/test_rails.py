@@ -13,11 +13,11 @@ import pinocchio as pin
 import pytest
 
 import hilcal as hc
-from drivers.simulated.rehearsal import Rehearsal, case_of_plan, read_plan
 from hilcal.calibration.dh_table import dh_rows, flange_poses, to_toml
 from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.rehearsal import Rehearsal, case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.model.model import Model

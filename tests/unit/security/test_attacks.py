@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.io import savemat
 
-from drivers.simulated.own_law import check_hash
 from hilcal import limits
 from hilcal.cli import main
+from hilcal.drivers.simulated.own_law import check_hash
 from hilcal.errors import InputError
 from hilcal.store.rows import text_crc
 from hilcal.tables.files import open_grid

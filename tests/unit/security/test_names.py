@@ -36,7 +36,6 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from drivers.terminal_operator import TerminalOperator
 from hilcal.calibration import storage
 from hilcal.calibration.dh_table import dh_rows, to_csv, to_toml
 from hilcal.calibration.handover import ur_kinematics, urdf
@@ -49,6 +48,7 @@ from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.template import cell_text
 from hilcal.discovery.write_effect import source_of_form
+from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
 from hilcal.identification import posterior_document
 from hilcal.names import check_name, check_names, csv_text, escaped, from_csv, quoted

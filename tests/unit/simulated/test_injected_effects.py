@@ -9,10 +9,15 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-import drivers.simulated
-from drivers.simulated.injected_effects import DEFLECTION_EFFECTS, EFFECTS, hide, nothing_hidden
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import World
+import hilcal.drivers.simulated
+from hilcal.drivers.simulated.injected_effects import (
+    DEFLECTION_EFFECTS,
+    EFFECTS,
+    hide,
+    nothing_hidden,
+)
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import World
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states
@@ -214,7 +219,7 @@ def test_the_world_shares_no_physics_with_the_program():
     allowed = {"hilcal.robot.arm", "hilcal.cell", "hilcal.readings.readings", "hilcal.errors",
                "hilcal.types"}  # fmt: skip
     files = ("mechanics", "truth", "world", "injected_effects")
-    folder = Path(drivers.simulated.__file__).parent
+    folder = Path(hilcal.drivers.simulated.__file__).parent
     for name in files:
         for node in ast.walk(ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))):
             names = []

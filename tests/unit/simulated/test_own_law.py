@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
-from drivers.simulated.own_law import OwnLaw, own_law, own_names
-from drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
-from drivers.simulated.world_server import read_world, write_world
 from hilcal.diagnosis.stepwise import add
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.injected_effects import ALL_EFFECTS, nothing_hidden
+from hilcal.drivers.simulated.own_law import OwnLaw, own_law, own_names
+from hilcal.drivers.simulated.rehearsal import case_of_plan, check_choice, read_plan
+from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline

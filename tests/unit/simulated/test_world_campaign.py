@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.injected_effects import hide, nothing_hidden
-from drivers.simulated.rehearsal import simulate
-from drivers.simulated.world import SimulatedNoise
+from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
+from hilcal.drivers.simulated.rehearsal import simulate
+from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from studies.random_campaigns import dead_weights, rehearsal_states

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.injected_effects import nothing_hidden
-from drivers.simulated.truth import Truth
-from drivers.simulated.world import World
+from hilcal.drivers.simulated.injected_effects import nothing_hidden
+from hilcal.drivers.simulated.truth import Truth
+from hilcal.drivers.simulated.world import World
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
 from tests.support.world_cases import frames, moment_beyond

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.simulated.world_server import read_world, write_world
+from hilcal.drivers.simulated.world_server import read_world, write_world
 from hilcal.errors import InputError
 from tests.support.living_cell import (
     WEIGHT,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from drivers.simulated.mechanics import build, elasticity, equilibrium, long_links
+from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium, long_links
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from tests.support.example_cell import ur10e_cell

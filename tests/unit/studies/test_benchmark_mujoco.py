@@ -120,7 +120,7 @@ def drawn(softness: Floats, rng: np.random.Generator) -> dict[str, Floats]:
 
 @pytest.mark.parametrize("robot", ["ur10e", "xarm6"])
 def test_two_mechanics_agree_to_a_micrometre(robot: str) -> None:
-    """Those of `drivers.simulated` and these share no code; both have the same parameters."""
+    """Those of `hilcal.drivers.simulated` and these share no code; parameters are the same."""
     rng = np.random.default_rng(6)
     c = campaign(robot, 8, rng)
     world = bare(c.cell, rng)

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from drivers.simulated.injected_effects import EFFECTS
 from hilcal.cell import cell_from_config
 from hilcal.cli.demo import CELL
 from hilcal.config import CellConfig, load_config
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.verdict import diagnose
+from hilcal.drivers.simulated.injected_effects import EFFECTS
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit

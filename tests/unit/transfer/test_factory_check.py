@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.cell import cell_from_config
 from hilcal.cli.planning import make_plan
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError
 from hilcal.readings.readings import Readings
