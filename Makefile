@@ -13,7 +13,7 @@ export OMP_NUM_THREADS ?= 1
 # else every program that a test starts compiles all of hilcal again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test check format slow bench docs versions dist sbom release lock clean
+.PHONY: help setup demo test check format slow bench peers docs versions dist sbom release lock clean
 
 help:
 	@echo "make demo    the whole story on a simulated cell with a hidden effect"
@@ -21,6 +21,7 @@ help:
 	@echo "make check   ruff, mypy, import-linter"
 	@echo "make slow    the tests that take minutes"
 	@echo "make bench   the benchmarks"
+	@echo "make peers   figaroh, for the benchmarks beside it"
 	@echo "make docs    the site, in site/"
 	@echo "make release all steps of a release up to the upload; TESTS=... runs some tests only"
 	@echo "make versions the lowest and the newest versions of libraries (takes long)"
@@ -42,7 +43,7 @@ $(DOCS): requirements-docs.lock $(STAMP)
 	@touch $@
 
 docs: $(DOCS)
-	$(BIN)/python -m mkdocs build --strict -d site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict -d site
 
 demo: $(STAMP)
 	$(BIN)/hilcal demo
@@ -64,8 +65,16 @@ format: $(STAMP)
 slow: $(STAMP)
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
+# With the peers that `make peers` installs; the page of their ratios is renewed by
+# `python -m tests.benchmarks.peers bench.json`.
 bench: $(STAMP)
-	$(BIN)/python -m pytest -q -m "slow or not slow" --benchmark-enable --benchmark-only
+	HILCAL_PEERS=$(wildcard $(CURDIR)/.peers/bin/python) $(BIN)/python -m pytest -q \
+	  -m "slow or not slow" --benchmark-enable --benchmark-only --benchmark-json=bench.json
+
+peers:
+	$(PYTHON) -m venv .peers
+	.peers/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes \
+	  --requirement tests/benchmarks/peers-requirements.txt
 
 # PYTHONS="python3.12 python3.13" tries others.
 versions:
@@ -108,6 +117,6 @@ lock:
 	rm -rf .lock
 
 clean:
-	rm -rf .venv .lock .wheel build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache \
+	rm -rf .venv .lock .wheel .peers build dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache \
 	  .hypothesis .benchmarks .import_linter_cache
 	find hilcal drivers tests -name __pycache__ -type d -prune -exec rm -rf {} +
