@@ -222,7 +222,10 @@ def _laws(
     kinds: list[Hashable] = []
     refused: list[tuple[str, str]] = []
     for s in selections:
-        form = refine(found, form_of(found, s.terms))
+        form, kind = refine(found, form_of(found, s.terms)), structure_of(found, s.terms)
+        if kind not in chance:
+            refused.append((form.text(), "the model explains all that it moves the readings by"))
+            continue
         say(f"refitting with {form.text()}")
         try:
             after, form, coefficients, _ = exact(found, form, name)
@@ -232,8 +235,8 @@ def _laws(
         left = left_out_by_pose(after)
         share = float(np.clip((before.sum() - left.sum()) / misfit, -1.0, 1.0))
         law = _law(problem, s, form, name, coefficients, share, after, folds, known)
-        kinds.append(structure_of(found, s.terms))
-        law = replace(law, probability=chance[kinds[-1]])
+        kinds.append(kind)
+        law = replace(law, probability=chance[kind])
         evidence = (
             f"It explains {100 * share:.0f} % of the misfit on poses left out; p-value "
             f"{law.p_value:.1g}, the search\npaid for. The probability of its structure, of those "
