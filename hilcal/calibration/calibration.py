@@ -162,7 +162,7 @@ class Calibration(Brief):
         """
         from hilcal.calibration.storage import read
 
-        if is_campaign(Path(path)):
+        if Path(path).is_file() and is_campaign(Path(path)):
             import hilcal  # campaigns are above calibrations: the library knows them
 
             with hilcal.Campaign.open(path, catalogue, read_only=True) as run:

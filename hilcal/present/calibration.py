@@ -16,8 +16,7 @@ from hilcal.calibration.poses import BAND
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.acceptance import Acceptance
-from hilcal.present.document import Block, heading, note, table
-from hilcal.present.plan import load_name
+from hilcal.present.document import Block, heading, load_name, note, table
 from hilcal.present.registration import base_line
 from hilcal.present.running import spoken
 from hilcal.present.verdict import UNCALIBRATED, repeatability_source

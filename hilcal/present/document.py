@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self
 
+from hilcal.store.plan import UNLOADED
+
 if TYPE_CHECKING:
     import plotly.graph_objects as go
     from rich.console import RenderableType
@@ -115,6 +117,11 @@ class PageSection:
     id: str
     title: str
     blocks: tuple[Block, ...]
+
+
+def load_name(name: str, under: str = "") -> str:
+    """Return a load's name for people, e.g. after "under "."""
+    return "unloaded" if name == UNLOADED else under + name
 
 
 def heading(text: str) -> Words:

@@ -7,7 +7,7 @@ from hilcal import numbers
 from hilcal.design.confounding import Confounding
 from hilcal.design.next import SURE, Next, PairPower
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
-from hilcal.present.document import Block, Table, heading, note, pairs, table
+from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
 from hilcal.present.running import spoken
 from hilcal.store.plan import UNLOADED
 
@@ -113,11 +113,6 @@ def certified(efficiency: float) -> str:
 
 def _floor(efficiency: float) -> str:
     return f"{int(min(max(efficiency, 0.0), 1.0) * 1000 + 1e-6) / 10:.1f} %"
-
-
-def load_name(name: str, under: str = "") -> str:
-    """Return a load's name for people, e.g. after "under "."""
-    return "unloaded" if name == UNLOADED else under + name
 
 
 def cost_rows(s: PlanSummary) -> Iterator[tuple[str, str]]:

@@ -10,9 +10,8 @@ from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.extrapolation import Beyond, Extrapolation
 from hilcal.identification.priors import names_of
 from hilcal.identification.validation import Validation
-from hilcal.present.document import Block, Table, heading, note, table
+from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
-from hilcal.present.plan import load_name
 from hilcal.types import Floats
 
 MOST = 4

@@ -22,9 +22,9 @@ from hilcal.present.charts.readings import (
     residual_over,
 )
 from hilcal.present.diagnosis import shown_suspects, suspects_table
+from hilcal.present.document import load_name
 from hilcal.present.document import table as block
 from hilcal.present.fit import follows, misses, model_name
-from hilcal.present.plan import load_name
 from hilcal.present.story import DependenceCurve
 from hilcal.present.story import laws as curves_of_laws
 from hilcal.present.verdict import headline, message

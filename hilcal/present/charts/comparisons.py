@@ -11,8 +11,8 @@ from hilcal.diagnosis.comparison import Comparison
 from hilcal.identification.family_sizes import FamilySize
 from hilcal.present.charts import style
 from hilcal.present.comparison import words_of
+from hilcal.present.document import load_name
 from hilcal.present.fleet import FAR
-from hilcal.present.plan import load_name
 from hilcal.present.story import Story
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ import plotly.graph_objects as go
 
 from hilcal import numbers
 from hilcal.present.charts import style
-from hilcal.present.plan import load_name
+from hilcal.present.document import load_name
 from hilcal.present.story import LEVEL_NAMES, Story, StoryRevision, worst_and_even
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints

@@ -23,12 +23,12 @@ from hilcal.present.document import (
     Words,
     captioned,
     heading,
+    load_name,
     note,
     table,
 )
 from hilcal.present.fit import errors, follows, misses, prior_lines
 from hilcal.present.html.page import Card, FirstScreen
-from hilcal.present.plan import load_name
 from hilcal.present.registration import base_line, covariance_words
 from hilcal.present.story import Chapter, Story, StoryRevision
 from hilcal.present.validation import loads_report, opening, validation_report

@@ -20,8 +20,7 @@ from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
 from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of
 from hilcal.measuring.route import route
 from hilcal.present import plan as plan_blocks
-from hilcal.present.document import Block, Words, heading, pairs, table
-from hilcal.present.plan import load_name
+from hilcal.present.document import Block, Words, heading, load_name, pairs, table
 from hilcal.present.running import spoken
 from hilcal.present.viewer import arm_shapes, recording, style
 from hilcal.present.viewer.recording import along, fixed
