@@ -68,7 +68,8 @@ print(build_sdist("dist") if sys.argv[1] == "sdist" else build_wheel("dist"))
 NAME = f"hilcal-{hilcal.__version__}"
 NOT_TRACKED = shutil.ignore_patterns(
     *(".git", ".venv", ".*_cache", "__pycache__", "*.egg-info", "dist", "build", "site", ".lock"),
-    *(".hypothesis", ".benchmarks", "out", ".benchmark-envs"),
+    *(".hypothesis", ".benchmarks", "out", ".benchmark-envs", ".wheel", ".peers"),
+    *("bench.json", "MUJOCO_LOG.TXT"),
 )
 
 
