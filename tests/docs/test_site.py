@@ -158,7 +158,8 @@ def test_the_search_finds_an_effect(address: str) -> None:
     with open_browser() as browser:
         page = browser.new_page(viewport=DESKTOP)
         page.goto(f"{address}/index.html", wait_until="networkidle")
-        page.fill(".md-search__input", "hysteresis")
+        page.click(".md-search__input")
+        page.keyboard.type("hysteresis", delay=50)  # as a person; what is filled in is not heard
         page.wait_for_selector(".md-search-result__item")
         found = page.eval_on_selector_all(
             ".md-search-result__link", "links => links.map(link => link.getAttribute('href'))"
