@@ -30,7 +30,7 @@ from hilcal.present.diagnosis import (
     suspects_table,
 )
 from hilcal.present.discovery import coefficient
-from hilcal.present.document import Block, Table, pairs, table
+from hilcal.present.document import Block
 from hilcal.present.fit import errors, misses, model_name, parameters
 from hilcal.present.verdict import message
 from hilcal.robot.arm import Arm
@@ -103,8 +103,9 @@ class StoryRevision:
         error: of the fitted readings.
         holdout: of whole poses left out.
         cells: of its row in a table of revisions.
-        panels: "verdict", "details", "parameters", "follows" (what the residual follows) and "law"
-            (beyond the catalogue, empty without one) in words and tables.
+        panels: "verdict", "details" and "parameters" in words and tables.
+        follows: what the residual follows; None where nothing is found.
+        laws: of the model, which the catalogue does not have; one entry per curve.
     """
 
     revision: int
@@ -117,6 +118,8 @@ class StoryRevision:
     holdout: ErrorBlock
     cells: tuple[str, ...] = ()
     panels: Mapping[str, tuple[Block, ...]] = field(default_factory=dict)
+    follows: DependenceCurve | None = None
+    laws: tuple[DependenceCurve, ...] = ()
 
     @property
     def size_m(self) -> Floats:
@@ -230,7 +233,7 @@ LITTLE = 0.2
 shown, not those of the variables; a guess."""
 LEAST_CARRIED = 0.02
 """Share of the misfit below which a variable is not shown; a guess."""
-MOST_SUSPECTS, MOST_PARAMETERS, BINS = 3, 40, 12
+MOST_SUSPECTS, MOST_PARAMETERS = 3, 40
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -349,6 +352,8 @@ def _revision(c: Chapter, e: FullPrediction, axes: Floats, measured: Floats) -> 
         holdout=c.fit.holdout,
         cells=revision_cells(c.number, changed, c.fit, verdict),
         panels=_panels(c),
+        follows=None if d is None else follows(d),
+        laws=laws(c.fit),
     )
 
 
@@ -361,16 +366,12 @@ def _panels(c: Chapter) -> dict[str, tuple[Block, ...]]:
         if d.significant:
             verdict.append(suspects_table(d, MOST_SUSPECTS))
         details = list(diagnosis_report(d))
-    found = None if d is None else follows(d)
-    drawn: tuple[Block, ...] = ("Nothing is found that the residual follows.",)
-    if found is not None:
-        drawn = (found.says, curve_table(found))
+        if (drawn := follows(d)) is not None:
+            details.append(f"Drawn: {drawn.y_label} against {drawn.x_label}. {drawn.says}")
     return {
         "verdict": (*verdict, f"Model: {model_name(c.fit.model.named)}."),
         "details": (*details, errors(c.fit)),
         "parameters": tuple(parameters(c.fit, MOST_PARAMETERS)),
-        "follows": drawn,
-        "law": tuple(b for x in laws(c.fit)[:1] for b in (pairs(x.facts), curve_table(x))),
     }
 
 
@@ -386,21 +387,6 @@ def follows(d: Diagnosis) -> DependenceCurve | None:
         return curve(carried[0])
     suspects = [] if d.lead is None else shown_suspects(d)
     return regressor(d.fit, suspects[0]) if suspects else None
-
-
-def curve_table(c: DependenceCurve) -> Table:
-    """Return a curve as a table; single readings by their means in bins of equal count."""
-    x, y, error = c.x, c.y, c.error
-    if error is None:
-        bins = np.array_split(np.argsort(x, kind="stable"), min(BINS, max(1, len(x) // 4)))
-        x, y = (np.array([v[b].mean() for b in bins]) for v in (c.x, c.y))
-        error = np.array([c.y[b].std() / max(len(b) - 1, 1) ** 0.5 for b in bins])
-    out = table(c.x_label, c.y_label, "±", *(() if c.line is None else ("law",)))
-    for k in range(len(x)):
-        value, spread = numbers.with_std(float(y[k]), float(error[k]))
-        law = () if c.line is None else (numbers.digits(float(np.interp(x[k], *c.line))),)
-        out.add(c.names[k] if c.names else numbers.digits(float(x[k])), value, spread, *law)
-    return out
 
 
 def laws(fit: Fit) -> tuple[DependenceCurve, ...]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from hilcal.identification.residual import ErrorBlock
 from hilcal.present.document import table
-from hilcal.present.story import DependenceCurve, Story, StoryRevision, curve_table
+from hilcal.present.story import DependenceCurve, Story, StoryRevision
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
 
@@ -80,7 +80,7 @@ def story(
     floor = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean()))
     offset = target if mode == "absolute" else 0.0
     revisions = tuple(
-        _revision(k, parts, truth, offset, covariance, names) for k in range(len(parts))
+        _revision(k, parts, truth, offset, covariance, torque, names) for k in range(len(parts))
     )
     return Story(
         arm=arm,
@@ -122,12 +122,11 @@ def doubtful(names: str = "") -> Story:
     told = story(poses=12, names=names)
     first, second, third, last = told.revisions
     second = replace(second, verdict="ambiguous")
-    panels = {**third.panels, "follows": (ANGLE.says, curve_table(ANGLE))}
-    third = replace(third, verdict="unknown_effect", panels=panels)
+    third = replace(third, verdict="unknown_effect", follows=ANGLE)
     return replace(told, revisions=(first, second, third, last))
 
 
-def _revision(k, parts, truth, offset, covariance, names):
+def _revision(k, parts, truth, offset, covariance, torque, names):
     predicted = sum(parts[: k + 1])
     residual = truth - predicted
     norm2 = np.einsum(
@@ -158,4 +157,14 @@ def _revision(k, parts, truth, offset, covariance, names):
         holdout=ErrorBlock(**{key: 1.06 * v for key, v in error.to_json().items()}),
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else []))},
+        follows=DependenceCurve(
+            left[0],
+            "",
+            torque[:, 1],
+            1e6 * residual[:, 2],
+            "torque of joint 2 [Nm]",
+            "z [µm]",
+        )
+        if left
+        else None,
     )

@@ -17,6 +17,7 @@ from hilcal.present.document import Block, heading, table
 from hilcal.present.live_viewer import PORT
 from hilcal.present.story import (
     LEVEL_NAMES,
+    DependenceCurve,
     Story,
     StoryRevision,
     levels,
@@ -114,21 +115,19 @@ def tell(rec: rr.RecordingStream, story: Story) -> None:
 def begin(rec: rr.RecordingStream, story: Story) -> None:
     """Log what is the same in every revision."""
     static_scene(rec, story)
-    for entity, name, color in SERIES:
-        fixed(rec, f"errors/{entity}", *style.series(name, color, 1.5, 4.0))
     fixed(rec, "words/guide", style.document(GUIDE))
 
 
 def tell_revision(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
     """Log one revision at the recording's current time."""
     revision_scene(rec, story, r)
-    sizes = (r.error.rms_m, r.holdout.rms_m, r.error.max_m, story.noise_floor_m)
-    for (entity, *_), size in zip(SERIES, sizes, strict=True):
-        rec.log(f"errors/{entity}", rr.Scalars(1e6 * size))
+    error_bars(rec, story)
     pose_bars(rec, story, r)
+    curve_bars(rec, "follows", r.follows)
+    if any(one.laws for one in story.revisions):
+        curve_bars(rec, "law", r.laws[0] if r.laws else None)
     rec.log("words/verdict", style.document(verdict(story, r)))
-    for panel in PANELS:
-        rec.log(f"words/{panel}", style.document(style.markdown(r.panels.get(panel, ()))))
+    rec.log("words/parameters", style.document(style.markdown(r.panels.get("parameters", ()))))
     rec.log("words/revisions", style.document(revisions(story, r.revision)))
     rec.log("words/details", style.document(details(story, r)))
     rec.log("log", rr.TextLog(log_line(story, r), level="INFO"))
@@ -150,8 +149,9 @@ def _poses(rec: rr.RecordingStream, story: Story) -> None:
     rec.reset_time()
 
 
-PANELS = {"follows": "What the residual follows", "law": "Law", "parameters": "Parameters ± σ"}
-ERRORS = "Error of each revision [µm]"
+FOLLOWS = "What the residual follows (axes: Details)"
+LAW = "Law beyond the catalogue: blue readings, green law"
+ERRORS = "Error of each revision [µm]: blue fitted, pink left out, red largest, green noise"
 
 
 def blueprint(story: Story) -> rrb.Blueprint:
@@ -160,20 +160,19 @@ def blueprint(story: Story) -> rrb.Blueprint:
     It opens at the first revision and stands there; that of a growing story goes along with it.
     """
     residual, deflection, bars = titles(story)
-    errors = rrb.TimeSeriesView(origin="errors", name=ERRORS)
-    quiet = rrb.PlotLegend(visible=False)
     left = rrb.Vertical(
         rrb.Tabs(_view3d(story, residual, "deflection"), _view3d(story, deflection, "residual")),
-        rrb.Tabs(errors, rrb.BarChartView(origin="bars", name=bars, plot_legend=quiet)),
+        rrb.Tabs(_bars("errors", ERRORS), _bars("bars", bars)),
         row_shares=[11, 4],
     )
-    law = any(r.panels.get("law") for r in story.revisions)
-    panels = [panel for panel in PANELS if law or panel != "law"]
+    laws = [_bars("law", LAW)] if any(r.laws for r in story.revisions) else []
     words = (("verdict", "Verdict"), ("details", "Details"), ("guide", "How to read this"))
     right = rrb.Vertical(
         rrb.Tabs(*(style.text(of, name) for of, name in words)),
         rrb.Tabs(
-            *(style.text(panel, PANELS[panel]) for panel in panels),
+            _bars("follows", FOLLOWS),
+            *laws,
+            style.text("parameters", "Parameters ± σ"),
             style.text("revisions", "Table"),
             rrb.TextLogView(origin="log", name="Log"),
         ),
@@ -206,15 +205,69 @@ def _view3d(story: Story, name: str, without: str) -> rrb.Spatial3DView:
     return style.view3d("world", name, place, middle, contents)
 
 
-SERIES = (
-    ("fit", "fitted poses, rms", style.MEASURED),
-    ("holdout", "poses left out, rms", style.HOLDOUT),
-    ("largest", "largest of all", style.RED),
-    ("noise", "noise alone, rms", style.NOISE),
-)
-"""Of the errors of revisions: entity, name and colour."""
+def _bars(origin: str, name: str) -> rrb.BarChartView:
+    return rrb.BarChartView(origin=origin, name=name, plot_legend=rrb.PlotLegend(visible=False))
+
+
+SERIES = {
+    "fit": style.MEASURED,
+    "holdout": style.HOLDOUT,
+    "largest": style.RED,
+    "noise": style.NOISE,
+}
+"""Of the errors of revisions: entity and colour, see `ERRORS`."""
 BARS = 150
 """Bars of poses at most."""
+_BINS = 12
+"""Of single readings over what they may follow, for their mean."""
+
+
+def error_bars(rec: rr.RecordingStream, story: Story) -> None:
+    """Log the errors of all revisions, µm: four bars beside each other for each."""
+    told, floor = story.revisions, story.noise_floor_m
+    sizes = np.array([(r.error.rms_m, r.holdout.rms_m, r.error.max_m, floor) for r in told])
+    at, wide = np.array([float(r.revision) for r in told]), 0.8 / len(SERIES)
+    for k, (name, color) in enumerate(SERIES.items()):
+        left, widths = at - 0.4 + k * wide, np.full(len(at), wide)
+        bars = rr.BarChart(1e6 * sizes[:, k], abscissa=left, widths=widths, color=color)
+        rec.log(f"errors/{name}", bars)
+
+
+def curve_bars(rec: rr.RecordingStream, entity: str, c: DependenceCurve | None) -> None:
+    """Log a curve as bars over its variable, and beside each that of the law, where it has one.
+
+    Single readings are drawn by their mean in bins of equal count.
+    """
+    bars: dict[str, Floats] = {}
+    edges = np.zeros(0)
+    if c is not None and len(c.x):
+        x, y = (c.x, c.y) if c.error is not None else _means(c)
+        order = np.arange(len(x)) if c.names else np.argsort(x, kind="stable")
+        bars["mean"] = y[order]
+        if c.line is not None:
+            bars["law"] = np.interp(x[order], *c.line)
+        edges = _edges(order.astype(float) if c.names else x[order])
+    for k, (part, color) in enumerate((("mean", style.MEASURED), ("law", style.NOISE))):
+        if part not in bars:
+            rec.log(f"{entity}/{part}", rr.Clear(recursive=False))
+            continue
+        width = np.diff(edges) / len(bars)
+        at = edges[:-1] + k * width
+        rec.log(f"{entity}/{part}", rr.BarChart(bars[part], abscissa=at, widths=width, color=color))
+
+
+def _edges(x: Floats) -> Floats:
+    """(K + 1,) of bins about growing centres (K,): half-way between them."""
+    if len(x) == 1:
+        return np.array([x[0] - 0.5, x[0] + 0.5])
+    middle = 0.5 * (x[1:] + x[:-1])
+    return np.concatenate([[2 * x[0] - middle[0]], middle, [2 * x[-1] - middle[-1]]])
+
+
+def _means(c: DependenceCurve) -> tuple[Floats, Floats]:
+    order = np.argsort(c.x, kind="stable")
+    bins = np.array_split(order, min(_BINS, max(1, len(order) // 4)))
+    return np.array([c.x[b].mean() for b in bins]), np.array([c.y[b].mean() for b in bins])
 
 
 def pose_bars(rec: rr.RecordingStream, story: Story, r: StoryRevision) -> None:
@@ -342,7 +395,7 @@ is the worst reading; the order in µm can be another, where some readings are n
 in µm, against the noise. Left-out error far above the fitted one = too many parameters.
 
 **What the residual follows**: its mean over the leading suspect, or, where that explains little of
-it, over the recorded variable that carries most of it.
+it, over the recorded variable that carries most of it; *Details* names both axes.
 """
 
 

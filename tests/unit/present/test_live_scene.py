@@ -191,7 +191,7 @@ def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):
 
 def test_the_errors_of_revisions_grow_one_by_one_and_end_as_the_whole_story(refined, tmp_path):
     growing = recorded(tmp_path / "growing.rrd", revisions(), end=False)
-    assert len(values(growing, "/errors/fit", "Scalars:scalars")) == 4
+    assert len(values(growing, "/errors/fit", "BarChart:values")) == 4
     said = [row[0] for row in values(growing, "/words/verdict", "TextDocument:text")]
     assert all(" of " not in text.splitlines()[0] for text in said)  # nobody knows the last yet
     said = [row[0] for row in values(refined, "/words/verdict", "TextDocument:text")]
@@ -207,7 +207,7 @@ def test_other_readings_begin_another_story(tmp_path):
     other = story(poses=12)
     told = [*revisions(), (9.0, Revised(replace(other, revisions=(other.revisions[-1],))))]
     path = recorded(tmp_path / "two.rrd", told, end=False)
-    assert len(values(path, "/errors/fit", "Scalars:scalars")) == 5
+    assert len(values(path, "/errors/fit", "BarChart:values")) == 5
     tables = [row[0] for row in values(path, "/words/revisions", "TextDocument:text")]
     assert tables[-1].count("\n|") < tables[-2].count("\n|")
 

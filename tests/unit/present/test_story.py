@@ -17,14 +17,11 @@ from hilcal.identification.full_prediction import full_prediction
 from hilcal.identification.linearisation import HeldOut
 from hilcal.present.html.certificate import left_out_errors
 from hilcal.present.story import (
-    BINS,
     Chapter,
     Story,
     StoryRevision,
     build_story,
     curve,
-    curve_table,
-    follows,
     of_left_out,
     pose_numbers,
 )
@@ -32,7 +29,6 @@ from hilcal.refinement import add
 from hilcal.robot.chain import evaluate
 from tests.support.campaigns import Campaign
 from tests.support.cli_cases import rehearsal
-from tests.support.viewer_story import ANGLE
 from tests.unit.diagnosis.test_diagnose_unknown import hidden
 
 
@@ -66,8 +62,9 @@ def test_a_story_holds_together(
         assert (first.change, last.change) == ("", f"+ {r.hidden}")
         assert first.verdict == "missing_effect"
         assert last.verdict == "adequate"
-        assert r.hidden in first.panels["follows"][0]
-        assert "Nothing is found" in last.panels["follows"][0]
+        assert first.follows is not None
+        assert first.follows.title == r.hidden
+        assert last.follows is None
         for revision in story.revisions:
             np.testing.assert_allclose(
                 story.measured - revision.predicted, revision.residual, atol=1e-12
@@ -104,8 +101,8 @@ def test_arrows_start_at_the_nominal_target(positions: tuple[Rehearsal, Story]) 
 def test_the_right_suspect_lies_on_the_line_of_slope_one(
     deflections: tuple[Rehearsal, Story], positions: tuple[Rehearsal, Story]
 ) -> None:
-    for r, _ in (deflections, positions):
-        g = follows(chapters_of(r)[0].diagnosis)
+    for r, story in (deflections, positions):
+        g = story.revisions[0].follows
         assert g is not None
         assert r.hidden in g.x_label
         slope = float(g.x @ g.y / (g.x @ g.x))
@@ -126,7 +123,7 @@ def judged(c: Campaign) -> tuple[Diagnosis, StoryRevision]:
 def test_an_unknown_effect_has_a_curve_in_units_for_people() -> None:
     d, r = judged(hidden("dq2 = sin 3 q4", "absolute", 0, 1.5))
     assert r.verdict == "unknown_effect"
-    lead = follows(d)
+    lead = r.follows
     assert lead is not None
     assert (lead.title, lead.x_label) == ("joint 4 angle", "joint 4 angle [°]")
     assert lead.y_label == "error of joint 2 [µrad]"
@@ -145,21 +142,9 @@ def test_a_suspect_that_explains_little_leaves_the_picture_to_the_variable(
     left_out = LeftOut(lambda: HeldOut(explains, True))
     lead = replace(d.suspects[1], left_out=left_out, explains=True)
     named = replace(d, reason="one_suspect", suspects=(lead, d.suspects[0]))
-    found = follows(named)
-    assert found is not None
-    assert found.title == ("joint 4 angle" if curves else lead.effect)
-
-
-def test_a_curve_as_a_table_has_its_means() -> None:
-    of_bins = curve_table(ANGLE)
-    assert of_bins.heads == (ANGLE.x_label, ANGLE.y_label, "±")
-    assert [float(row[1]) for row in of_bins.rows] == pytest.approx(ANGLE.y.tolist())
-    x = np.linspace(-1.0, 1.0, 400)
-    single = replace(ANGLE, x=x, y=3.0 * x, error=None, line=np.array([[-1.0, 1.0], [-3.0, 3.0]]))
-    rows = curve_table(single).rows
-    assert len(rows) == BINS
-    for row in rows:
-        assert float(row[1]) == pytest.approx(float(row[3]), abs=0.05)
+    r = build_story([Chapter(1, None, d.fit, named)]).revisions[0]
+    assert r.follows is not None
+    assert r.follows.title == ("joint 4 angle" if curves else lead.effect)
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from hilcal.present.document import table
 from hilcal.present.story import levels, worst_and_even
 from hilcal.present.viewer import campaign, save, style
 from hilcal.robot.body import body_poses, capsules
-from tests.support.recordings import rows, same, texts, values
-from tests.support.viewer_story import story, ur10e
+from tests.support.recordings import rows, same, texts
+from tests.support.viewer_story import ANGLE, LOAD, doubtful, story, ur10e
 
 FORBIDDEN = "█▏░─│⟂∥∈∝ᵀ✘漢"
 READINGS = 90
@@ -47,12 +47,57 @@ def test_every_revision_has_its_errors_in_micrometres(told, recording):
         "largest": [r.error.max_m for r in told.revisions],
         "noise": [told.noise_floor_m] * len(told.revisions),
     }
+    numbers = [r.revision for r in told.revisions]
     for name, sizes in expected.items():
-        read = rows(recording, f"/errors/{name}", "Scalars:scalars", "revision")
-        assert sorted(read) == [r.revision for r in told.revisions]
-        np.testing.assert_allclose([read[k][0] for k in sorted(read)], 1e6 * np.array(sizes))
-        ((called,),) = values(recording, f"/errors/{name}", "SeriesPoints:names")
-        assert called in {words for _, words, _ in campaign.SERIES}
+        for shown in numbers:
+            left, right, height = bars(recording, f"/errors/{name}", shown)
+            np.testing.assert_allclose(height, 1e6 * np.array(sizes))
+            assert ((np.array(numbers) - 0.5 < left) & (right < np.array(numbers) + 0.5)).all()
+
+
+def bars(path: Path, entity: str, revision: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return left and right edges and heights of the bars of a revision."""
+    left, width, height = (
+        np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision][0]["buffer"])
+        if name != "widths"
+        else np.array(rows(path, entity, f"BarChart:{name}", "revision")[revision])
+        for name in ("abscissa", "widths", "values")
+    )
+    return left, left + width, height
+
+
+def test_a_curve_is_drawn_by_bars_about_its_values(tmp_path):
+    told, path = doubtful(), tmp_path / "doubt.rrd"
+    save(told, path)
+    left, right, height = bars(path, "/follows/mean", 2)
+    np.testing.assert_allclose(height, ANGLE.y)
+    assert ((left < ANGLE.x) & (ANGLE.x < right)).all()
+    np.testing.assert_allclose(left[1:], right[:-1], rtol=1e-5)  # side by side
+    assert 3 not in rows(path, "/follows/mean", "BarChart:values", "revision")  # nothing follows
+
+
+def test_loads_stand_beside_each_other_in_their_order(tmp_path):
+    told, path = doubtful(), tmp_path / "load.rrd"
+    third = replace(told.revisions[2], follows=LOAD)
+    save(replace(told, revisions=(third,)), path)
+    left, right, height = bars(path, "/follows/mean", 2)
+    np.testing.assert_allclose(height, LOAD.y)
+    np.testing.assert_allclose(right - left, 1.0)
+
+
+def test_readings_over_a_suspect_are_drawn_by_their_mean(told, recording):
+    left, _, height = bars(recording, "/follows/mean", 0)
+    assert 4 <= len(left) <= 12
+    assert np.all(np.diff(left) > 0)
+    follows = told.revisions[0].follows
+    assert follows.y.min() <= height.min() <= height.max() <= follows.y.max()
+
+
+def test_a_curve_of_one_bin_or_no_height_is_drawn(tmp_path):
+    one = replace(ANGLE, x=np.ones(1), y=np.zeros(1), error=np.zeros(1))
+    told = doubtful()
+    save(replace(told, revisions=(replace(told.revisions[2], follows=one),)), tmp_path / "one.rrd")
+    assert bars(tmp_path / "one.rrd", "/follows/mean", 2)[2].tolist() == [0.0]
 
 
 def test_it_opens_at_the_first_revision_and_the_end_says_that_it_is_the_end(told, recording):

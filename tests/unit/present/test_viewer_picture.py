@@ -88,7 +88,7 @@ def test_every_view_is_drawn_without_a_report(recording, tmp_path):
             "Details",
             campaign.ERRORS,
             "How to read this",
-            campaign.PANELS["follows"],
+            campaign.FOLLOWS,
             "Table",
             "Log",
         ),
