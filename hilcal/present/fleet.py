@@ -1,6 +1,6 @@
 """Many arms: what is known of a type, which arms are unlike it, what wears."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from hilcal import numbers
@@ -9,6 +9,7 @@ from hilcal.present.document import Block, heading, note, table
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
     from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
+    from hilcal.transfer.type_sizes import TypeSize
 
 FAR = 3.0
 """Standard deviations between which most arms lie; a choice."""
@@ -86,6 +87,15 @@ def type_lines(t: "Pooled") -> Iterator[str]:
     if t.seen:
         yield "Effects that the diagnoses added:"
         yield from (f"  {_seen(s)}" for s in t.seen)
+    yield from size_lines(t.sizes)
+
+
+def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
+    """Yield the section of a cell for effects of another size than on other arms."""
+    if other := [s for s in sizes if s.other]:
+        yield "Effects of another size than on other arms; for the cell of one more of this type:"
+        yield "  [ordinary]"
+        yield from (f"  {_size(s)}" for s in other)
 
 
 def unlike_words(o: "Odd") -> str:
@@ -95,6 +105,11 @@ def unlike_words(o: "Odd") -> str:
     if o.campaign:
         return f"{o.arm} has changed by {o.campaign}: {o.parameter} {off} ({o.sigma:.1f} σ)"
     return f"{o.arm}: {o.parameter} {off} ({o.sigma:.1f} σ)"
+
+
+def _size(s: "TypeSize") -> str:
+    low, high = numbers.digits(s.low), numbers.digits(s.high)
+    return f"{s.effect} = {numbers.digits(s.factor)} # 95 %: {low} to {high}"
 
 
 def _seen(s: "DiagnosedEffect") -> str:

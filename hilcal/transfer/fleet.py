@@ -169,4 +169,5 @@ def _type_json(t: Pooled) -> dict[str, object]:
         "unlike": [asdict(o) for o in t.odd],
         "effects_added": [asdict(s) for s in t.seen],
         "wear": list(t.wear),
+        "sizes": [asdict(s) for s in t.sizes],
     }

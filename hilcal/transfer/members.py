@@ -16,6 +16,7 @@ from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.posterior import Posterior, Source
 from hilcal.identification.posterior_of_fit import of_arm
+from hilcal.model.model import Model
 from hilcal.names import check_names
 from hilcal.readings.same_readings import prints
 from hilcal.refinement import refine
@@ -23,6 +24,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import seconds_of
+from hilcal.transfer.type_sizes import SizeEvidence, size_evidence
 from hilcal.types import Floats
 
 LIST = "arms.csv"
@@ -60,6 +62,7 @@ class Member:
         added: effects of the arm that the diagnosis added to the baseline.
         verdict: of the model.
         rms_m: 3-D position error on poses left out.
+        sizes: what it tells of the sizes of effects; None where nothing.
     """
 
     name: str
@@ -71,6 +74,7 @@ class Member:
     added: tuple[str, ...]
     verdict: str
     rms_m: float
+    sizes: SizeEvidence | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,12 +181,10 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...] | None) -> Mem
         options = {e.name: e.options for e in found.model.effects}
         model = with_effects(run.cell, found.readings, mode, names, options, run.catalogue)
         found = fit(model, found.readings, mode)
-    return _of_fit(entry, run, found, tuple(start.names), verdict)
+    return _of_fit(entry, run, found, start, verdict)
 
 
-def _of_fit(
-    entry: Entry, run: Campaign, found: Fit, usual: tuple[str, ...], verdict: str
-) -> Member:
+def _of_fit(entry: Entry, run: Campaign, found: Fit, start: Model, verdict: str) -> Member:
     of = overview(run.file)
     serial = next((i.serial for i in of.instruments if i.part == "arm" and i.serial), None)
     arm, known = entry.arm, "list"
@@ -200,7 +202,8 @@ def _of_fit(
         type=run.cell.arm.name,
         date=entry.date or of.created,
         posterior=replace(posterior, scatter=None),
-        added=tuple(e.name for e in found.model.effects if of_arm(e) and e.name not in usual),
+        added=tuple(e.name for e in found.model.effects if of_arm(e) and e.name not in start.names),
         verdict=verdict,
         rms_m=found.holdout.rms_m,
+        sizes=size_evidence(start, found),
     )

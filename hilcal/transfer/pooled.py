@@ -28,6 +28,7 @@ from hilcal.regression.hierarchy import (
 from hilcal.regression.schur import schur_complement
 from hilcal.store.revision import seconds_of, utc_now
 from hilcal.transfer.members import Member
+from hilcal.transfer.type_sizes import TypeSize, type_sizes
 from hilcal.types import Floats
 
 COMMON = 0.5
@@ -123,6 +124,7 @@ class Pooled:
         prior: what to expect of another arm.
         off: (A, K) each arm's parameters minus the mean of the type, SI.
         off_std: (A, K) their standard uncertainties; infinite where an arm did not determine one.
+        sizes: of the effects of the type, by their names.
     """
 
     type: str
@@ -135,6 +137,7 @@ class Pooled:
     prior: Posterior
     off: Floats
     off_std: Floats
+    sizes: tuple[TypeSize, ...]
 
     @property
     def distance(self) -> Floats:
@@ -220,6 +223,7 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         prior=_prior(members, effects, names, scale, units, h, len(arms)),
         off=(h.arm_mean - h.mu) * scale,
         off_std=np.where(h.arm_variance < UNDETERMINED**2, np.sqrt(h.arm_variance) * scale, np.inf),
+        sizes=type_sizes([m.sizes for m in members if m.sizes is not None]),
     )
 
 
