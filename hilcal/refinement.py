@@ -22,7 +22,11 @@ from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.verdict import NOTHING, judge, judge_naming
 from hilcal.discovery.proposal import LawSearch
 from hilcal.identification.arm_scatter import with_arm_scatter, with_prior_scatter
-from hilcal.identification.background import allows_background, with_background
+from hilcal.identification.background import (
+    allows_background,
+    with_background,
+    with_pooled_lines,
+)
 from hilcal.identification.carried_evidence import carried_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
@@ -129,9 +133,11 @@ def refine(
     `background` asks for it, all effects of the catalogue are fitted together, see
     `Path.take_background`. Effects that were tried or taken out enter the history by which
     `verdict.judge` judges each step. Where the arm's scatter is what is left, the last step is a
-    fit with it in the covariance, so that weights, uncertainties and p-values have it, too. A
-    correlation of the noise along the order of the readings is in all fits (see
-    `diagnosis.serial_noise`): it would be taken for effects.
+    fit with it in the covariance, so that weights, uncertainties and p-values have it, too.
+    In the last fit the lines of a transmission error are about as large as their pools, since that
+    predicts better than if each is by itself (`with_pooled_lines`). A correlation of the noise
+    along the order of the readings is in all fits (see `diagnosis.serial_noise`): it would be taken
+    for effects.
 
     Args:
         model: the starting model. Its effects are not taken out, but for those of a carried prior
@@ -185,6 +191,7 @@ def refine_from(
         path.extend()
         changed = path.reconsider()
         changed = changed or (background and path.take_background()) or path.take_scatter()
+    path.pool_lines()
     return Refinement(tuple(path.steps))
 
 
@@ -391,6 +398,22 @@ class Path:
         readings = with_arm_scatter(fitted.model.cell, fitted.readings, judged.scatter)
         self.append(fit(fitted.model, readings, fitted.mode, start=fitted.theta), None)
         return True
+
+    def pool_lines(self) -> None:
+        """Fit effects of many lines anew, the sizes of these about those of their pools.
+
+        The fit takes the place of the last step's. Not where the error on poses left out rises by
+        more than it scatters from pose to pose, nor where nothing was changed.
+        """
+        last = self.steps[-1]
+        if len(self.steps) == 1 or last.fit.model.background or last.diagnosis.wrong_figures:
+            return
+        found = with_pooled_lines(last.fit)
+        if found is None or predicts_better(found, last.fit):
+            return
+        self._evidence = Evidence(found, self._refits.add, self._say, self._regressions)
+        judged = judge(self._evidence, self._history(found))
+        self.steps[-1] = replace(last, fit=found, diagnosis=judged)
 
     def _better(self, last: RefinementStep, other: Alternative) -> bool:
         """Whether others are worth a trial.

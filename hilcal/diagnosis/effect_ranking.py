@@ -197,7 +197,8 @@ def candidates(fit: Fit) -> tuple[Effect, ...]:
         if kind.name not in model.names and possible:
             effect = model.catalogue.make(kind.name, model.cell, states, m=fit.whitening.m)
             out.append(effect.for_scoring(states))
-    finer = (e.refined(states) for e in model.effects if e.name not in model.random)
+    beside = model.random if model.background else ()
+    finer = (e.refined(states) for e in model.effects if e.name not in beside)
     return (*out, *(e for e in finer if e is not None))
 
 

@@ -222,17 +222,18 @@ def backward_elimination(
     """Return the redundant effects of a fit, the least significant first.
 
     Those with a carried prior are judged by `spoken_against`: other readings speak for them; random
-    ones by `background_evidence`.
+    ones beside a background by `background_evidence`.
 
     Args:
         fit: the fit.
         known: scores of its effects against the model without them, as far as they were made.
     """
     carried = fit.solution.space.carried(fit.model.size)
+    beside = fit.model.random if fit.model.background else ()
     judged = [
         e.name
         for e, mine in zip(fit.model.effects, fit.model.slices(), strict=True)
-        if e.role == "effect" and e.name not in fit.model.random and not carried[mine].any()
+        if e.role == "effect" and e.name not in beside and not carried[mine].any()
     ]
     if not judged:
         return ()

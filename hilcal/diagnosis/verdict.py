@@ -210,7 +210,7 @@ def _with_arrivals(e: Evidence, history: History) -> Diagnosis:
 
 def _judged(e: Evidence, history: History) -> Diagnosis:
     """Judge by the evidence as it is."""
-    added = tuple(n for n in history.added if n not in e.fit.model.random)
+    added = () if e.fit.model.background else history.added
     suspects = ranked(e.suspects, history.rejected)
     lead = suspects[0] if suspects and suspects[0].passes else None
     insufficiency = None if lead is None else e.insufficiency

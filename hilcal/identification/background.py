@@ -1,9 +1,12 @@
-"""The background of a model: effects that predict together, and are not proved one by one.
+"""Random effects of a model: its background, and the lines of shrunk effects.
 
 Every arm has every effect, most of them too small to name. A model with a background has all
 effects of its catalogue that the readings allow, random with a mean of zero and the standard
 deviations that the mixed model estimates (see `hilcal.mixed`). Those that people see as the model
 are named; the others are its background. The prediction is that of all of them.
+
+Where no background is needed, effects of many small parameters, as the lines of a gear, are random
+all the same, see `with_pooled_lines`.
 """
 
 from collections.abc import Collection
@@ -16,7 +19,14 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.full_covariance import joint_factors
-from hilcal.identification.mixed_fit import INSTRUMENT, SCATTER, SCATTER_RAD, MixedFit, mixed_fit
+from hilcal.identification.mixed_fit import (
+    INSTRUMENT,
+    SCATTER,
+    SCATTER_RAD,
+    MixedFit,
+    mixed_fit,
+    mixed_fit_of,
+)
 from hilcal.model.model import Model
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.types import Floats
@@ -24,6 +34,8 @@ from hilcal.types import Floats
 MOST_ROWS = 1500
 """Elements of readings up to which a background is fitted: with more, effects are named one by one
 until nothing is left, and the equations cost the cube of the columns. A choice."""
+MOST_ROWS_OF_LINES = 2000
+"""The same up to which lines are pooled; a choice, some seconds."""
 UNSURE = 2.0
 """Factor to which few readings tell a standard deviation: it may be so much more than plausible; a
 choice."""
@@ -99,8 +111,11 @@ def allows_background(of: Fit) -> bool:
     A prior of another campaign says of its own effects how large they are. A model that was made
     without readings cannot take effects by name.
     """
-    few = len(of.white) <= MOST_ROWS
-    return few and of.model.prior is None and of.model.readings is not None
+    return len(of.white) <= MOST_ROWS and _alone(of)
+
+
+def _alone(of: Fit) -> bool:
+    return of.model.prior is None and of.model.readings is not None
 
 
 def with_background(of: Fit, named: Collection[str]) -> Fit | None:
@@ -126,6 +141,33 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
         if not readings.scatter_stated:
             readings = with_arm_scatter(found.model.cell, readings, _scatter(found))
         return fit(background_model(found, named), readings, of.mode, start=found.theta)
+    except CannotAnswerError:
+        return None
+
+
+def with_pooled_lines(of: Fit) -> Fit | None:
+    """Fit shrunk effects anew, the sizes of their lines about those of their pools.
+
+    A fit chooses the variance of each line (`Effect.groups`), as a wave of one gear, of its few
+    parameters alone: it drops true ones by chance, and keeps false ones. With what the lines of a
+    pool (`Effect.pools`) share, see `mixed.families`, simulated transmission errors were predicted
+    with 0.9 of the error at fresh poses. The noise is that of the fit.
+
+    Returns:
+        The fit; None where the model has no such effect, or the readings are too many.
+    """
+    model = of.model
+    shrunk = {e.name for e in model.effects if e.groups() is not None} - set(model.random)
+    if not shrunk or not _alone(of) or len(of.white) > MOST_ROWS_OF_LINES:
+        return None
+    # What the fit knows of the arm's scatter is in the covariance.
+    kept = replace(of.readings[~of.outlier], scatter_stated=True)
+    try:
+        found = mixed_fit_of(model, kept, of.mode, set(model.names) - shrunk, shrunk)
+        std = found.prior_std() / found.std(INSTRUMENT)
+        parts = zip(model.effects, model.slices(), strict=True)
+        random = {**model.random, **{e.name: std[own] for e, own in parts if e.name in shrunk}}
+        return fit(replace(model, random=random), of.readings, of.mode, start=found.theta)
     except CannotAnswerError:
         return None
 

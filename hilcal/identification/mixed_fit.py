@@ -1,11 +1,11 @@
-"""The mixed model of all effects, fitted to readings.
+"""The mixed model of effects, fitted to readings.
 
-Every effect of the catalogue that the readings allow takes part, each of its families with a
-variance of its own (see `hilcal.mixed`). The rows are linearised at the joint optimum: at the
-parameters that the mixed model predicts, again until they stay.
+Every effect of the model takes part, most often each of the catalogue that the readings allow, and
+each of its families with a variance of its own (see `hilcal.mixed`). The rows are linearised at the
+joint optimum: at the parameters that the mixed model predicts, again until they stay.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,7 +16,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.identification.residual import residual
 from hilcal.mixed.equations import Equations
-from hilcal.mixed.families import LogStdPrior, families_of
+from hilcal.mixed.families import Families, LogStdPrior, families_of
 from hilcal.mixed.prediction import coordinates_covariance
 from hilcal.mixed.problem import MixedProblem, Noise, independent_rows, mixed_problem
 from hilcal.mixed.variances import Variances, estimate_variances
@@ -131,13 +131,7 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
 
     Waves that few poses cannot resolve are there all the same; `harmonics` of them are kept.
     """
-    finer = tuple(
-        e.with_options(states, harmonics=harmonics)
-        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < harmonics
-        else e
-        for e in model.effects
-    )
-    model = replace(model, effects=finer)
+    model = with_all_harmonics(model, states, harmonics)
     for kind in model.catalogue.effects:
         if kind.name in model.names or kind.role in FRAME_ROLES:
             continue
@@ -148,8 +142,19 @@ def with_all_effects(model: Model, states: States, harmonics: int = HARMONICS) -
     return model
 
 
+def with_all_harmonics(model: Model, states: States, harmonics: int = HARMONICS) -> Model:
+    """Return a model whose waves have at least so many harmonics."""
+    finer = tuple(
+        e.with_options(states, harmonics=harmonics)
+        if "harmonics" in e.options and len(getattr(e, "harmonics", ())) < harmonics
+        else e
+        for e in model.effects
+    )
+    return replace(model, effects=finer)
+
+
 def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:
-    """Fit all effects at once.
+    """Fit all effects of the catalogue at once.
 
     Args:
         model: frames, and effects that have to be in it.
@@ -160,9 +165,31 @@ def mixed_fit(model: Model, readings: Readings, mode: Mode) -> MixedFit:
         CannotAnswerError: no static equilibrium, or no likelihood.
         InputError: a deflection without its unloaded reading.
     """
-    model = with_all_effects(model, readings.states)
+    return mixed_fit_of(with_all_effects(model, readings.states), readings, mode)
+
+
+def mixed_fit_of(
+    model: Model,
+    readings: Readings,
+    mode: Mode,
+    flat: Collection[str] = (),
+    lines: Collection[str] = (),
+) -> MixedFit:
+    """Fit the effects of a model at once.
+
+    Args:
+        model: frames and effects.
+        readings: without gross errors.
+        mode: "deflection" or "absolute".
+        flat: effects whose parameters have no prior.
+        lines: effects of which each group has a size of its own.
+
+    Raises:
+        CannotAnswerError: no static equilibrium, or no likelihood.
+        InputError: a deflection without its unloaded reading.
+    """
     w = whitening(readings, mode, "gc")
-    found, theta = _iterated(model, readings, w)
+    found, theta = _iterated(model, readings, w, families_of(model, flat, lines))
     return MixedFit(model, readings, w, theta, found, coordinates_covariance(found))
 
 
@@ -217,11 +244,15 @@ def variances_with_noise(
     Returns:
         The variances, the components of the noise last, and the parameters (P,) predicted.
     """
-    return _iterated(model, readings, whitening(readings, mode, "gc"), (*instrument, arm))
+    return _iterated(model, readings, whitening(readings, mode, "gc"), None, (*instrument, arm))
 
 
 def _iterated(
-    model: Model, readings: Readings, w: Whitening, parts: Sequence[NoisePart] = ()
+    model: Model,
+    readings: Readings,
+    w: Whitening,
+    families: Families | None = None,
+    parts: Sequence[NoisePart] = (),
 ) -> tuple[Variances, Floats]:
     """Estimate the variances, linearised at the parameters (P,) that they predict; and those.
 
@@ -229,7 +260,7 @@ def _iterated(
     linear model do not do so exactly.
     """
     theta, start = np.zeros(model.size), None
-    here, rounds = _linearise(model, readings, w, theta, parts), 0
+    here, rounds = _linearise(model, readings, w, theta, families, parts), 0
     while True:
         found = estimate_variances(here.problem, start, search=True)
         start, rounds = found.log_std, rounds + 1
@@ -238,7 +269,7 @@ def _iterated(
         for k in range(HALVINGS):
             trial = theta + 0.5**k * step
             try:
-                there = _linearise(model, readings, w, trial, parts)
+                there = _linearise(model, readings, w, trial, families, parts)
             except CannotAnswerError:  # no equilibrium so far away
                 continue
             if there.penalised(trial, found.equations) <= before:
@@ -279,6 +310,7 @@ def _linearise(
     readings: Readings,
     w: Whitening,
     theta: Floats,
+    families: Families | None = None,
     parts: Sequence[NoisePart] = (),
 ) -> _Linearised:
     """Linearise at theta (P,)."""
@@ -291,7 +323,9 @@ def _linearise(
     else:
         rows, noise = _noise(model, readings, w, rows)
     white, jacobian = rows[:, 0], rows[:, 1:]
-    problem = mixed_problem(white + jacobian @ theta, jacobian, families_of(model), noise)
+    problem = mixed_problem(
+        white + jacobian @ theta, jacobian, families or families_of(model), noise
+    )
     return _Linearised(problem, white)
 
 

@@ -5,13 +5,16 @@ What arms are like before anything is measured: log standard deviations, normal 
     log s_f = mean_f + a + b_effect(f) + c_f
     a ~ N(0, ARM²),  b ~ N(0, EFFECT²),  c_f ~ N(0, spread_f²)
 
+A family may be divided into lines k, each of a size of its own: log s_k = log s_f + d_k,
+d_k ~ N(0, LINE²).
+
 An arm is precise or not in most of its parts (a), and the families of one effect, as the octaves of
 a gear's error, are large or small together (b). With few poses this keeps one octave from taking
 what others explain; independent priors of the same spread predicted 4 % worse with 20 poses of the
 real UR10 and of a real UR5. Components of the noise have their own spread alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +30,9 @@ ARM = 1.5
 times the ordinary ones is no surprise; a choice."""
 EFFECT = 1.0
 """Of an effect beside its arm: a factor of 2.7; a choice."""
+LINE = 0.7
+"""Of a line of an effect, as one wave of one gear, beside its pool: a factor of 2; a choice. With
+0.5 to 1 simulated transmission errors were predicted alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +59,8 @@ class Family:
         magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
         prior: what is known of log s.
         known: whether s is known, and shares nothing with other families.
+        pool: what families of one effect belong to that are lines of it; empty for others.
+        pool_spread: of what the log s of the families of a pool share.
     """
 
     name: str
@@ -61,6 +69,8 @@ class Family:
     magnitude: Floats
     prior: LogStdPrior
     known: bool = False
+    pool: str = ""
+    pool_spread: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,7 +78,7 @@ class Families:
     """All parameters of a model.
 
     Attributes:
-        frames: (F,) indices of those without a prior: registration and target.
+        frames: (F,) indices of those without a prior: registration and target, flat effects.
         random: the families.
     """
 
@@ -81,12 +91,17 @@ class Families:
         return tuple(f.name for f in self.random)
 
 
-def families_of(model: Model) -> Families:
+def families_of(model: Model, flat: Collection[str] = (), lines: Collection[str] = ()) -> Families:
     """Return the families of a model.
 
     Parameters of one effect with the same unit make a family, in an effect with pools (as the
     octaves of harmonics) each pool one. A frame with a prior (`Effect.prior_std`), as deflections
     need, is a family of known standard deviation.
+
+    Args:
+        model: the model.
+        flat: effects of it whose parameters have no prior.
+        lines: effects of which each group is a family, about the size of its pool.
     """
     frames: list[Ints] = []
     random: list[Family] = []
@@ -96,10 +111,10 @@ def families_of(model: Model) -> Families:
         if std is not None:
             known = LogStdPrior(0.0, KNOWN)
             random.append(Family(effect.name, effect.name, index, std, known, known=True))
-        elif effect.role in FRAME_ROLES:
+        elif effect.role in FRAME_ROLES or effect.name in flat:
             frames.append(index)
         else:
-            random += _of_effect(effect, index)
+            random += _lines(effect, index) if effect.name in lines else _of_effect(effect, index)
     return Families(np.concatenate([np.zeros(0, dtype=np.int64), *frames]), tuple(random))
 
 
@@ -132,6 +147,24 @@ def _of_effect(effect: Effect, index: Ints) -> list[Family]:
     return out
 
 
+def _lines(effect: Effect, index: Ints) -> list[Family]:
+    groups, out = effect.groups(), []
+    for pool in _of_effect(effect, index):
+        own = np.isin(index, pool.parameters)
+        group = np.zeros(len(index), dtype=np.int64) if groups is None else groups
+        for k in np.unique(group[own]):
+            mine = own & (group == k)
+            prior = LogStdPrior(pool.prior.mean, LINE)
+            name = f"{pool.name}, line {k}"
+            out.append(
+                Family(
+                    name, effect.name, index[mine], effect.magnitudes[mine], prior,
+                    pool=pool.name, pool_spread=pool.prior.spread,
+                )
+            )  # fmt: skip
+    return out
+
+
 def log_std_prior(
     priors: Sequence[LogStdPrior], families: Sequence[Family]
 ) -> tuple[Floats, Floats]:
@@ -145,5 +178,7 @@ def log_std_prior(
     effect = np.array([f.effect for f in families])
     unknown = np.array([not f.known for f in families], dtype=float)
     shared = (ARM**2 + EFFECT**2 * (effect[:, None] == effect)) * np.outer(unknown, unknown)
+    pool, spread = np.array([f.pool for f in families]), [f.pool_spread for f in families]
+    shared += (pool[:, None] == pool) * np.outer(spread, spread)
     covariance[: len(effect), : len(effect)] += shared
     return np.array([p.mean for p in priors]), np.linalg.inv(covariance)

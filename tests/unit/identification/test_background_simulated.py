@@ -6,7 +6,10 @@ import numpy as np
 
 from hilcal.calibration.budget import budget
 from hilcal.config import load_config
+from hilcal.diagnosis.verdict import diagnose
+from hilcal.identification.background import with_pooled_lines
 from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import fit
 from hilcal.refinement import BACKGROUND, refine
 from studies.diagnosis import Asked
 from studies.diagnosis_command import simulate
@@ -58,3 +61,35 @@ def test_noise_that_is_stated_too_small_is_no_background() -> None:
     found = refine(baseline(case.cell, case.readings, asked.mode), case.readings, asked.mode)
     assert found.verdict == "noise_misjudged"
     assert not found.fit.model.background
+
+
+def test_waves_of_gears_in_pools_predict_better_than_line_by_line() -> None:
+    config, ratios = load_config(CELL), []
+    for seed in (1, 2, 3):
+        case = study_case(
+            config, "ur10e", "absolute", ("transmission_error",), 3.0, seed, n_poses=30
+        )
+        some = case.readings
+        start = baseline(case.cell, some, "absolute")
+        found = refine(start, some, "absolute")
+        by_lines = replace(found.fit.model, random={})
+        lines = fit(by_lines, some, "absolute", start=found.fit.theta)
+        assert "transmission_error" in found.fit.model.random
+        assert not found.fit.model.background
+        fresh, *_ = rehearsal_states(case.cell, 40, [], np.random.default_rng(seed))
+        true = case.world.sight(fresh).position
+        errors = [
+            np.linalg.norm(x.predict(fresh).position - true, axis=1).mean()
+            for x in (found.fit, lines)
+        ]
+        ratios.append(errors[0] / errors[1])
+        assert found.verdict == "adequate"
+        # what a diagnosis of the stored revision would say
+        assert diagnose(found.fit, found.diagnosis.history).verdict == found.verdict
+    assert np.exp(np.mean(np.log(ratios))) < 0.9
+
+
+def test_without_shrunk_effects_there_are_no_lines() -> None:
+    case = study_case(load_config(CELL), "ur10e", "absolute", (), 0.0, 1, n_poses=12)
+    plain = fit(baseline(case.cell, case.readings, "absolute"), case.readings, "absolute")
+    assert with_pooled_lines(plain) is None
