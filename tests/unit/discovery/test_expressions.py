@@ -55,9 +55,7 @@ def of(symbol: str, shape: shapes.Shape = shapes.LINEAR, *numbers: float) -> Amp
 AIR = next(symbol for symbol in NAMED if symbol.startswith("(T_air"))
 SUM = "(q_2 + q_3 + q_4)"
 WAVE = Amplitude((Factor(NAMED["q_4"], shapes.COS, (2.0,)), Factor(NAMED["τ_3"], shapes.LINEAR)))
-BEND = Amplitude(
-    (Factor(composed(((1.0, of("q_1")), (-0.5, of("q_5")))), shapes.ABOVE, (0.2,)),)
-)
+BEND = Amplitude((Factor(composed(((1.0, of("q_1")), (-0.5, of("q_5")))), shapes.ABOVE, (0.2,)),))
 
 
 @pytest.mark.parametrize(

@@ -243,6 +243,21 @@ def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
     assert told.read_text() == page(date, rows, fakes)
 
 
+def test_a_row_that_is_reproduced_stands_beside_the_published_ones(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = (str(TASKS), "--entrants", "frames", "--tasks", "elastic-00[123]")
+    assert run(tmp_path, *words, "--beside", str(KEPT)) == 0
+    table = capsys.readouterr().out
+    rows = [r for r in kept(KEPT)[1] if r["task"] in ("elastic-001", "elastic-002", "elastic-003")]
+    published = next(line for line in block(rows).splitlines() if line.startswith("| frames |"))
+    without_seconds = published.rsplit("|", 2)[0]
+    assert [line for line in table.splitlines() if line.startswith("| frames |")] == [
+        next(line for line in table.splitlines() if line.startswith(without_seconds))
+    ]
+    assert table.splitlines()[2].startswith("| hilcal | 1.00 |")
+
+
 def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
     (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
     folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]
@@ -257,6 +272,7 @@ def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: P
     [
         (["--entrants", "nobody"], "entrant 'nobody' is unknown; valid: boosting, figaroh,"),
         (["--tasks", "none-*"], "--tasks none-*: no task of"),
+        (["--score", "--beside", "none.json"], "--beside none.json: cannot be read (["),
     ],
 )
 def test_wrong_words_are_refused(
