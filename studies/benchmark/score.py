@@ -100,7 +100,7 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
     """Return {"tasks": a row of each entrant and task, "groups": what they come to}.
 
     A run that failed, or whose file is not as the format says, is a row with its reason: "failed".
-    An entrant that answers a law in any task has not found those of the tasks where it answers none.
+    Who answers a law in any task has not found those of the tasks where it answers none.
 
     Raises:
         BenchmarkError: no tasks, no entrants, or a task that cannot be read.

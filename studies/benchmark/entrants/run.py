@@ -210,8 +210,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if given.page:
         _put(given.page, page(date, rows, given.home))
     ran, done = {row["entrant"] for row in rows}, {(row["task"], row["part"]) for row in rows}
-    others = [r for r in beside if r["entrant"] not in ran and (r["task"], r["part"]) in done]
-    print(block(rows + others))
+    more = [r for r in beside if r["entrant"] not in ran and (r["task"], r["part"]) in done]
+    print(block(rows + more))
     return 0
 
 
