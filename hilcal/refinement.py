@@ -1,6 +1,6 @@
 """Diagnose and change the model, until it is adequate or something must be measured."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 from hilcal import limits
@@ -12,6 +12,7 @@ from hilcal.diagnosis.background_evidence import (
     proved,
 )
 from hilcal.diagnosis.diagnosis import Diagnosis, History, Verdict
+from hilcal.diagnosis.effect_probabilities import effect_probabilities
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.promise import LEAST_KEPT, kept_by_refit
@@ -111,6 +112,14 @@ class Refinement(Shown):
     def rejected(self) -> tuple[str, ...]:
         """Effects whose addition was tried and did not lower the error on poses left out."""
         return self.diagnosis.history.rejected
+
+    def probabilities(self, effects: Iterable[str]) -> dict[str, float]:
+        """Return the probability that the arm has each effect, by name.
+
+        See `diagnosis.effect_probabilities`. An effect that no step tested has 0.04: prior odds of
+        one to nine, less the price of its strength.
+        """
+        return effect_probabilities([s.diagnosis for s in self.steps], effects)
 
 
 def refine(

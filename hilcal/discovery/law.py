@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.discovery.amplitudes import Amplitude, Factor, unit_of
+from hilcal.discovery.expressions import expressions
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.sites import ORDINARY, Site
 from hilcal.discovery.terms import LawTerm
@@ -245,6 +246,11 @@ class Law:
     def formula(self) -> str:
         """The formula as plain text."""
         return self.form.text()
+
+    @property
+    def expressions(self) -> dict[str, str]:
+        """Its value at each site as arithmetic of named quantities; see `expressions`."""
+        return expressions(self)
 
     @property
     def acts_on(self) -> tuple[str, ...]:

@@ -218,7 +218,9 @@ class Comparison:
             A = np.vstack([J / scale, np.sqrt(damping) * np.eye(len(theta))])
             move = np.linalg.lstsq(A, -np.append(r, np.zeros(len(theta))), rcond=None)[0] / scale
             tried = off(theta + move)
-            if np.all(np.isfinite(tried)) and tried @ tried < r @ r:
+            with np.errstate(over="ignore"):  # a step too far
+                better = bool(np.all(np.isfinite(tried)) and tried @ tried < r @ r)
+            if better:
                 theta, r, damping = theta + move, tried, max(damping / 5.0, 1e-12)
             elif (damping := 5.0 * damping) > 1e8:
                 break

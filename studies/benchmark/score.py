@@ -100,6 +100,7 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
     """Return {"tasks": a row of each entrant and task, "groups": what they come to}.
 
     A run that failed, or whose file is not as the format says, is a row with its reason: "failed".
+    Who answers a law in any task has not found those of the tasks where it answers none.
 
     Raises:
         BenchmarkError: no tasks, no entrants, or a task that cannot be read.
@@ -129,6 +130,10 @@ def score_all(tasks: Path, results: Path) -> dict[str, Any]:
             except BenchmarkError as error:
                 row["failed"] = str(error)
             rows.append(row)
+    answer = {row["entrant"] for row in rows if row.get("law_equivalent") is not None}
+    for row in rows:
+        if row["track"] == "law" and row["entrant"] in answer and row["failed"] is None:
+            row["law_equivalent"] = row["law_equivalent"] or 0.0
     return {"tasks": rows, "groups": groups(rows)}
 
 

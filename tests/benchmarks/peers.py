@@ -32,8 +32,8 @@ KINDS = {
         a general cone solver (CVXOPT, through PICOS), and its time grows fast with their number;
         hilcal solves the problem for few of them, and scans the others for those that would add
         something. For a number of poses figaroh takes those of most weight, or exchanges one pose
-        at a time (its `Detmax`, which needs no continuous optimum, is as fast as hilcal's whole
-        search among few candidates, and returns the value that it reached but not the poses).
+        at a time (its `Detmax`, which needs no continuous optimum, is at least as fast as hilcal's
+        whole search among few candidates, and returns the value that it reached but not the poses).
         hilcal searches for whole numbers from the continuous optimum on, and states a proved bound
         of what is lost.
         """,

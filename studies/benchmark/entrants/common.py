@@ -15,8 +15,9 @@ import json
 import sys
 import time
 import xml.etree.ElementTree as ET
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -279,6 +280,15 @@ def spread(residual: Floats, asked: Asked) -> Floats:
     return np.full((len(asked.test.q), 3), np.sqrt(variance))
 
 
+def chosen(
+    asked: Asked, settings: Sequence[float], predict: Callable[[float, ArmRows, ArmRows], Floats]
+) -> tuple[float, Floats]:
+    """Return the setting that predicts poses left out best, and the residual (N, 3) of them."""
+    tried = [left_out(asked.train, partial(predict, setting)) for setting in settings]
+    best = int(np.argmin([np.sum(r**2) for r in tried]))
+    return settings[best], tried[best]
+
+
 def ridge(asked: Asked) -> tuple[Callable[[ArmRows], Floats], Floats]:
     """Choose the prior's multiple for geometry and compliance that poses left out ask for.
 
@@ -289,12 +299,44 @@ def ridge(asked: Asked) -> tuple[Callable[[ArmRows], Floats], Floats]:
     def fit(multiple: float, rows: ArmRows, steps: int = 4) -> Floats:
         return asked.arm.fit(rows, ORDINARY * multiple, asked.sigma, steps)
 
-    def off(multiple: float) -> Floats:
-        return left_out(asked.train, lambda a, b: asked.arm.predict(fit(multiple, a, 3), b))
+    def predict(multiple: float, rows: ArmRows, other: ArmRows) -> Floats:
+        return asked.arm.predict(fit(multiple, rows, 3), other)
 
-    tried = [off(m) for m in MULTIPLES]
-    best = int(np.argmin([np.sum(r**2) for r in tried]))
-    return lambda rows: fit(MULTIPLES[best], rows), tried[best]
+    best, off = chosen(asked, MULTIPLES, predict)
+    return lambda rows: fit(best, rows), off
+
+
+def families(
+    asked: Asked, theta: Floats, rows: ArmRows, waves: int
+) -> tuple[Floats, dict[str, Floats]]:
+    """Columns of frames and of families of effects, at a fit.
+
+    Args:
+        asked: the task.
+        theta: (51,) where the arm is linearised.
+        rows: N readings.
+        waves: K; waves of the joints, sin k q and cos k q, k = 1 ... K.
+
+    Returns:
+        (3N, 9) of the frames, and (3N, q) of each family in ordinary magnitudes: link lengths, link
+        angles, compliances, and the waves, each octave a family.
+    """
+    by, joints = asked.arm.jacobian(theta, rows)
+    each = by[:, :, GEOMETRY].reshape(len(by), 3, 6, 6)
+    z = {"length": 5e-4 * each[..., :3], "angle": 5e-4 * each[..., 3:]}
+    z["give"] = 1e-5 * by[:, :, COMPLIANCE]
+    for k in range(1, waves + 1):
+        name = f"octave {int(np.ceil(np.log2(k)))}"
+        two = [1e-4 * joints * f(k * rows.q)[:, None] for f in (np.sin, np.cos)]
+        z[name] = np.concatenate([*([z[name]] if name in z else []), *two], axis=-1)
+    frames = by[:, :, :FRAMES].reshape(-1, FRAMES)
+    return frames, {n: c.reshape(3 * len(by), -1) for n, c in z.items()}
+
+
+def wave(name: str, k: int) -> tuple[Callable[[Floats], Floats], Callable[[str], str]]:
+    """Return sine or cosine of k x, and how it is written."""
+    f = getattr(np, name)
+    return lambda x: np.asarray(f(k * x)), lambda x: f"{name}({k}*{x})"
 
 
 def learnt(
@@ -374,6 +416,12 @@ class Sought:
         y = np.einsum("nik,ni->nk", moves, off) / np.maximum(square, 1e-2 * square.max())
         size = float(np.sqrt(np.mean(y**2)))
         return cls(names, np.stack(x, axis=1), y / size, size, moves, known)
+
+    def law(self, factors: Floats, terms: Sequence[str]) -> dict[str, str] | None:
+        """Return Σ factor · term as a law, terms products of its quantities; None for nothing."""
+        named = zip(factors * self.size, terms, strict=True)
+        words = [f"{c:.4g}*{term.replace(' ', '*')}" for c, term in named if c != 0.0]
+        return {"formula": " + ".join(words)} if words else None
 
     def positions(self, value: Floats) -> Floats:
         """(N, 3) positions with values (N, k), in their units, beside the fit."""

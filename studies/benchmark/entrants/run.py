@@ -1,6 +1,7 @@
 """Run the entrants, each in an environment of its own, on tasks; keep, score and tell the results.
 
     python -m studies.benchmark.entrants.run TASKS -o RESULTS [--entrants a,b] [--tasks GLOB]
+        [--beside KEPT]
 
 An entrant is a folder beside this file with entrant.py and requirements.txt. Its environment is
 made once. It sees a copy of the task without the truth. What stops it (a crash, the limit of time,
@@ -27,7 +28,7 @@ from typing import Any
 
 from ..score import score_all
 from ..task import BenchmarkError, folders, for_entrants, read_result, read_task
-from .tables import block, page
+from .tables import block, kept, page
 
 HERE = Path(__file__).parent
 ROOT = HERE.parents[2]
@@ -171,10 +172,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     p.add_argument("--python", action="append", default=[], metavar="NAME=PATH", help=instead)
     p.add_argument("--score", action="store_true", help="run nothing, score what is there")
     p.add_argument("--keep", type=Path, help="keep the scores, JSON")
+    others = "scores that were kept: in the table, entrants that were not run stand beside"
+    p.add_argument("--beside", metavar="KEPT", type=Path, help=others)
     p.add_argument("--page", type=Path, help="write the page of tables, Markdown")
     given = p.parse_args(arguments)
     entrants = Entrants(given.home, given.envs, _pairs(given.python), given.limit)
     try:
+        beside = _kept(given.beside) if given.beside else []
         known = entrants.names()
         names = given.entrants.split(",") if given.entrants else known
         if unknown := [*{*names, *entrants.given} - {*known}]:
@@ -205,8 +209,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _put(given.keep, f'{head}, "rows": [\n{lines}\n]}}\n')
     if given.page:
         _put(given.page, page(date, rows, given.home))
-    print(block(rows))
+    ran, done = {row["entrant"] for row in rows}, {(row["task"], row["part"]) for row in rows}
+    more = [r for r in beside if r["entrant"] not in ran and (r["task"], r["part"]) in done]
+    print(block(rows + more))
     return 0
+
+
+def _kept(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of scores that were kept.
+
+    Raises:
+        BenchmarkError: a file that holds no scores.
+    """
+    try:
+        return kept(path)[1]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        why = f"cannot be read ({error}); valid: a file that --keep wrote"
+        raise BenchmarkError(f"--beside {path}: {why}") from error
 
 
 if __name__ == "__main__":

@@ -49,6 +49,8 @@ def block(rows: Sequence[Group]) -> str:
 
 def page(date: str, rows: Sequence[Group], home: Path) -> str:
     """Return the page: a table of each track, by poses and strength, and what failed."""
+    did = Counter(row["entrant"] for row in rows if not row["failed"])
+    of = " that an entrant did" if len({*did.values()}) > 1 else ""
     out = [
         "# The benchmark of hidden effects",
         "",
@@ -58,10 +60,10 @@ def page(date: str, rows: Sequence[Group], home: Path) -> str:
         block(rows),
         "",
         "Error at fresh poses: rms, over the best entrant's in each task; geometric mean over the",
-        "tasks that an entrant did; 1.00: always the best. In 95 % band: share of coordinates",
+        f"tasks{of}; 1.00: always the best. In 95 % band: share of coordinates",
         "within the stated band. Log score: mean log probability of what is the case, over the",
-        "candidates; 0 is perfect. Laws: share that is equivalent to the truth. s: seconds of one",
-        "processor, median.",
+        "candidates; 0 is perfect. Laws: share of the tasks of their track in which the formula is",
+        "equivalent to the truth, of entrants that write any. s: seconds of one processor, median.",
         "",
         "| entrant | what it is |",
         "|---|---|",

@@ -252,6 +252,21 @@ def test_a_law_that_cannot_be_read_is_a_failure_with_its_reason(tmp_path: Path) 
     assert found["right"][0]["law_equivalent"] == 1.0
     assert "open('x')" in found["wrong"][0]["failed"]
     assert found["silent"][0]["law_error"] is None
+    assert found["silent"][0]["law_equivalent"] is None
+
+
+def test_who_writes_a_law_in_one_task_has_not_found_those_that_it_leaves_out(
+    tmp_path: Path,
+) -> None:
+    first, second = sorted(TASKS.glob("law-*"))[:2]
+    scored(tmp_path, first, some=answer(first), none=answer(first, law=None))
+    scored(tmp_path, second, some=answer(second, law=None), none=answer(second, law=None))
+    document = score_all(tmp_path / "tasks", tmp_path / "results")
+    found = {(r["entrant"], r["task"]): r["law_equivalent"] for r in document["tasks"]}
+    assert [found["some", f.name] for f in (first, second)] == [1.0, 0.0]
+    assert [found["none", f.name] for f in (first, second)] == [None, None]
+    own = next(e for e in document["groups"][0]["entrants"] if e["entrant"] == "some")
+    assert own["law_equivalent"]["value"] == 0.5
 
 
 @pytest.mark.parametrize("track", ["elastic", "law", "mujoco"])

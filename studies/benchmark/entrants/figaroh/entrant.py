@@ -1,8 +1,7 @@
 """figaroh: its calibration of geometry, by priors on placements, registration and target estimated.
 
-figaroh 1.0 models no load on the tool: rows are fitted alike, whatever hangs there. With
-`method: map` it has no elasticity either; its elasticity goes without priors and knows the weight
-of the links alone.
+figaroh 1.0 models no load on the tool: rows are fitted alike, whatever hangs there. With priors it
+has no elasticity either; its elasticity knows the weight of the links alone.
 """
 
 import logging
@@ -12,13 +11,17 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-import yaml  # type: ignore[import-untyped]
 from figaroh.calibration.base_calibration import BaseCalibration  # type: ignore[import-not-found]
 from figaroh.calibration.calibration_tools import calc_updated_fkm  # type: ignore[import-not-found]
 from figaroh.tools.robot import Robot  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
 from benchmark.entrants.common import Asked, enter, spread  # type: ignore[import-not-found]
+
+CONFIG = """tasks: {{calibration: {{kinematics: {{base_frame: universe, tool_frame: tool0}},
+  measurements: {{markers: [{{measurable_dof: [true, true, true, false, false, false]}}]}},
+  parameters: {{calibration_level: full_params, estimation: {{method: map, noise_std: {s:.17e}}}}},
+  data: {{number_of_samples: {n}, source_file: "{data}"}}}}}}"""
 
 
 class PlacedArm(BaseCalibration):  # type: ignore[misc]
@@ -30,7 +33,7 @@ class PlacedArm(BaseCalibration):  # type: ignore[misc]
 
     def predicted(self, var: Any, q: Any) -> Any:
         """Return positions at (N, 6) joint angles, axis by axis."""
-        config = {**self.calib_config, "NbSample": len(q)}
+        config = self.calib_config | {"NbSample": len(q)}
         return calc_updated_fkm(self.model, self.data, var, q, config)
 
 
@@ -42,16 +45,7 @@ def geometry(asked: Asked) -> dict[str, Any]:
         data, config = Path(folder, "data.csv"), Path(folder, "config.yaml")
         head = ",".join(["x1", "y1", "z1", *joints])
         np.savetxt(data, np.hstack([rows.y, rows.q]), delimiter=",", header=head, comments="")
-        markers = [{"measurable_dof": [True] * 3 + [False] * 3}]
-        method = {"method": "map", "noise_std": asked.sigma}
-        calibration = {
-            "kinematics": {"base_frame": "universe", "tool_frame": "tool0"},
-            "measurements": {"markers": markers},
-            "parameters": {"calibration_level": "full_params", "estimation": method},
-            "data": {"number_of_samples": len(rows.q), "source_file": str(data)},
-        }
-        about = {"robot": {"name": "arm"}, "tasks": {"calibration": calibration}}
-        config.write_text(yaml.safe_dump(about), encoding="utf-8")
+        config.write_text(CONFIG.format(s=asked.sigma, n=len(rows.q), data=data), "utf-8")
         arm = PlacedArm(robot, str(config))
         arm.calib_config |= {"known_baseframe": False, "known_tipframe": False}
         arm.initialize()

@@ -1,10 +1,9 @@
 """A sketch of a mixed model: families of effects as random, their variances by REML.
 
-    y = A b + Σ_f Z_f u_f + e,   u_f ~ N(0, s_f² 1),  e ~ N(0, s_e² 1)
+    y = A b + Σ_f Z_f u_f + e,   u_f ~ N(0, s_f² 1),  e ~ N(0, s_e² 1),   b: frames
 
-b: frames; families: link lengths, link angles, compliances, waves of the joints in octaves. Log s
-has a weak normal prior (Patterson and Thompson, Biometrika 58 (1971) 545; Robinson, Statistical
-Science 6 (1991) 15). It is linear about the frames of a ridge fit, and dense.
+Log s has a weak normal prior (Patterson and Thompson, Biometrika 58 (1971) 545; Robinson,
+Statistical Science 6 (1991) 15). It is linear about the frames of a ridge fit, and dense.
 """
 
 import sys
@@ -16,32 +15,17 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import minimize
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, enter, ridge  # type: ignore[import-not-found]
+from benchmark.entrants.common import Asked, enter, families, ridge  # type: ignore[import-not-found]
 
 WAVES, SPREAD = 32, 3.0
-
-
-def columns(asked: Asked, theta: Any, rows: Any) -> tuple[Any, dict[str, Any]]:
-    """Return columns of the frames and of each family, in ordinary magnitudes."""
-    by, joints = asked.arm.jacobian(theta, rows)
-    each = by[:, :, 9:45].reshape(len(by), 3, 6, 6)
-    z = {
-        "length": 5e-4 * each[..., :3],
-        "angle": 5e-4 * each[..., 3:],
-        "give": 1e-5 * by[:, :, 45:],
-    }
-    for k in range(1, WAVES + 1):
-        name = f"octave {int(np.ceil(np.log2(k)))}"
-        two = [1e-4 * joints * f(k * rows.q)[:, None] for f in (np.sin, np.cos)]
-        z[name] = np.concatenate([*([z[name]] if name in z else []), *two], axis=-1)
-    return by[:, :, :9].reshape(-1, 9), {n: c.reshape(3 * len(by), -1) for n, c in z.items()}
+OFTEN: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
 
 
 def mixed(asked: Asked) -> dict[str, Any]:
     """Estimate the variances, predict by the BLUP, and say how far it may be off."""
     theta = ridge(asked)[0](asked.train)
     theta[9:] = 0.0
-    (a, z), (at, zt) = (columns(asked, theta, rows) for rows in (asked.train, asked.test))
+    (a, z), (at, zt) = (families(asked, theta, r, WAVES) for r in (asked.train, asked.test))
     r = (asked.train.y - asked.arm.predict(theta, asked.train)).ravel()
     gram = [c @ c.T for c in z.values()]
     mean = np.r_[0.0, 0.0, 0.0, -0.7 * np.arange(len(z) - 3), 0.0]
@@ -60,12 +44,9 @@ def mixed(asked: Asked) -> dict[str, Any]:
         return float(r @ w + logs + np.sum(((s - mean) / SPREAD) ** 2))
 
     bounds = [(m - 5.0, m + 5.0) for m in mean[:-1]] + [(-1.0, 4.0)]
-    often: Any = {"maxiter": 4, "xtol": 0.05, "ftol": 1e-4}
-    s = minimize(cost, mean, method="Powell", bounds=bounds, options=often).x
+    s = minimize(cost, mean, method="Powell", bounds=bounds, options=OFTEN).x
     root, inner, b, w = solved(s)
-    size = np.concatenate(
-        [np.full(c.shape[1], np.exp(x)) for x, c in zip(s, z.values(), strict=False)]
-    )
+    size = np.repeat(np.exp(s[:-1]), [c.shape[1] for c in z.values()])
     own, other = (np.hstack([*c.values()]) * size for c in (z, zt))
     across = other @ own.T
     rest = at - across @ cho_solve(root, a)

@@ -14,16 +14,9 @@ import numpy as np
 import pysindy as ps  # type: ignore[import-not-found]
 
 sys.path.append(str(Path(__file__).parents[3]))
-from benchmark.entrants.common import Asked, Sought, enter, left_out, ridge, spread  # type: ignore[import-not-found]
+from benchmark.entrants.common import Asked, Sought, chosen, enter, ridge, spread, wave  # type: ignore[import-not-found]
 
-THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)
-"""Least share that a term has of the root mean square of what is explained; 10: no term."""
-
-
-def wave(name: str, k: int) -> tuple[Any, Any]:
-    """Return sine or cosine of k x, and how it is written."""
-    f = getattr(np, name)
-    return lambda x: f(k * x), lambda x: f"{name}({k}*{x})"
+THRESHOLDS = (0.1, 0.2, 0.3, 0.5, 10.0)  # least share of a term in what is explained; 10: no term
 
 
 def library(angles: int, all_: int) -> Any:
@@ -36,30 +29,28 @@ def library(angles: int, all_: int) -> Any:
     return ps.GeneralizedLibrary(both, [[1, 1]], inputs_per_library=parts)
 
 
+def model(at: Any, threshold: float) -> Any:
+    """Fit SINDy to the values of what is sought."""
+    optimizer = ps.STLSQ(threshold * len(at.x) ** 0.5, alpha=0.1, normalize_columns=True)
+    made = ps.SINDy(optimizer, library(6, at.x.shape[1]))
+    return made.fit(at.x, t=1.0, x_dot=at.y, feature_names=at.names)
+
+
 def sparse(asked: Asked) -> dict[str, Any]:
     """Choose the threshold on poses left out."""
     fit, _ = ridge(asked)
-
-    def model(at: Any, threshold: float) -> Any:
-        optimizer = ps.STLSQ(threshold * len(at.x) ** 0.5, alpha=0.1, normalize_columns=True)
-        made = ps.SINDy(optimizer, library(6, at.x.shape[1]))
-        return made.fit(at.x, t=1.0, x_dot=at.y, feature_names=at.names)
 
     def predict(threshold: float, rows: Any, other: Any) -> Any:
         theta = fit(rows)
         at, there = Sought.of(asked, theta, rows), Sought.of(asked, theta, other)
         return replace(there, size=at.size).positions(model(at, threshold).predict(there.x))
 
-    tried = [left_out(asked.train, lambda a, b, t=t: predict(t, a, b)) for t in THRESHOLDS]
-    best = int(np.argmin([np.sum(r**2) for r in tried]))
-    out = {"prediction_m": predict(THRESHOLDS[best], asked.train, asked.test)}
+    best, off = chosen(asked, THRESHOLDS, predict)
+    out = {"prediction_m": predict(best, asked.train, asked.test), "std_m": spread(off, asked)}
     if "acts_on" in asked.task.about:
-        at = Sought.of(asked, fit(asked.train), asked.train)
-        found = model(at, THRESHOLDS[best])
-        terms = zip(found.coefficients()[0] * at.size, found.get_feature_names(), strict=True)
-        words = [f"{c:.4g}*{name.replace(' ', '*')}" for c, name in terms if c != 0.0]
-        out["law"] = {"formula": " + ".join(words)} if words else None
-    return out | {"std_m": spread(tried[best], asked)}
+        found = model(at := Sought.of(asked, fit(asked.train), asked.train), best)
+        out["law"] = at.law(found.coefficients()[0], found.get_feature_names())
+    return out
 
 
 if __name__ == "__main__":

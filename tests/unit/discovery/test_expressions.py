@@ -1,0 +1,93 @@
+"""Laws as arithmetic: it has the value of the law's own amplitudes, or is left out."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.composed import composed
+from hilcal.discovery.law import Coefficient, Form, Law, LawPart
+from hilcal.discovery.sites import Site, sites
+from hilcal.discovery.variables import Variable, variables
+from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.protocol import Situation
+from studies.benchmark.formula import Formula
+
+CELL = example_cell()
+
+
+def situation() -> Situation:
+    states = example_states(CELL)
+    n = len(states)
+    more = {"time": 30.0 * np.arange(n), "air_temperature": 20.0 + np.linspace(-1.0, 2.0, n)}
+    return example_situation(CELL, replace(states, **more))
+
+
+S = situation()
+NAMED: dict[str, Variable] = {v.symbol: v for v in variables(S)}
+COLUMNS: dict[str, Any] = {
+    **{f"q{j + 1}": S.angle[:, j] for j in range(6)},
+    **{f"tau{j + 1}": S.torque[:, j] for j in range(6)},
+    "force": np.linalg.norm(S.states.wrench[:, :3], axis=1),
+    "time": S.states.time,
+    "air": S.states.air_temperature,
+}
+
+
+def site(symbol: str) -> Site:
+    return next(s for s in sites(CELL.arm.n) if s.symbol == symbol)
+
+
+def law(*parts: tuple[str, float, Amplitude]) -> Law:
+    """A law with a coefficient of each part."""
+    form = Form(tuple(LawPart(site(at), a, k) for k, (at, _, a) in enumerate(parts)))
+    numbers = tuple(Coefficient("abc"[k], value, 0.0, "1") for k, (_, value, _) in enumerate(parts))
+    return Law("law_1", form, numbers, 0.0, 9.0, 0.9, 1.0, 1.0, (), ())
+
+
+def of(symbol: str, shape: shapes.Shape = shapes.LINEAR, *numbers: float) -> Amplitude:
+    return Amplitude((Factor(NAMED[symbol], shape, numbers),))
+
+
+AIR = next(symbol for symbol in NAMED if symbol.startswith("(T_air"))
+SUM = "(q_2 + q_3 + q_4)"
+WAVE = Amplitude((Factor(NAMED["q_4"], shapes.COS, (2.0,)), Factor(NAMED["τ_3"], shapes.LINEAR)))
+BEND = Amplitude((Factor(composed(((1.0, of("q_1")), (-0.5, of("q_5")))), shapes.ABOVE, (0.2,)),))
+
+
+@pytest.mark.parametrize(
+    "amplitude",
+    [
+        of("q_3", shapes.SIN, 3.0),
+        of(SUM, shapes.COS, 1.0),
+        of("(q_1 - q_2)", shapes.COS, 1.0),
+        of("τ_2", shapes.THRESHOLD, 4.0),
+        of("|f|", shapes.ABOVE, 10.0),
+        of("t", shapes.RELAXATION, 600.0),
+        of(AIR),
+        WAVE,
+        BEND,
+        Amplitude(()),
+    ],
+    ids=lambda a: a.text() or "constant",
+)
+def test_an_expression_has_the_value_of_the_law(amplitude: Amplitude) -> None:
+    text = law(("dq_3", 2e-4, amplitude)).expressions["dq_3"]
+    value = Formula.parse(text, COLUMNS).value(COLUMNS)
+    np.testing.assert_allclose(value + 0.0 * S.angle[:, 0], 2e-4 * amplitude.values(S), rtol=1e-12)
+
+
+def test_each_site_has_the_sum_of_its_terms() -> None:
+    found = law(
+        ("dq_3", 2e-4, of("q_3")), ("base_z", 1e-3, of("t")), ("dq_3", -1e-4, of("τ_1"))
+    ).expressions
+    assert found == {"dq_3": "0.0002*((q3)) + -0.0001*((tau1))", "base_z": "0.001*((time - 0.0))"}
+
+
+@pytest.mark.parametrize("symbol", ["f_x", "ρ", "z", "mF_x", "gF_z"])
+def test_a_site_whose_law_depends_on_what_has_no_name_is_left_out(symbol: str) -> None:
+    both = law(("dq_1", 1e-4, of("q_2")), ("dq_2", 1e-4, of(symbol)))
+    assert list(both.expressions) == ["dq_1"]
