@@ -5,9 +5,9 @@ import time
 from dataclasses import dataclass
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.failure import CHECK_LINK, failure
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.reading import Receiver
+from hilcal.drivers.ur_link.states import CHECK_LINK, failure
 from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats

@@ -5,9 +5,8 @@ the same. They differ, too, in where programs go and in the registers that a cli
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
-from hilcal.drivers.ur_link.dashboard import Dashboard, RobotFacts
+from hilcal.drivers.ur_link.dashboard import Dashboard
 from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.robot_api import RobotApi
 
@@ -16,29 +15,7 @@ POLYSCOPE_X = 10
 REALTIME_PORT, PRIMARY_PORT = 30003, 30001
 
 
-class Supervision(Protocol):
-    """A dashboard server or Robot API; every call raises LinkError where it fails, in time."""
-
-    @property
-    def name(self) -> str:
-        """What it is, for people."""
-        ...
-
-    def check(self, seconds: float) -> None:
-        """Ask for a sign of life."""
-        ...
-
-    def describe(self, seconds: float) -> RobotFacts:
-        """Ask for everything worth knowing."""
-        ...
-
-    def in_remote_control(self, seconds: float) -> bool | None:
-        """Whether programs may command the arm; None where the controller does not say."""
-        ...
-
-    def stop(self, seconds: float) -> None:
-        """Stop the robot's program, and with it the arm."""
-        ...
+Supervision = Dashboard | RobotApi
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,7 @@ from hilcal.drivers.ur_link import primary, states
 from hilcal.drivers.ur_link.dashboard import RobotFacts
 from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.probe import ControllerFacts
-from hilcal.drivers.ur_link.reading import Reading
-from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.reading import Reading, Receiver
 from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.measuring.devices import Report
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hilcal.drivers.simulated.ur.state import line
 from hilcal.drivers.ur_link import states
-from hilcal.drivers.ur_link.cause import program_ended
+from hilcal.drivers.ur_link.brakes import program_ended
 from hilcal.drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
 from hilcal.drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
 from hilcal.drivers.ur_link.survey import settled_rate
