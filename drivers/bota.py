@@ -8,8 +8,7 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_sensor import checked_config, open_streaming
-from hilcal.drivers.force_stream import SensorFormat
+from hilcal.drivers.force_stream import SensorFormat, checked_config, open_streaming
 from hilcal.drivers.frame_losses import ByDeviceClock
 from hilcal.drivers.frames import FrameFormat, crc_x25
 from hilcal.measuring.devices import ForceSensorDevice

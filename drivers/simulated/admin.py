@@ -104,6 +104,16 @@ class Operations:
         return self._state() if result is None else result
 
 
+def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Callable[..., None]:
+    """Return the operation that sets an attribute to its one argument, whatever that is called."""
+
+    def store(**given: Any) -> None:
+        (value,) = given.values()
+        setattr(target, name, kind(value))
+
+    return store
+
+
 def _die() -> None:
     threading.Timer(0.02, os._exit, (70,)).start()
 

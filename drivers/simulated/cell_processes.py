@@ -1,7 +1,6 @@
 """A whole simulated cell: one process per device, all looking into one physical world."""
 
 import contextlib
-import os
 import secrets
 import socket
 import subprocess
@@ -9,7 +8,6 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -19,11 +17,11 @@ from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.world import World
 from hilcal.drivers.simulated.world_server import open_board, write_world
+from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-_ROOT = Path(__file__).resolve().parents[2]
 _END = 2.0  # s that a process has to end by itself, and again after it was asked to
 
 
@@ -54,19 +52,13 @@ class DeviceProcess:
         """Start the process, after ending one that still runs; returns at once."""
         self.kill()
         self.socket.unlink(missing_ok=True)
-        path = os.environ.get("PYTHONPATH")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
-            "OMP_NUM_THREADS": "1",
-        }
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 self._command,
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
-                env=environment,
+                env={**environment(), "OMP_NUM_THREADS": "1"},
                 start_new_session=True,  # Ctrl-C is for the one who started it
             )
 
@@ -267,12 +259,7 @@ class SimulatedCell:
         """Return the running cell."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End every process."""
         self.close()
 

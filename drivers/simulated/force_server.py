@@ -180,8 +180,8 @@ class Bota(SensorProtocol):
     def operations(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
         return {
-            "saturate": lambda on: setattr(self, "saturated", bool(on)),
-            "clock": lambda us: setattr(self, "_start_us", int(us)),
+            "saturate": admin.setter(self, "saturated"),
+            "clock": admin.setter(self, "_start_us", int),
         }
 
 
@@ -388,7 +388,7 @@ class Stream:
         own: dict[str, Callable[..., object]] = {
             "overload": self.gauge.add,
             "freeze": self.gauge.freeze,
-            "stall": lambda on: setattr(self, "stalled", bool(on)),
+            "stall": admin.setter(self, "stalled"),
         }
         return admin.Operations(own | self.sensor.operations() | self.port.faults(), self.state)
 

@@ -348,9 +348,6 @@ def respond(station: Station, line: str) -> bytes:
 def operations(station: Station, port: PtyPort) -> admin.Operations:
     """Return what can be asked of the station."""
 
-    def put(name: str) -> Callable[..., None]:
-        return lambda on: setattr(station, name, bool(on))
-
     def delay(rpc: int, seconds: float, count: int = 1) -> None:
         station.delays[int(rpc)] = float(seconds), int(count)
 
@@ -364,17 +361,13 @@ def operations(station: Station, port: PtyPort) -> admin.Operations:
         }
 
     own: dict[str, Callable[..., object]] = {
-        "beam": put("broken"),
-        "hide": station.hide,
-        "lock_lost": lambda: setattr(station, "locked", False),
-        "freeze": lambda on: setattr(station, "stuck", station.seen if on else None),
-        "stray": station.follow_stray,
-        "dist_error": put("dist_error"),
+        **station.faults(),
+        "dist_error": admin.setter(station, "dist_error"),
         "warn": station.warn,
-        "busy": put("busy"),
+        "busy": admin.setter(station, "busy"),
         "delay": delay,
         "wrong_trid": lambda count=1: setattr(station, "wrong_transactions", int(count)),
-        "meas_s": lambda seconds: setattr(station, "meas_s", float(seconds)),
+        "meas_s": admin.setter(station, "meas_s", float),
         "log": lambda: [[number, *values] for number, values in list(station.requests)],
     }
     return admin.Operations(own | port.faults(), state)

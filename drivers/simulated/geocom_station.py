@@ -2,11 +2,12 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
 
@@ -155,6 +156,16 @@ class Station:
     seen: PolarPoint | None = None
     stuck: PolarPoint | None = None
     stray: PolarPoint | None = None
+
+    def faults(self) -> dict[str, Callable[..., None]]:
+        """Return what can go wrong between instrument and target, by name."""
+        return {
+            "beam": setter(self, "broken"),
+            "hide": self.hide,
+            "lock_lost": lambda: setattr(self, "locked", False),
+            "freeze": lambda on: setattr(self, "stuck", self.seen if on else None),
+            "stray": self.follow_stray,
+        }
 
     def hide(self, targets: Iterable[int]) -> None:
         """Cover these targets by number, and no others."""

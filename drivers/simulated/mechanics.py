@@ -138,20 +138,14 @@ def build(
         here = pin.SE3.Identity()
         return int(model.idx_qs[last])
 
-    base = []
-    if tilts:
-        base = [
-            add(pin.JointModelRX(), "base_x"),
-            add(pin.JointModelRY(), "base_y"),
-            add(pin.JointModelRZ(), "base_z"),
-        ]
+    turns = [(pin.JointModelRX(), "x"), (pin.JointModelRY(), "y"), (pin.JointModelRZ(), "z")]
+    base = [add(kind, f"base_{axis}") for kind, axis in turns] if tilts else []
     here = pin.SE3(links[0])
     tilt, tilt_joint, drive, beam = [], [], [], []
     guide: list[list[int]] = []
     bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
     for j in range(arm.n):
         slides = bool(arm.slides[j])
-        turns = [(pin.JointModelRX(), "x"), (pin.JointModelRY(), "y"), (pin.JointModelRZ(), "z")]
         if slides:
             drive.append(add(pin.JointModelPZ(), f"drive{j + 1}"))
             shifts = [(pin.JointModelPX(), "px"), (pin.JointModelPY(), "py")]
@@ -168,22 +162,10 @@ def build(
         if j + 1 in bent:
             tip = pin.SE3(_beam_axes(links[j + 1][:3, 3]), links[j + 1][:3, 3])
             here = tip
-            moves = (
-                pin.JointModelPY(),
-                pin.JointModelPZ(),
-                pin.JointModelRX(),
-                pin.JointModelRY(),
-                pin.JointModelRZ(),
-            )
+            moves = (pin.JointModelPY(), pin.JointModelPZ(), *(kind for kind, _ in turns))
             beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(moves)])
             here = tip.inverse() * pin.SE3(links[j + 1])
-    hand = []
-    if tool:
-        hand = [
-            add(pin.JointModelRX(), "tool_x"),
-            add(pin.JointModelRY(), "tool_y"),
-            add(pin.JointModelRZ(), "tool_z"),
-        ]
+    hand = [add(kind, f"tool_{axis}") for kind, axis in turns] if tool else []
     carried = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
     model.appendBodyToJoint(last, carried, here)
     return ElasticTree(

@@ -207,22 +207,19 @@ class Cameras:
 def operations(cameras: Cameras) -> admin.Operations:
     """Return what can be asked of the cameras."""
 
-    def put(name: str) -> Callable[..., None]:
-        return lambda on: setattr(cameras, name, bool(on))
-
     def state() -> dict[str, Any]:
         versions = [list(version) for version, _ in cameras.clients.values()]
         return {"frames": cameras.number, "clients": versions, "hidden": cameras.hidden}
 
     own: dict[str, Callable[..., object]] = {
-        "beam": put("hidden"),
-        "stall": put("stalled"),
-        "pause": put("paused"),
-        "insist": put("insist"),
-        "lose": lambda share: setattr(cameras, "lose", float(share)),
+        "beam": admin.setter(cameras, "hidden"),
+        "stall": admin.setter(cameras, "stalled"),
+        "pause": admin.setter(cameras, "paused"),
+        "insist": admin.setter(cameras, "insist"),
+        "lose": admin.setter(cameras, "lose", float),
         "forget": lambda: cameras.clients.clear(),
-        "rename": lambda name: setattr(cameras, "name", str(name)),
-        "bodies": lambda count: setattr(cameras, "others", int(count)),
+        "rename": admin.setter(cameras, "name", str),
+        "bodies": admin.setter(cameras, "others", int),
     }
     return admin.Operations(own, state)
 

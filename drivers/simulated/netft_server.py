@@ -157,13 +157,6 @@ class NetFt:
 def operations(sensor: NetFt) -> admin.Operations:
     """Return what can be asked of the sensor."""
 
-    def put(name: str, kind: Callable[[Any], Any]) -> Callable[..., None]:
-        def store(**given: Any) -> None:
-            (value,) = given.values()
-            setattr(sensor, name, kind(value))
-
-        return store
-
     def state() -> dict[str, Any]:
         return {
             "frames": sensor.number,
@@ -175,13 +168,13 @@ def operations(sensor: NetFt) -> admin.Operations:
     own: dict[str, Callable[..., object]] = {
         "overload": sensor.gauge.add,
         "freeze": sensor.gauge.freeze,
-        "stall": put("stalled", bool),
+        "stall": admin.setter(sensor, "stalled"),
         "restart": sensor.restart,
-        "lose": put("lose", float),
-        "twice": put("twice", float),
-        "cut": put("cut", float),
-        "status": put("status", lambda word: word),
-        "page": put("elements", dict),
+        "lose": admin.setter(sensor, "lose", float),
+        "twice": admin.setter(sensor, "twice", float),
+        "cut": admin.setter(sensor, "cut", float),
+        "status": admin.setter(sensor, "status", lambda word: word),
+        "page": admin.setter(sensor, "elements", dict),
     }
     return admin.Operations(own, state)
 

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.simulated.admin import setter
+
 BITS_PER_BYTE = 10
 FIFO = 16384
 """Bytes that wait for a reader beyond what the terminal itself holds."""
@@ -188,9 +190,9 @@ class PtyPort:
     def faults(self) -> dict[str, Callable[..., None]]:
         """Return what can go wrong on the line, by name."""
         return {
-            "flip": lambda probability: setattr(self, "flip", float(probability)),
-            "cut": lambda probability: setattr(self, "cut", float(probability)),
-            "mute": lambda on: setattr(self, "mute", bool(on)),
+            "flip": setter(self, "flip", float),
+            "cut": setter(self, "cut", float),
+            "mute": setter(self, "mute"),
             "half_frame": lambda: setattr(self, "_halve", True),
             "garbage": self.garbage,
             "unplug": self.unplug,

@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +88,11 @@ class SimulationCase:
     hidden: str
     strength_sigma: float
     home: Floats | None = field(default=None, kw_only=True)
+
+    def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
+        """Return what was measured in it, with the configuration that it was measured with."""
+        kept = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
+        return Rehearsal(**{**kept, "config": config or self.config}, readings=readings)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -372,8 +377,7 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float =
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
-    readings = replace(readings, pose_names=plan.pose_names)
-    return Rehearsal(s.config, s.cell, s.mode, world, s.hidden, s.strength_sigma, readings)
+    return replace(s, world=world).measured(replace(readings, pose_names=plan.pose_names))
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import contextlib
 import socket
 import time
-from types import TracebackType
 from typing import Self
 
 
@@ -106,12 +105,7 @@ class Connection:
         """Return the open connection."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End the connection."""
         self.close()
 

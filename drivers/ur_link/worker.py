@@ -16,6 +16,12 @@ from typing import Any
 _ROOT = Path(__file__).resolve().parents[2]
 
 
+def environment() -> dict[str, str]:
+    """Return the environment of a child process that has to import this very program."""
+    path = os.environ.get("PYTHONPATH")
+    return {**os.environ, "PYTHONPATH": f"{_ROOT}{os.pathsep}{path}" if path else str(_ROOT)}
+
+
 class WorkerError(Exception):
     """A worker did not carry out a request; the text gives the reason.
 
@@ -52,11 +58,6 @@ class Worker:
         self._buffer = b""
         self._socket, theirs = socket.socketpair()
         life, self._life = os.pipe()
-        path = os.environ.get("PYTHONPATH")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
-        }
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 [sys.executable, "-P", "-m", module, str(life), str(os.getpid()), *arguments],
@@ -64,7 +65,7 @@ class Worker:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=(life,),
-                env=environment,
+                env=environment(),
             )
         except OSError as error:
             self._let_go()

@@ -154,7 +154,7 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
             missing(campaign)
             stored = campaign.readings(), campaign.about(COVERS)
             readings = full_readings(*stored, secret.cell, there.config)
-            return _rehearsal(secret, there.config, readings)
+            return secret.measured(readings, there.config)
 
         def further(more: Plan) -> Rehearsal:
             log = RunLog(campaign)
@@ -181,7 +181,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
         def measured(part: Plan, number: int, begun: float) -> Rehearsal:
             r = read_plan(secret, part, [told.seed, number], begun)
             _write(t, campaign, r.readings)
-            return _rehearsal(secret, secret.config, campaign.readings())
+            return secret.measured(campaign.readings())
 
         def further(more: Plan) -> Rehearsal:
             last = last_time(campaign.readings())
@@ -240,18 +240,6 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
         for begin, end in pairwise(starts):
             campaign.append_readings(readings[slice(begin, end)])
             advance(1)
-
-
-def _rehearsal(secret: SimulationCase, config: CellConfig, readings: Readings) -> Rehearsal:
-    return Rehearsal(
-        config=config,
-        cell=secret.cell,
-        mode=secret.mode,
-        world=secret.world,
-        hidden=secret.hidden,
-        strength_sigma=secret.strength_sigma,
-        readings=readings,
-    )
 
 
 NEXT_SEED = 1000

@@ -238,6 +238,20 @@ class Trajectory:
             self._end(self._now)
         self._now = max(self._now, now)
 
+    def publish(self, board: Blackboard, payload: float, com: Floats) -> None:
+        """Write what the arm does, and the payload (kg, m) that its controller was told."""
+        board.write(
+            "arm",
+            alive=1.0,
+            q=self.q,
+            qd=self.qd,
+            side=self.side,
+            arrivals=self.arrivals,
+            moving=float(self.moving),
+            payload=payload,
+            payload_com=com,
+        )
+
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
         self._time, self._stopping, self._stands = 0.0, False, None
@@ -387,6 +401,12 @@ class ArmState:
                 return Safety.ROBOT_EMERGENCY_STOP | Safety.EMERGENCY_STOP | Safety.STOPPED
             case _:
                 return Safety.NORMAL
+
+    @property
+    def program_state(self) -> str:
+        """State of the program in the words of dashboard and Robot API."""
+        known = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
+        return known.get(self.runtime, "STOPPED")
 
     @property
     def able(self) -> bool:
