@@ -73,8 +73,8 @@ from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
 from hilcal.present.progress import Say, working
 from hilcal.present.verdict import message
+from hilcal.procedure.next_plan import plan_of
 from hilcal.procedure.procedure import Measure, Procedure
-from hilcal.procedure.separate import plan_of
 from hilcal.procedure.state import Files, Settings
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model

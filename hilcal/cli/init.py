@@ -377,11 +377,7 @@ def init(
 ) -> None:
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
-    given: dict[str, list[str]] = {
-        f"--{name.replace('_', '-')}": value if isinstance(value, list) else [value]
-        for name, value in locals().items()
-        if name in _OPTIONS and value is not None
-    }
+    options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
     there = somebody_there(t) and not as_json
     check_folder(cell, str(cell))
     check_new(cell, force or (there and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
@@ -389,8 +385,9 @@ def init(
     if there:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
     for item in items():
-        if item.option in given:
-            for words in given[item.option]:
+        given = options[item.option]
+        if given is not None:
+            for words in given if isinstance(given, list) else [given]:
                 _from_option(draft, item, words)
         elif there:
             _ask(t, draft, item)
@@ -410,15 +407,6 @@ def init(
         f"and with the devices{_lacking(draft)}:\n  hilcal check {quoted(cell)} --plan plan.json"
     )
     t.document({"cell": str(cell), "config": draft.data})
-
-
-_OPTIONS = frozenset(
-    {
-        *("robot", "host", "repeatability", "tracker", "tracker_port", "tracker_accuracy"),
-        *("force_sensor", "force_port", "target", "load_point", "tool_mass", "tool_com", "load"),
-        *("readings", "floor", "tracker_place"),
-    }
-)
 
 
 def _lacking(draft: Draft) -> str:

@@ -23,7 +23,7 @@ from hilcal.cli.options import (
 )
 from hilcal.cli.planning import answer_json, dry_checked, make_checked, read_cell, refuse_unready
 from hilcal.cli.showing import followed
-from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
+from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.goal_rule import GoalRule
@@ -327,10 +327,5 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
             raise KeyboardInterrupt
         t.notice("stopping the arm; wait a moment")
 
-    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(kind, stop) for kind in kinds]
-    try:
+    with handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), stop):
         yield
-    finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import TextIO
 
 from rich.console import Console, RenderableType
@@ -144,9 +145,18 @@ def told_to_end(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
         while not asked:
             time.sleep(POLL)
 
-    before = [signal.signal(kind, lambda number, _: asked.append(number)) for kind in kinds]
-    try:
+    with handled(kinds, lambda number, _: asked.append(number)):
         yield wait
+
+
+@contextmanager
+def handled(
+    kinds: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], object]
+) -> Iterator[None]:
+    """Handle signals as long as the block lasts."""
+    before = {kind: signal.signal(kind, handler) for kind in kinds}
+    try:
+        yield
     finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)
+        for kind, earlier in before.items():
+            signal.signal(kind, earlier)

@@ -12,11 +12,11 @@ from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import ArmDevice, Clock
 from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import route
 from hilcal.measuring.session import LiveModel, Session
 from hilcal.measuring.stopping_rule import StoppingRule
 from hilcal.store.plan import Plan
+from hilcal.store.run_log import RunLog
 
 HOW_ON = "The campaign is safe: run again with --resume"
 EMERGENCY = "press the emergency stop"
@@ -28,7 +28,7 @@ def run(
     cell: Cell,
     config: CellConfig,
     plan: Plan,
-    store: Store,
+    store: RunLog,
     clock: Clock,
     watcher: Watcher,
     live: LiveModel | None = None,
@@ -107,7 +107,7 @@ def _stop(arm: ArmDevice) -> str:
     return "interrupted"
 
 
-def _note(store: Store, error: BaseException, trouble: str) -> None:
+def _note(store: RunLog, error: BaseException, trouble: str) -> None:
     """Store why the session ended, as far as that is possible."""
     content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error)}
     if trouble:

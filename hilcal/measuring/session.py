@@ -21,12 +21,13 @@ from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.reading_record import Store, detail, reading_of, sample_json, stored_wrench
+from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.measuring.route import Stop
 from hilcal.measuring.session_state import Eta, SessionState, Shift
 from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 Done = TypeVar("Done")
@@ -43,7 +44,7 @@ class Session:
         cell: Cell,
         config: CellConfig,
         plan: Plan,
-        store: Store,
+        store: RunLog,
         clock: Clock,
         watcher: Watcher,
         live: LiveModel | None = None,

@@ -1,7 +1,7 @@
 """Ending a campaign as soon as its goal is met: the status of the goal, and the way home."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -9,24 +9,14 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, Watcher
-from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import Stop, home
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.store.run_log import RunLog
 
-
-class StoppingRule(Protocol):
-    """Judges the readings of a campaign by its goal."""
-
-    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
-        """Return how far the goal is.
-
-        Args:
-            readings: all readings so far.
-            last: whether the plan has no others; otherwise the answer may be that of a few
-                readings before, so that judging does not delay the campaign.
-        """
-        ...
+StoppingRule = Callable[[Readings, bool], GoalStatus]
+"""Tells from all readings so far how far the goal is. Unless it is told that the plan has no more,
+the answer may be that of a few readings before, so that judging does not delay the campaign."""
 
 
 class GoalCheck:
@@ -40,7 +30,7 @@ class GoalCheck:
         self,
         rule: StoppingRule | None,
         plan: Plan,
-        store: Store,
+        store: RunLog,
         watcher: Watcher,
         event: Callable[[str, dict[str, Any]], None],
     ) -> None:

@@ -1,6 +1,6 @@
 """The run at corrected joint targets: its plan, and its readings beside those of validation."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -20,14 +20,13 @@ from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.route import approach_sides, duration, route
 from hilcal.present.calibration import refusals
+from hilcal.present.progress import Say
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan
 from hilcal.types import Bools, Floats, Ints
-
-Say = Callable[[str], None]
 
 POINTS, LEFT_OUT = "points", "left_out"
 """Keys of a plan's file: what was expected of each point, and which are missing."""

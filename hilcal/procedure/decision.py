@@ -1,6 +1,5 @@
 """Whether more is to be measured: what is in doubt, and what a further plan would tell."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +14,14 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import about
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.procedure.separate import doubt_of, plan_of, separating
+from hilcal.present.progress import Say
+from hilcal.procedure.next_plan import doubt_of, plan_of, separating
 from hilcal.procedure.state import Settings, duration_of
 from hilcal.procedure.validation_plan import RECORDED
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
 from hilcal.types import Floats
-
-Say = Callable[[str], None]
 
 WORTH = 0.05
 """Share by which a further plan must lower the predicted error to be worth its time; a choice."""

@@ -25,6 +25,7 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
+from hilcal.present.progress import Say
 from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
 from hilcal.procedure.shared import reference_of
 from hilcal.procedure.state import (
@@ -47,7 +48,6 @@ from hilcal.store.plan import Plan
 from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
-Say = Callable[[str], None]
 Measure = Callable[[CampaignFile, float | None], None]
 """Measures what is missing of a campaign's plan and stores it there; the time of day, s, that its
 time counts from is given where it is not its own."""

@@ -1,6 +1,5 @@
 """Poses and loads of a validation campaign: within what was measured, and none of its poses."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import compress
 
@@ -16,11 +15,10 @@ from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
+from hilcal.present.progress import Say
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
-
-Say = Callable[[str], None]
 
 DRAWN = 4
 """Poses that are drawn for each one that is wanted; a choice: few of them cannot be reached or lie

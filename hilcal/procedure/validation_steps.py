@@ -4,7 +4,6 @@ The validation campaign is a file of its own. Before anything is predicted of it
 the calibration's log; from then on it has to be just this.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from hilcal.calibration.improvement import Improvement, improvement
@@ -13,6 +12,7 @@ from hilcal.errors import InputError
 from hilcal.identification import validation
 from hilcal.identification.acceptance import Acceptance, acceptance
 from hilcal.identification.extrapolation import extrapolation
+from hilcal.present.progress import Say
 from hilcal.procedure.corrected import corrected_plan, expected_of, paired
 from hilcal.procedure.shared import CalibrationContext, reference_in, reference_of
 from hilcal.procedure.state import (
@@ -30,7 +30,6 @@ from hilcal.store.purpose import CORRECTED, VALIDATION
 from hilcal.store.records import content_hash
 from hilcal.store.run_log import PLAN
 
-Say = Callable[[str], None]
 VALIDATING, CORRECTING = 2, 3
 """Streams of random numbers; 0 and 1 are those of the plans that are fitted."""
 
