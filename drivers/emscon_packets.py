@@ -89,12 +89,7 @@ _MEANING = {
 
 
 def failure(doing: str, status: int) -> DeviceError:
-    """Return the exception for a status that is not `OK`.
-
-    Args:
-        doing: what was asked for, e.g. "measuring".
-        status: of the command or of the result.
-    """
+    """Return the exception for a status that is not `OK`, e.g. of "measuring"."""
     if status in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[status]} (status {status})")
     words = _MEANING.get(status)

@@ -351,10 +351,7 @@ def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStrea
 def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceStream:
     """Open the port of a sensor that streams from power-on, and wait for the first frame.
 
-    Args:
-        section: the configuration; its own rate comes before `baud`.
-        baud: the sensor's rate as delivered, Bd.
-        sensor: what it sends.
+    The rate of the configuration comes before `baud`, the one of the sensor as delivered, Bd.
 
     Raises:
         DeviceError: no such port, in use, nothing or nothing sensible comes.

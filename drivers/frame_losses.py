@@ -36,10 +36,8 @@ class ByDeviceClock:
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
         """Take frames that came together; return which of them are in their place.
 
-        Args:
-            count: their number.
-            ticks: the device's clock at each, empty where it has none.
-            now: when they were read, s; nothing was left to read then.
+        `ticks` is the device's clock at each, empty where it has none; `now` is when they were
+        read, s, and nothing was left to read.
         """
         return [self._in_place(tick) for tick in ticks]
 

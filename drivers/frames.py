@@ -63,7 +63,6 @@ class Deframer:
     once a second good frame follows it directly.
 
     Attributes:
-        frames: good frames so far.
         corrupt: frames with a wrong checksum; several candidates inside one length count once.
         skipped: bytes that belonged to no good frame; both from the first good frame on, for
             who begins to listen comes into the middle of one.

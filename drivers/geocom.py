@@ -114,16 +114,7 @@ class GeoComTracker:
         return TrackerSample(polar.host_ns, value, covariance, polar.warning)
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a target is expected, aim at the one that is there, lock on it.
-
-        Args:
-            position: (3,) sensor axes, m.
-            radius: a target farther from there is another one, m.
-
-        Raises:
-            TargetLostError: there is none.
-            DeviceError: the instrument or its line failed.
-        """
+        """Turn to where a target is expected, aim at it, lock on it; see `PointingTracker.aim`."""
         x, y, z = (float(v) for v in position)
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
@@ -137,12 +128,7 @@ class GeoComTracker:
         self._find(min(2 * radius / distance, self._options.search_rad), search=False)
 
     def find_target(self) -> None:
-        """Aim at the target, search for it where it is not in sight, lock on it.
-
-        Raises:
-            TargetLostError: not found.
-            DeviceError: the instrument or its line failed.
-        """
+        """Aim at the target, search for it where it is not in sight, lock on it."""
         self._find(self._options.search_rad, search=True)
 
     def _find(self, window: float, search: bool) -> None:
@@ -169,11 +155,7 @@ class GeoComTracker:
                 raise TargetLostError(f"{DEVICE}: the instrument does not hold its target locked")
 
     def report(self) -> Report:
-        """Ask the instrument who it is and how it is, and measure once; nothing turns.
-
-        Raises:
-            DeviceError: the line failed.
-        """
+        """Ask the instrument who it is and how it is, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
         name = self._told(until, geo.NAME, _text) or ("GeoCOM instrument",)
         serial = self._told(until, geo.SERIAL_NUMBER, int)

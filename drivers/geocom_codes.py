@@ -96,12 +96,7 @@ def words(code: int) -> str:
 
 
 def failure(doing: str, code: int) -> DeviceError:
-    """Return the exception for a return code that gave no reading.
-
-    Args:
-        doing: what was asked for, e.g. "measuring".
-        code: any code but `OK` and `WARNINGS`.
-    """
+    """Return the exception for a return code that gave no reading, e.g. of "measuring"."""
     if code in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
     advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""

@@ -115,12 +115,9 @@ class Link:
     ) -> Reply:
         """Send a request until it is answered without damage.
 
-        Args:
-            request: its number.
-            values: its arguments; floats stay floats on the line.
-            parsers: one per value of the reply.
-            until: deadline of all tries together, `time.monotonic` s.
-            seconds: how long one answer may take, s.
+        `values` are its arguments, of which floats stay floats on the line; `parsers` one per value
+        of the reply; `until` the deadline of all tries together, `time.monotonic` s; `seconds` how
+        long one answer may take.
 
         Raises:
             DeviceError: the line is broken, mute or garbled; says which.

@@ -85,12 +85,7 @@ class NatNetTracker:
                 raise
 
     def measure(self) -> TrackerSample:
-        """Average the next frames, see the module.
-
-        Raises:
-            TargetLostError: the rigid body is not seen.
-            DeviceError: no frames come, or the same one again and again.
-        """
+        """Average the next frames, see the module; one that comes again and again is refused."""
         bodies = self._frames(self._options.frames)
         position = np.array([b.position for b in bodies])
         turns = Rotation.from_quat(np.array([b.quaternion for b in bodies]))
@@ -111,20 +106,11 @@ class NatNetTracker:
         return TrackerSample(time.monotonic_ns(), value[:m], covariance[:m, :m])
 
     def find_target(self) -> None:
-        """Wait until the rigid body is seen; cameras do not turn.
-
-        Raises:
-            TargetLostError: it is not.
-            DeviceError: no frames come.
-        """
+        """Wait until the rigid body is seen; cameras do not turn."""
         self._frames(1)
 
     def report(self) -> Report:
-        """Say who answered, and measure once.
-
-        Raises:
-            DeviceError: no frames come.
-        """
+        """Say who answered, and measure once."""
         s = self._server
         version = f"{s.version[0]}.{s.version[1]}"
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"

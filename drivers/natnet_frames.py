@@ -36,11 +36,7 @@ def message(number: int, content: bytes = b"") -> bytes:
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return number and content of a message.
-
-    Raises:
-        struct.error: it is cut short.
-    """
+    """Return number and content of a message; raises struct.error where it is cut short."""
     number, size = _HEAD.unpack_from(data)
     if len(data) < _HEAD.size + size:
         raise struct.error("cut short")
@@ -60,8 +56,6 @@ class NatNetServer:
     """Who answered, and how it sends frames.
 
     Attributes:
-        name: of the program.
-        program: its version.
         version: of NatNet in which it sends frames.
         data_port: where it sends frames to; 0 where it does not tell.
         group: multicast address; empty where it sends to each client.
@@ -75,11 +69,7 @@ class NatNetServer:
 
 
 def server(content: bytes) -> NatNetServer:
-    """Return what the answer to a connection says.
-
-    Raises:
-        struct.error: it is cut short.
-    """
+    """Return what the answer to a connection says; raises struct.error where it is cut short."""
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
     known = NatNetServer(_text(name), ".".join(map(str, numbers[:4])), version)
@@ -95,11 +85,9 @@ class Body:
     """A rigid body in a frame.
 
     Attributes:
-        number: its streaming ID.
         position: (3,) of its pivot, m.
         quaternion: (4,) scalar last.
         error: mean distance of its markers from where they should be, m.
-        tracked: whether it was seen in this frame.
     """
 
     number: int
@@ -110,28 +98,20 @@ class Body:
 
 
 class Reader:
-    """Reads a content from its beginning on."""
+    """Reads a content from its beginning on; raises struct.error where that ends before."""
 
     def __init__(self, content: bytes, version: Version) -> None:
         """Begin."""
         self.content, self.version, self.at = content, version, 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:
-        """Return the next numbers.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Return the next numbers."""
         values = layout.unpack_from(self.content, self.at)
         self.at += layout.size
         return values
 
     def count(self) -> int:
-        """Return the next number.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Return the next number."""
         return int(self.take(_COUNT)[0])
 
     def listed(self) -> tuple[int, int]:
@@ -141,11 +121,7 @@ class Reader:
         return count, self.at + size if size else 0
 
     def text(self) -> str:
-        """Return the next text.
-
-        Raises:
-            struct.error: it does not end.
-        """
+        """Return the next text."""
         end = self.content.find(b"\0", self.at)
         if end < 0:
             raise struct.error("a text without an end")
@@ -154,11 +130,7 @@ class Reader:
         return words
 
     def skip(self, size: int) -> None:
-        """Leave bytes out.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Leave bytes out."""
         self.at += size
         if not 0 <= self.at <= len(self.content):
             raise struct.error("cut short")

@@ -26,11 +26,8 @@ BY_ID = Path("/dev/serial/by-id")
 def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial.Serial:
     """Open a serial port, 8N1, raw, locked against every other program that asks.
 
-    Args:
-        device: its part in the cell for messages, e.g. "tracker".
-        path: of the port, e.g. a link in /dev/serial/by-id.
-        baud: rate, Bd.
-        timeout: of reads and writes, s; 0.5 by default.
+    `device` is its part in the cell, for messages; `baud` the rate, Bd; `timeout` of reads and
+    writes, s.
 
     Raises:
         DeviceError: there is no such port, it is in use by another program, may not be used, or
@@ -67,16 +64,7 @@ def line_failures(device: str, path: str) -> Iterator[None]:
 
 
 def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
-    """Throw away what comes until the line has been quiet for so long.
-
-    Args:
-        port: an open port.
-        quiet: how long nothing may come, s.
-        limit: when to give up, s.
-
-    Returns:
-        Whether it became quiet within the limit.
-    """
+    """Throw away what comes until the line has been quiet for so long, s; False after `limit` s."""
     now = time.monotonic()
     end, still_since = now + limit, now
     while now < end:

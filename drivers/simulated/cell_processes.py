@@ -30,11 +30,6 @@ class DeviceProcess:
 
     Its standard input is a pipe held by this process, whose end it follows; its output goes
     to DIR/NAME.log; it is ready when DIR/NAME.sock appears.
-
-    Attributes:
-        name: of the device: "world", "arm", "tracker", "force".
-        socket: its admin socket.
-        log: the file of its output.
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:
@@ -148,7 +143,6 @@ class SimulatedCell:
 
     Attributes:
         config: the given configuration, with the simulated devices filled in.
-        directory: where the devices meet.
     """
 
     def __init__(

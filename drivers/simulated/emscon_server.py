@@ -65,15 +65,9 @@ class SimulatedTracker:
     """What the tracker is set to and what it answers.
 
     Attributes:
-        station: its beam and the reflector that it holds.
-        noise: of a measurement.
         rng: of the orientation's noise.
-        initialized: whether it knows its zeros.
         settings: what the commands have set, by the command that reads it.
         failing: status and how many next answers have it, by command.
-        mute: whether it does not answer.
-        client: who is connected.
-        asked: the last commands.
     """
 
     station: Station

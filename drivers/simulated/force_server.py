@@ -44,8 +44,6 @@ class StrainGauge:
         wrench = true + bias + drift (T - T_start) + overload + noise
 
     Attributes:
-        board: the one physical world.
-        rng: generator of the noise.
         bias: (6,) when the world begins, N and N·m.
         drift: (6,) per K.
         noise: (6,) standard deviation of one frame.
@@ -107,8 +105,6 @@ class SensorProtocol:
     Attributes:
         baud: the line's rate, Bd.
         noise: of one frame, force in N and moment in N·m.
-        rate: frames per second.
-        streaming: whether it sends by itself.
     """
 
     baud = 0
@@ -121,12 +117,9 @@ class SensorProtocol:
         self.streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame.
+        """Return one frame of a wrench (6,), N and N·m, and a temperature, °C.
 
-        Args:
-            number: of the frame since power-on, lost ones counted.
-            wrench: (6,) N and N·m.
-            temperature: °C.
+        `number` counts frames since power-on, lost ones, too.
         """
         raise NotImplementedError
 
@@ -332,9 +325,6 @@ class Stream:
     """The sensor's clock: frame k is due at start + k / rate.
 
     Attributes:
-        sensor: its protocol.
-        gauge: its measuring bridge.
-        port: its line.
         stalled: whether frames are made but not sent.
         number: of the next frame, since power-on.
         due: when it is due, `time.monotonic`.

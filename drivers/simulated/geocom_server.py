@@ -41,9 +41,7 @@ class GeocomRequest:
     """One request, taken apart.
 
     Attributes:
-        rpc: number of the procedure.
         transaction: number that the answer repeats.
-        parameters: as written.
         checked: whether it came with a checksum, so the answer carries one too.
         error: code of the communication, `OK` where the request is sound.
     """

@@ -92,9 +92,6 @@ class Station:
     """A tracking station: it holds its target through jumps as long as the beam is free.
 
     Attributes:
-        board: the one physical world.
-        beam: its noise.
-        rng: generator.
         meas_s: world time of one distance measurement, s.
         locked: whether the target is held; no lock, no distance.
         broken: whether something stands in the beam.
@@ -113,12 +110,8 @@ class Station:
         distance_ms: station time of it, ms.
         ranging: until when a distance measurement runs, `time.monotonic`; None is not.
         tracking: whether the distance meter goes on by itself.
-        requests: the last requests: number and parameters.
-        measured: number of target measurements.
         number: of the target that is held, or was last.
         hidden: numbers of targets that cannot be seen.
-        several: whether the tool carries several targets.
-        seen: the last measurement.
         stuck: what is measured to the last digit whatever the target does; None is the target.
         stray: a reflector at rest that is followed instead; None is the target.
     """

@@ -55,7 +55,6 @@ class Draw:
     """Draws one effect's parameters in a plausible direction and of a plausible size.
 
     Attributes:
-        arm: the arm.
         compliance: (n,) the drives' compliances, which stiffening belongs to, rad/(N·m).
         torque: (n,) the largest torque at each drive in the states at hand, N·m.
         harmonics: number of harmonics of the transmission error.

@@ -58,24 +58,14 @@ class Cameras:
     """What the cameras see and whom they tell.
 
     Attributes:
-        board: the one physical world.
-        rng: generator.
-        line: UDP socket of commands.
-        version: of NatNet that it can.
         frame_std: of a frame, m.
         waves: (6, 4) per coordinate and turn: direction and phase of the distortion.
         distortion: its amplitude, m.
         group: multicast group; empty for none.
         clients: version and when it was heard of last, by address.
-        name: of the rigid body.
         others: rigid bodies beside it.
-        number: of the last frame.
-        hidden: whether the rigid body is not seen.
-        stalled: whether no frames are sent.
         paused: whether the same frame is sent again and again.
-        lose: share of frames that are lost.
         insist: whether the version that a client asks for when it connects is not heard.
-        seen: the pose in the last frame.
     """
 
     board: Blackboard

@@ -43,21 +43,12 @@ class NetFt:
     """The sensor: who is sent to, and how far it has counted.
 
     Attributes:
-        gauge: its measuring bridge.
-        rng: generator of faults.
-        rate: records per second.
-        line: its UDP socket.
         client: address that asked for records; None is nobody.
         left: how many records are left to send; 0 is without end.
-        number: of the last record.
         due: when the next one is due, `time.monotonic`.
-        begun: when it was switched on.
-        stalled: whether nothing is sent.
-        lose: share of datagrams that are lost.
         twice: share of datagrams that come again later.
         cut: share of datagrams that are cut short.
         status: sent instead of its own where it is not None.
-        elements: of its page, by name.
     """
 
     gauge: StrainGauge

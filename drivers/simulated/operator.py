@@ -22,7 +22,6 @@ class SimulatedOperator:
     Attributes:
         socket: the world's admin socket.
         hand: time that a change of the load takes, s of cell time.
-        clock: cell time.
         person: who is asked at the terminal, as in a real cell; None where nobody is.
     """
 

@@ -31,9 +31,7 @@ class OwnLaw:
     """An effect with its true parameters.
 
     Attributes:
-        effect: set up for `states`.
         states: of the campaign that it was set up for.
-        catalogue: that the effect is from.
         theta: (P,) its parameters, SI.
     """
 

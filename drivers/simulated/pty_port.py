@@ -50,20 +50,10 @@ class PtyPort:
         dropped: frames lost because nobody read them in time.
         flip: probability that one bit of a frame is flipped.
         cut: probability that a frame is truncated.
-        mute: whether nothing goes out.
     """
 
     def __init__(self, link: Path, baud: int, rng: np.random.Generator) -> None:
-        """Plug the line in.
-
-        Args:
-            link: symbolic link that is the port's name.
-            baud: the instrument's rate, Bd.
-            rng: generator for faults and garbage.
-
-        Raises:
-            ValueError: no such rate.
-        """
+        """Plug the line in; `link` is the port's name, `baud` the instrument's rate, Bd."""
         if baud not in _SPEEDS:
             raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
         self.link, self.baud = link, baud
@@ -120,9 +110,7 @@ class PtyPort:
     def send(self, frame: bytes, born: float | None = None) -> None:
         """Put a frame on the wire; it arrives by `pump` when its last bit has passed.
 
-        Args:
-            frame: bytes of one frame.
-            born: when the instrument began to send it, `time.monotonic`; None is now.
+        `born` is when the instrument began to send it, `time.monotonic`; None is now.
         """
         with self._lock:
             if self.mute or not self.plugged:

@@ -197,11 +197,7 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
-    Args:
-        hidden: the parameters.
-        arm: the arm.
-        states: N states.
-        reference: temperature at which joints do not drift, °C.
+    Joints do not drift at the temperature `reference`, °C.
 
     Raises:
         InputError: hysteresis without approach sides, or drifting joints without their

@@ -223,9 +223,7 @@ class World:
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
         """Return the static equilibrium of N states.
 
-        Args:
-            states: commanded joints and wrenches.
-            slip: (N, n) how far each drive missed its command, rad (repeatability).
+        `slip` (N, n) is how far each drive missed its command, rad (repeatability).
 
         Raises:
             InputError: the states lack what a hidden effect depends on, or find no equilibrium.
@@ -270,14 +268,9 @@ class World:
         """Return what the tracker would read of N states without noise of its own.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
-        T_flange_target, the target shifted by its offset; the position then 1 + s times as
-        long, about the origin of the sensor's axes. An effect of a user's own displaces the target
-        before drift and scale.
-
-        Args:
-            states: commanded joints and wrenches.
-            slip: as for `rest`.
-            rest: the equilibrium of these states, where it is known.
+        T_flange_target, the target shifted by its offset; the position then 1 + s times as long,
+        about the origin of the sensor's axes. An effect of a user's own displaces the target before
+        drift and scale. `slip` is as for `rest`, which is the equilibrium where that is known.
 
         Raises:
             InputError: the states lack what a hidden effect depends on, e.g. a drifting
@@ -328,14 +321,8 @@ class World:
         """Return the (N, m) readings of N states, with all noise.
 
         The arm's repeatability is drawn in joint space and goes through the equilibrium, so
-        that it is correlated over all elements; then the tracker adds its own.
-
-        Args:
-            states: N states.
-            rng: generator.
-            m: elements per reading, 3 or 6.
-            arrival: (N,) number of the arrival in which each reading is taken: those of one
-                arrival share the arm's scatter. Each reading is one of its own where None.
+        that it is correlated over all elements; then the tracker adds its own. Readings of one
+        `arrival` (N,) share the arm's scatter; each is one of its own where None. m is 3 or 6.
         """
         each = np.arange(len(states)) if arrival is None else arrival
         slip = self.joint_std * rng.standard_normal((int(each.max()) + 1, states.q.shape[1]))[each]
@@ -361,10 +348,7 @@ def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[
     origin lies within the arm's reach (readings in base axes) the instrument itself stands
     `distance` away from it.
 
-    Args:
-        cell: the configured cell.
-        rng: generator.
-        distance: from the base to the station, m.
+    `distance` is from the base to the station, m.
     """
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)

@@ -45,10 +45,8 @@ class SimulatedMount:
 
         f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
 
-        Args:
-            world: tool, load point (as it truly is) and gravity.
-            turn: (3, 3) true orientation of the flange, base axes.
-            wrench: (6,) of the load at its point, base axes, N and N·m.
+        Orientation `turn` (3, 3) of the flange and wrench (6,) of the load at its point are in
+        base axes.
         """
         cell = world.cell
         weight = cell.tool_mass * cell.gravity
@@ -211,13 +209,8 @@ class WorldState:
 
         w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change.
 
-        Args:
-            wrench: (6,) at the start, base axes, N and N·m.
-            period: s of world time, over 0.
-            decay: s of world time, over 0.
-
-        Raises:
-            InputError: another number.
+        `wrench` (6,) is that at the start, base axes, N and N·m; period and decay are over 0, s of
+        world time.
         """
         start = _six("swing", wrench)
         if not (period > 0.0 and decay > 0.0):

@@ -37,7 +37,6 @@ class Halt:
 
     Attributes:
         reading: after the stop; None where the arm's state cannot be read.
-        stands: whether it is sure that the arm stands.
         lost: why the state could not be read before it was connected to anew; else empty.
     """
 
@@ -67,10 +66,8 @@ class Brakes:
     def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
         """Stop in every way, which ends control; never raises.
 
-        Args:
-            control: ends with this; None where there is none.
-            brake: deceleration of the leading joint, rad/s².
-            lost: why the link is lost, if it is known to be.
+        `brake` is the deceleration of the leading joint, rad/s²; `lost` why the link is lost, if it
+        is known to be.
         """
         if control is not None:
             try:
@@ -138,11 +135,6 @@ def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, s
 
     A safety stop ends the program, and a lost link the process that commands the arm: what was
     noticed first is reported only where nothing deeper is found.
-
-    Args:
-        supervision: the controller's, to be asked.
-        halt: how the stop ended.
-        noticed: what the driver noticed.
     """
     reading = halt.reading
     if reading is not None and reading.sample.safety != states.NORMAL:
@@ -160,9 +152,7 @@ def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, s
 def program_ended(reading: Reading, late: float) -> str:
     """Return why the robot's program does not play any more, as far as it is known.
 
-    Args:
-        reading: without a playing program.
-        late: the longest pause in the signs of life to the robot's watchdog, s; 0 for none.
+    `late` is the longest pause in the signs of life to the robot's watchdog, s; 0 for none.
     """
     busy = f"this computer was too busy for {late:.2f} s to show that it lives"
     if late > 1.0 / WATCHDOG_HZ:

@@ -24,9 +24,7 @@ _NICE = -10
 def end_with_parent(life: int, parent: int) -> None:
     """End this process when the parent ends; Ctrl-C is for the parent alone.
 
-    Args:
-        life: file descriptor of the reading end of the parent's pipe.
-        parent: the parent's process number.
+    `life` is the file descriptor of the reading end of the parent's pipe, `parent` its number.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGIO, signal.SIG_DFL)

@@ -66,11 +66,7 @@ class Dashboard:
 
 
 def ask(host: str, commands: tuple[str, ...], seconds: float) -> list[str]:
-    """Return the answer to each command, all within one deadline.
-
-    Raises:
-        LinkError: no dashboard, or it does not answer in time.
-    """
+    """Return the answer to each command, all within one deadline."""
     with Connection(host, PORT, "dashboard server", seconds) as line:
         line.read_line()  # it greets first
         out = []

@@ -56,15 +56,10 @@ class MotionInProgress:
         arrival: float,
         clock: float,
     ) -> None:
-        """Begin.
+        """Begin, from `start` to `goal` (6,), rad.
 
-        Args:
-            start: (6,) joint angles at its start, rad.
-            goal: (6,) at its end, rad.
-            speed: of the leading joint, rad/s.
-            acceleration: of the leading joint, rad/s².
-            arrival: the largest joint error at its end, rad.
-            clock: cell seconds per real second.
+        Speed and acceleration are of the leading joint, rad/s and rad/s²; `arrival` is the largest
+        joint error at its end, rad; `clock` cell seconds per real second.
         """
         self.brake = deceleration(speed)
         self._goal, self._arrival = goal, arrival

@@ -123,11 +123,7 @@ class Receiver:
     """Reads the arm's state; each reading is newer than the call for it."""
 
     def __init__(self, host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> None:
-        """Connect within a deadline.
-
-        Raises:
-            LinkError: the controller does not answer or sends no data.
-        """
+        """Connect within a deadline; each call raises LinkError where no new data come."""
         self._host = host
         self._arguments = (host, repr(hz), ",".join(outputs))
         self._worker = self._start(seconds)
@@ -138,11 +134,7 @@ class Receiver:
         return self._worker.pid
 
     def read(self, stale: float = PATIENCE_S) -> Reading:
-        """Return the next packet, which is newer than the call.
-
-        Raises:
-            LinkError: no new data for `stale` real s, or damaged ones.
-        """
+        """Return the next packet, which is newer than the call, within `stale` real s."""
         try:
             return read(self._worker.call("sample", stale + _ANSWER_S, stale=stale))
         except WorkerError as error:
@@ -152,11 +144,7 @@ class Receiver:
             raise LinkError(f"the RTDE data are damaged: {error}") from None
 
     def rate(self, seconds: float) -> float:
-        """Return the packets per second over a while.
-
-        Raises:
-            LinkError: no new data.
-        """
+        """Return the packets per second over a while."""
         try:
             deadline = seconds + PATIENCE_S + _ANSWER_S
             answer = self._worker.call("rate", deadline, window=seconds, stale=PATIENCE_S)
@@ -165,11 +153,7 @@ class Receiver:
             raise LinkError(str(error)) from None
 
     def renew(self, seconds: float) -> None:
-        """Connect again, in a new process.
-
-        Raises:
-            LinkError: the controller does not answer or sends no data.
-        """
+        """Connect again, in a new process."""
         begun = time.monotonic()
         self._worker.kill()
         # It shows much earlier than the library does that no data come.

@@ -23,7 +23,6 @@ class Generation:
     """How a controller of one generation is supervised and commanded.
 
     Attributes:
-        supervision: its dashboard server or Robot API.
         script_port: takes programs: the real-time port, of PolyScope X the primary one.
         upper: whether commands go by the upper half of the registers (24 to 47), which no fieldbus
             uses. ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any

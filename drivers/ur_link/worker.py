@@ -43,12 +43,7 @@ class Worker:
     """
 
     def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
-        """Start the process and wait until it reports that it is ready.
-
-        Args:
-            module: name of the module to run.
-            arguments: for its command line.
-            seconds: deadline.
+        """Start the process and wait until it reports that it is ready, for so many seconds.
 
         Raises:
             WorkerError: it did not get ready; it is gone.

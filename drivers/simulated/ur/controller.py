@@ -54,8 +54,6 @@ class Controller:
     """Runs one program at a time, and stops it for every reason there is.
 
     Attributes:
-        arm: the shared state.
-        scripts: programs received.
         unlock_after: real time before a protective stop can be unlocked, s.
         hears: whether the client that writes an integer register has an open link.
     """
@@ -323,9 +321,7 @@ class DashboardServer(ClientServer):
     def answer(self, words: str, local: bool) -> str:
         """Return the answer to a line.
 
-        Args:
-            words: the line.
-            local: the connection was made in local mode; it never gets more rights.
+        A connection that was made in `local` mode never gets more rights.
         """
         command = words.lower()
         asked = self._questions().get(command)

@@ -27,12 +27,9 @@ class PrimaryPort:
     """Sends states to every client, and takes programs from them."""
 
     def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
-        """Serve a controller.
+        """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m.
 
-        Args:
-            controller: the controller.
-            rows: (4, 6) theta, a, d, alpha of its kinematics, rad and m.
-            status: of its calibration, `LINEARISED` or `NOT_INITIALISED`.
+        `status` is that of its calibration, `LINEARISED` or `NOT_INITIALISED`.
         """
         self._controller, self._rows, self._status = controller, rows, status
 

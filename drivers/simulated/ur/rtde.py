@@ -114,9 +114,6 @@ class Recipe:
 
     Attributes:
         number: its id on the connection, 1 or more.
-        names: the variables in order.
-        kinds: their types.
-        layout: of id and variables.
     """
 
     number: int
@@ -379,11 +376,7 @@ class RtdeLinks:
     """All RTDE clients of one controller.
 
     Attributes:
-        arm: the shared state.
-        sensors: what is told.
-        faults: what goes wrong.
         taken: called after each input package.
-        links: the open connections.
         owners: which connection may write an input variable.
     """
 

@@ -348,20 +348,11 @@ class ArmState:
     """State of controller and arm.
 
     Attributes:
-        clock: world time.
-        kinematics: of the nominal arm.
-        trajectory: where the commanded arm is.
-        version: of PolyScope.
-        registers: the general-purpose ones.
         payload: what the controller has been told, kg.
         payload_com: (3,) flange axes, m.
         tcp: (6,) of the tool point on the flange, m and rad.
-        robot_mode: power.
-        runtime: of the program.
-        safety_mode: what the safety system says.
         remote: whether it takes orders from the network.
         scaling: further factor on the speed, as the controller applies it by itself.
-        slider: the speed slider.
         digital_outputs: RTDE `actual_digital_output_bits`.
         refuses_motion: whether a motion that is commanded ends the program instead.
         frozen_q: (n,) what the encoders tell in spite of any motion, rad; None is the truth.
