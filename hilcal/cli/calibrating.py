@@ -209,7 +209,6 @@ class _Continuation:
     """How an interrupted calibration is continued, for people.
 
     Attributes:
-        t: where people are told.
         on: the command that goes on.
         again: the command that begins.
     """

@@ -65,12 +65,8 @@ class RehearsalSettings:
     """What a rehearsal is of.
 
     Attributes:
-        config: the cell; its loads are all there.
         choice: an effect that is hidden, "random" or "nothing".
-        seed: of everything random.
-        output: the campaign file to make.
         base_dir: directory that paths in the configuration are relative to.
-        catalogue: the effects that a model can have.
         lacking: the same with what is hidden, where the models cannot have that.
     """
 
@@ -110,11 +106,7 @@ class RehearsedCampaign:
 def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
     """Plan a campaign, as the program that is not told what is hidden would.
 
-    Args:
-        told: what the rehearsal is of.
-        config: the cell, perhaps with some of its loads only.
-        poses: number of poses.
-        say: told what is being done.
+    `config` may have some of the loads only.
     """
     config = as_told(config, told.choice, told.world)
     cell = cell_from_config(config, told.base_dir)
@@ -205,15 +197,10 @@ def last_time(readings: Readings) -> float:
 
 
 def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:
-    """Measure, and go on after a failure as `run --resume` does.
+    """Do the work of measuring what is missing, and go on after a failure as `run --resume` does.
 
     A busy computer gives a simulated device no turn for a while, which is the same to the driver
-    as a device that fails.
-
-    Args:
-        t: where failures are told.
-        work: measures what is missing.
-        done: how many readings there are.
+    as a device that fails. `done` tells how many readings there are.
 
     Raises:
         DeviceError: it failed `TRIES` times on end without a further reading.

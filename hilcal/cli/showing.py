@@ -157,10 +157,7 @@ def _end_of_process() -> threading.Timer:
 def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]:
     """Let a live viewer follow what the block does, where it is asked for.
 
-    Args:
-        t: where it is said how to open it, and what is wrong with it.
-        asked: whether somebody wants it.
-        run: the campaign; the recording goes beside it.
+    The recording goes beside the campaign.
     """
     if not asked:
         yield None

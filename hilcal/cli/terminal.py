@@ -57,9 +57,7 @@ class Terminal:
     def document(self, content: Mapping[str, object], failed: HilcalError | None = None) -> None:
         """Print the JSON document, where it is asked for.
 
-        Args:
-            content: of the document.
-            failed: why the command fails nevertheless; it is in the document as "error".
+        With `failed`, why the command fails nevertheless, which is in the document as "error".
 
         Raises:
             HilcalError: `failed`, after printing.

@@ -51,11 +51,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
 def computer(folder: Path) -> tuple[Finding, ...]:
-    """Return the findings on this computer.
-
-    Args:
-        folder: where campaigns are stored.
-    """
+    """Return the findings on this computer, and on the folder where campaigns are stored."""
     return (clock(), *disk(folder), memory(), load())
 
 
@@ -173,11 +169,7 @@ def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> 
 
 
 def program(version: str) -> tuple[Finding, ...]:
-    """Return the findings on what is installed.
-
-    Args:
-        version: of hilcal.
-    """
+    """Return the findings on what is installed, of hilcal in this version."""
     return (
         Finding(PROGRAM, "hilcal", "ok", f"version {version}"),
         _python(),

@@ -23,13 +23,7 @@ _TINY = 1e-18  # m², below which a segment is a point
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clearance:
-    """The cell's shapes. Base axes, m; `clearance_of` makes it.
-
-    Attributes:
-        cell: the cell.
-        config: its obstacles and loads.
-        scene: the arm with its tool among the obstacles.
-    """
+    """The cell's shapes. Base axes, m; `clearance_of` makes it."""
 
     cell: Cell
     config: CellConfig

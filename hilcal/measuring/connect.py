@@ -24,10 +24,7 @@ class Rig:
     """Every device that a campaign uses, connected.
 
     Attributes:
-        arm: the arm.
-        tracker: the tracker.
         force: the force sensor; None where the cell has none.
-        operator: the person who hangs the loads.
     """
 
     arm: ArmDevice

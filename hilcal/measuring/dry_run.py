@@ -44,11 +44,6 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     Checked are all stops of the route and the straight paths in joint space between them by
     `Feasibility`, the tracker's sight of the target at each reading, the speed, and the names of
     the loads.
-
-    Args:
-        cell: the cell.
-        config: its limits, loads and motion.
-        plan: poses and steps.
     """
     limits = Feasibility(cell, config)
     problems = _cell_problems(config) + _load_problems(limits, plan)

@@ -95,10 +95,6 @@ class Feasibility:
     torques and moments by their own rates likewise.
 
     Attributes:
-        cell: the cell.
-        config: its limits, loads, obstacles and what the tracker sees.
-        margins: what is kept beyond them.
-        shapes: of arm, tool and obstacles.
         sight: the tracker's view; None where its place is not known.
     """
 
@@ -464,7 +460,6 @@ class _Touch:
     """Shapes that must not be closer than a margin in N states; `_Bounds` of their gaps.
 
     Attributes:
-        pairs: of shapes.
         q: (N, n) joint angles, rad.
         margin: m.
         rates: (K, n) how fast each pair may near, m/rad.

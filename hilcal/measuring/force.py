@@ -146,21 +146,13 @@ class ForceMeter:
 
     Attributes:
         zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        tool: what it carries.
         identified: whether the tool has been weighed, else it is that of the configuration.
     """
 
     def __init__(
         self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
     ) -> None:
-        """Use an open sensor.
-
-        Args:
-            sensor: the device.
-            settings: where it sits.
-            cell: the cell.
-            window: over how long it is averaged, real seconds.
-        """
+        """Use an open sensor, averaged over a window in real seconds."""
         self.sensor = sensor
         self.zero = np.zeros(6)
         self._cell, self._seconds = cell, window
@@ -239,14 +231,8 @@ class ForceMeter:
         """Find the real tool from unloaded readings.
 
         A reading whose force the tool does not explain to the tolerance was not unloaded, or
-        somebody leaned on the tool: the worst is left out until all are explained.
-
-        Args:
-            unloaded: the readings.
-            tolerance_N: by how much a force may differ.
-
-        Returns:
-            Numbers of the readings that were left out; None where they are too few.
+        somebody leaned on the tool: the worst is left out until all are explained. Returned are the
+        numbers of those; None where the readings are too few.
 
         Raises:
             HilcalError: their poses do not determine it, or fewer than `ENOUGH_POSES` agree.

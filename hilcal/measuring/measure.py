@@ -183,15 +183,7 @@ class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
     def __init__(self, count: int, scale: float = 1.0) -> None:
-        """Start empty.
-
-        Args:
-            count: K, the least number of samples to judge, 3 or more.
-            scale: cell seconds per real second (`Clock.scale`).
-
-        Raises:
-            ValueError: fewer than 3.
-        """
+        """Start empty; 3 samples or more are judged, at `scale` cell seconds per real second."""
         if count < 3:
             raise ValueError(f"count = {count}: a trend takes at least 3 samples")
         self._count, self._scale = count, scale
@@ -322,12 +314,8 @@ class MeasuredStop:
         q: (n,) mean actual joint angles meanwhile, rad.
         torque: (n,) mean torques that the drives were measured to exert meanwhile, N·m; None
             where the arm does not tell them.
-        before: sample of the arm at the start.
-        after: the same at the end.
-        tracker: every measurement of the tracker.
         force: mean wrench of the force sensor; None without one.
         settling: how long it took until all was settled, cell seconds.
-        remarks: what was remarkable, one line each.
     """
 
     mean: Average
@@ -365,10 +353,8 @@ class Measurer:
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
-        Args:
-            name: of the pose.
-            find: finds a lost target again; the tracker's search where None.
-            force: the wrench where it was averaged at this stop already.
+        `find` finds a lost target again, the tracker's search where None; `force` is the wrench
+        where it was averaged at this stop already.
 
         Raises:
             TargetLostError: the target was not found again.

@@ -75,12 +75,8 @@ def detail(
 ) -> dict[str, Any]:
     """Return everything raw behind a reading.
 
-    Args:
-        step: which one.
-        measured: what was measured.
-        tared: the mean wrench against the session's zero; None without a force sensor.
-        zero: (6,) that zero.
-        session: further keys of the session: times, losses, sides.
+    `tared` is the mean wrench against the session's zero (6,), None without a force sensor;
+    `session` has further keys: times, losses, sides.
     """
     out: dict[str, Any] = {
         "pose": step.pose,

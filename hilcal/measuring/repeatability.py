@@ -13,7 +13,6 @@ class UnloadedVisit:
     """One unloaded reading.
 
     Attributes:
-        pose: name of the pose.
         position: (3,) m, sensor axes.
         tracker: (3, 3) covariance of the instrument alone, m².
         gain: tr(J Jᵀ) of the target's translation, m²/rad².

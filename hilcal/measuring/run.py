@@ -38,23 +38,11 @@ def run(
 ) -> None:
     """Measure what is missing of a plan, or as much of it as a goal needs.
 
-    Every reading is stored before the next motion. Whatever is raised, also an interrupt from
-    the keyboard, the arm is stopped before anything else is done. The rig stays open.
-
-    Args:
-        rig: the open devices.
-        cell: the cell.
-        config: its limits and how to measure.
-        plan: the whole plan; steps that the store has are left out.
-        store: where readings go.
-        clock: the cell's time.
-        watcher: receives the events.
-        live: compares each reading with a model; None for no comparison.
-        wall: the time of day, s; it carries the campaign's time over a pause.
-        goal: decides when the readings are enough; then the arm goes home, the load is taken
-            off, and the rest is not measured.
-        epoch: the time of day, s, that the campaign's time counts from; its first session's
-            beginning unless given.
+    Every reading is stored before the next motion. Whatever is raised, also an interrupt from the
+    keyboard, the arm is stopped before anything else is done. The rig stays open. `live` compares
+    each reading with a model. As soon as the `goal` is met the arm goes home, the load is taken
+    off, and the rest is not measured. `wall` is the time of day, s, which carries the campaign's
+    time over a pause; it counts from `epoch`, the first session's beginning unless given.
 
     Raises:
         InputError: the plan is not safe (names the first problem), or the store fails.

@@ -20,11 +20,7 @@ the answer may be that of a few readings before, so that judging does not delay 
 
 
 class GoalCheck:
-    """Applies a stopping rule after each reading; does nothing where there is none.
-
-    Attributes:
-        status: that of the last check; None before any.
-    """
+    """Applies a stopping rule after each reading; does nothing where there is none."""
 
     def __init__(
         self,
@@ -63,16 +59,10 @@ def way_home(
 ) -> tuple[Stop, ...]:
     """Return the way to the reference pose, where the load is taken off and the drift is read.
 
-    The arm goes straight where that is clear; else back the way it came, which is clear, until
-    the straight way is. The reading is the next return to the reference pose that the plan holds.
-
-    Args:
-        cell: the cell.
-        config: its limits.
-        plan: the whole plan.
-        behind: where the arm has been in this session, the reference pose among it; it stands
-            at the last of these stops.
-        done: steps that are measured.
+    The arm goes straight where that is clear; else back the way it came, which is clear, until the
+    straight way is. The reading is the next return to the reference pose that the plan holds.
+    `behind` is where the arm has been in this session, the reference pose among it; it stands at
+    the last of these stops. `done` are the steps that are measured.
     """
     base = home(plan)
     q_home, here = plan.joints(base), behind[-1]

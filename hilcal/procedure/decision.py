@@ -55,8 +55,6 @@ class Decision:
         reason: "adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured;
             "floor", "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs
             too much; the verdict where no measurement would help.
-        verdict: of the refinement.
-        error: predicted after compensation.
         then_m: the same after the further plan; None where it is about a doubt.
         suspects: effects in doubt.
         power: least chance of separating two of them after the further plan.
@@ -106,17 +104,8 @@ def decide(
     """Decide whether to measure more, and what.
 
     A doubt between effects comes first; then a predicted error above the goal. A further plan is
-    measured where it would tell more and the time allows it.
-
-    Args:
-        cell: the cell as configured.
-        config: its limits and loads.
-        settings: the goal, and how long measuring may last.
-        d: the diagnosis of the last fit.
-        plans: of the campaign so far.
-        reference: (n,) joints of its reference pose, rad.
-        rng: generator.
-        say: takes progress, one line each.
+    measured where it would tell more and the time allows it. `d` is the diagnosis of the last fit,
+    `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
     """
     error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
     verdict: str = d.verdict
@@ -143,11 +132,6 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
 
     At `[planning] work_q_rad` where it is given, else half-way between measured poses, under the
     loads of the readings: the distance that 95 % of all these points are within.
-
-    Args:
-        calibration: the fit.
-        fitted: states that it was fitted to.
-        config: `[planning]`.
     """
     states = _work(fitted, config)
     columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}

@@ -76,15 +76,8 @@ def separating(
 ) -> Next:
     """Plan the measurements that separate the suspects of a doubt.
 
-    Args:
-        cell: the cell.
-        config: its limits, loads and noise.
-        doubt: what is to be separated.
-        poses: as many readings as so many poses take; what the doubt needs, or `usual`, where None.
-        rng: generator.
-        say: takes progress, one line each.
-        reference: (n,) joints of the campaign's reference pose, rad.
-        usual: poses where the doubt does not say how many it needs.
+    As many readings as so many poses take, as many as the doubt needs, or `usual` where neither is
+    known. `reference` (n,) are the joints of the campaign's reference pose, rad.
 
     Raises:
         InputError: suspects that cannot be.
@@ -135,14 +128,8 @@ def next_plan(
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
 
-    Args:
-        o: the campaign.
-        doubt: what is to be separated.
-        poses: as many readings as so many poses take; what the doubt needs where None.
-        rng: generator.
-        say: takes progress, one line each.
-        cell: configuration and cell, where they are not the campaign's any more.
-        compare: whether to compare criteria and numbers of poses as well, which takes longer.
+    As many readings as so many poses take; what the doubt needs where None. `cell` is given where
+    it is not the campaign's any more. To `compare` criteria and numbers of poses takes longer.
 
     Raises:
         InputError: suspects that cannot be, or a plan that may not be run.

@@ -28,7 +28,6 @@ class PassTask:
     """What a worker needs to know.
 
     Attributes:
-        stream: the file.
         model: that is fitted; its cell is registered.
         joint_std: (n,) scatter that is added to the covariances, rad; zero for none.
         outliers: rows that are set aside, counted from 0 in the stream, ascending, by row group.
@@ -110,12 +109,8 @@ def errors_of_group(
 ) -> Errors:
     """Return the errors of a row group at parameters (P,).
 
-    Args:
-        group: number of the row group.
-        work: what a worker needs to know.
-        theta: (P,) the parameters.
-        change: (F, P) what leaving out each fold does to them.
-        far: squared Mahalanobis distance from which on a reading is named.
+    `change` (F, P) is what leaving out each fold does to them; readings beyond the squared
+    Mahalanobis distance `far` are named.
     """
     moved = np.flatnonzero(np.any(change != 0, axis=0))
     sums, most, floor, rank = np.zeros((2, 3)), np.zeros(2), 0.0, 0
