@@ -20,10 +20,6 @@ _STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures not
            (8, "sends raw values; configure it to send N and N·m"))  # fmt: skip
 
 
-def _checksum(frame: bytes) -> bytes:
-    return crc_x25(frame[1:]).to_bytes(2, "little")
-
-
 def _overload(wrench: Floats, status: int) -> str:
     """The status in words; bit 0 (fewer samples behind a value) does not make it wrong."""
     for bit, words in _STATUS:
@@ -36,7 +32,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = SensorFormat(
     name="Bota sensor",
-    frame=FrameFormat(b"\xaa", 37, _checksum),
+    frame=FrameFormat(b"\xaa", 37, lambda frame: crc_x25(frame[1:]).to_bytes(2, "little")),
     body=np.dtype(
         [("status", "<u2"), ("wrench", "<f4", 6), ("ticks", "<u4"), ("temperature", "<f4")]
     ),

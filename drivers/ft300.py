@@ -92,10 +92,6 @@ def _ask(port: serial.Serial, slave: int, request: Callable[[minimalmodbus.Instr
     raise NoAnswerError(heard)
 
 
-def _checksum(frame: bytes) -> bytes:
-    return crc_modbus(frame).to_bytes(2, "little")
-
-
 def _overload(wrench: Floats, status: int) -> str:
     """Whether a component is at the end of its range, where it measures no more."""
     worst = int(np.argmax(np.abs(wrench) / RANGE))
@@ -110,7 +106,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = SensorFormat(
     name="Robotiq FT 300",
-    frame=FrameFormat(b"\x20\x4e", 16, _checksum),
+    frame=FrameFormat(b"\x20\x4e", 16, lambda frame: crc_modbus(frame).to_bytes(2, "little")),
     body=np.dtype([("wrench", "<i2", 6)]),
     unit=1.0 / np.repeat((100.0, 1000.0), 3),
     losses=lambda: ByArrival(RATE_HZ),

@@ -157,7 +157,7 @@ class GeoComTracker:
     def report(self) -> Report:
         """Ask the instrument who it is and how it is, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
-        name = self._told(until, geo.NAME, _text) or ("GeoCOM instrument",)
+        name = self._told(until, geo.NAME, lambda told: told.strip('"')) or ("GeoCOM instrument",)
         serial = self._told(until, geo.SERIAL_NUMBER, int)
         facts: list[tuple[str, str]] = []
         fields: list[tuple[str, object]] = [("name", name[0])]
@@ -329,11 +329,6 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
     options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
     return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))
-
-
-def _text(value: str) -> str:
-    """Text without its quotation marks."""
-    return value.strip('"')
 
 
 def usable(answer: Reply) -> str:

@@ -82,15 +82,12 @@ _MEANING = {
 """What the commonest codes say, alone or after a colon."""
 
 
-def _spelled(name: str) -> str:
-    """Return geocompy's name of a code as words in quotes."""
-    return f'"{name.replace("_", " ").lower()}"'
-
-
 def words(code: int) -> str:
     """Return a return code for people: what it means, and the number."""
     try:
-        return f"{_MEANING.get(code) or _spelled(GeoComCode(code).name)} (code {code})"
+        name = GeoComCode(code).name.replace("_", " ").lower()
+        known = _MEANING.get(code) or f'"{name}"'
+        return f"{known} (code {code})"
     except ValueError:
         return f"code {code}"
 

@@ -72,7 +72,8 @@ def server(content: bytes) -> NatNetServer:
     """Return what the answer to a connection says; raises struct.error where it is cut short."""
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
-    known = NatNetServer(_text(name), ".".join(map(str, numbers[:4])), version)
+    called = name.split(b"\0")[0].decode("utf-8", "replace")
+    known = NatNetServer(called, ".".join(map(str, numbers[:4])), version)
     if len(content) < _SERVER.size + _CONNECTION.size:
         return known
     _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
@@ -193,7 +194,3 @@ def names(content: bytes, version: Version) -> dict[int, str]:
         if end:
             r.skip(end - r.at)
     return found
-
-
-def _text(field: bytes) -> str:
-    return field.split(b"\0")[0].decode("utf-8", "replace")

@@ -88,7 +88,7 @@ class Operations:
     ) -> None:
         """Take the functions, and one that returns the state."""
         self._state = state or (lambda: None)
-        self.functions = {**functions, "die": _die}
+        self.functions = {**functions, "die": threading.Timer(0.02, os._exit, (70,)).start}
         if state is not None:
             self.functions["state"] = state
 
@@ -112,10 +112,6 @@ def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Call
         setattr(target, name, kind(value))
 
     return store
-
-
-def _die() -> None:
-    threading.Timer(0.02, os._exit, (70,)).start()
 
 
 def device_parser(doc: str | None) -> argparse.ArgumentParser:

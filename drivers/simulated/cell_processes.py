@@ -193,7 +193,8 @@ class SimulatedCell:
             write_world(directory / "world.json", world, config, base_dir)
             board = open_board(directory, config.simulation.clock, begun, world.cell.arm.n)
             if not is_ur(world.cell.arm):
-                board.write("arm", q=_standing(world.cell.arm) if home is None else home)
+                usual = np.mean(world.cell.arm.usual_range, axis=0)
+                board.write("arm", q=usual if home is None else home)
         except OSError as error:
             raise InputError(
                 f"simulated cell: {directory} cannot be used ({error}); "
@@ -406,12 +407,6 @@ def _devices(
 def is_ur(arm: Arm) -> bool:
     """Whether an arm is one of Universal Robots in the catalogue: its own protocol is simulated."""
     return arm.name.startswith("ur") and arm.n == len(UR_JOINTS) and arm.joint_names == UR_JOINTS
-
-
-def _standing(arm: Arm) -> Floats:
-    """(n,) the middle of what the joints are used in."""
-    low, high = arm.usual_range
-    return np.asarray(0.5 * (low + high))
 
 
 def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:

@@ -182,10 +182,6 @@ def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
     return OK, []
 
 
-def _lock_state(station: Station, parameters: tuple[str, ...]) -> Answer:
-    return OK, [str(int(station.locked))]
-
-
 def _lock_quality(station: Station, parameters: tuple[str, ...]) -> Answer:
     """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
     return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
@@ -302,7 +298,7 @@ _PROCEDURES: dict[int, Procedure] = {
     9018: _switch_atr,
     9019: lambda station, parameters: (OK, [str(int(station.atr_enabled))]),
     9020: _switch_lock,
-    9021: _lock_state,
+    9021: lambda station, parameters: (OK, [str(int(station.locked))]),
     9027: _turn,
     9037: _fine_adjust,
     11001: _constant(),

@@ -284,7 +284,10 @@ def hide(
     )
     before = reference.sight(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
-    whiten = _whitening(reference.covariance(before, m), pairs)
+    covariance = reference.covariance(before, m)
+    if pairs is not None:
+        covariance = covariance[pairs[0]] + covariance[pairs[1]]
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def strength(factor: float) -> float:
         change = _change(hidden(factor).sight(states), before, m)
@@ -318,7 +321,8 @@ def _simulated(
             "valid: a wrench that is not zero in some states"
         )
     if effect == "thermal_joint_drift":
-        world = replace(world, joint_reference=_first_temperature(states))
+        first = 0 if states.time is None else int(np.argmin(states.time))
+        world = replace(world, joint_reference=float(joint_temperature(states)[first].mean()))
     torque = np.maximum(
         np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(world.cell.arm)
     )
@@ -358,16 +362,6 @@ def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
         )
 
 
-def _first_temperature(states: States) -> float:
-    """Return the mean temperature of the joints in the first state, °C.
-
-    Raises:
-        InputError: states without temperatures of the joints.
-    """
-    first = 0 if states.time is None else int(np.argmin(states.time))
-    return float(joint_temperature(states)[first].mean())
-
-
 def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints, Ints]:
     """Return the rows of the loaded readings and of the unloaded ones that they belong to."""
     if pose is None:
@@ -390,13 +384,6 @@ def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints,
                 "valid: one state with a zero wrench per pose and cycle"
             )
     return rows, np.array([first[key] for key in keys])
-
-
-def _whitening(covariance: Floats, pairs: tuple[Ints, Ints] | None) -> Floats:
-    """Return (N, m, m) inverse Cholesky factors of a reading's or a difference's covariance."""
-    if pairs is not None:
-        covariance = covariance[pairs[0]] + covariance[pairs[1]]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def _change(after: IdealReading, before: IdealReading, m: int) -> Floats:

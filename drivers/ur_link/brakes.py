@@ -140,7 +140,8 @@ def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, s
     if reading is not None and reading.sample.safety != states.NORMAL:
         return reading.sample.safety, f"{states.safety_advice(reading.safety_bits)}, {RESUME}"
     if reading is not None and reading.mode != states.RUNNING:
-        return _not_running(reading)
+        word = states.mode_word(reading.mode)
+        return f"it does not run any more ({word})", f"switch it on, {RESUME}"
     with contextlib.suppress(LinkError):
         if supervision.in_remote_control(ASK_S) is False:
             return "it was switched to local mode", f"switch it to remote control, {RESUME}"
@@ -170,8 +171,3 @@ def not_commanded(error: WorkerError) -> str:
     if error.lost:
         return f"the process that commands it ended ({error})"
     return f"it did not take a command ({error})"
-
-
-def _not_running(reading: Reading) -> tuple[str, str]:
-    word = states.mode_word(reading.mode)
-    return f"it does not run any more ({word})", f"switch it on, {RESUME}"

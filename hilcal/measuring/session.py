@@ -63,7 +63,10 @@ class Session:
         if rig.force is not None and config.force_sensor is not None:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
-        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, self._passed)
+        self._mover = Mover(
+            rig.arm, self._meter, self._guard, config, clock,
+            lambda q: watcher.notify(ArmAt(tuple(q.tolist()))),
+        )  # fmt: skip
         self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
@@ -436,10 +439,6 @@ class Session:
             self._watcher.notify(Remark(shift.words(limit)))
 
     # people
-
-    def _passed(self, q: Floats) -> None:
-        """Tell where the arm is on its way."""
-        self._watcher.notify(ArmAt(tuple(q.tolist())))
 
     def _tell(
         self, step: Step, reading: Readings, total: int, left: float, settling: float

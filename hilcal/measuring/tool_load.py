@@ -79,7 +79,9 @@ class ToolLoad:
             wrench: (..., 6) readings, sensor axes.
             rotation: (..., 3, 3) R_base_sensor.
         """
-        return _turned(np.asarray(wrench) - self.tool_wrench(rotation), np.asarray(rotation))
+        own = np.asarray(wrench) - self.tool_wrench(rotation)
+        parts = own.reshape(*own.shape[:-1], 2, 3)
+        return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(own.shape))
 
     def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
         """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
@@ -200,12 +202,6 @@ def shift(wrench: Floats, arm: Floats) -> Floats:
     return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
 
 
-def _turned(wrench: Floats, rotation: Floats) -> Floats:
-    """Wrench (..., 6) in the axes that rotation (..., 3, 3) maps into."""
-    parts = wrench.reshape(*wrench.shape[:-1], 2, 3)
-    return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(wrench.shape))
-
-
 def _check(wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats) -> None:
     """Refuse arrays that cannot be readings."""
     K = len(wrench)
@@ -248,19 +244,14 @@ def _check_orientations(rotation: Floats, gravity: Floats) -> None:
         values = np.linalg.svd(u - u.mean(axis=0), compute_uv=False) / np.sqrt(K)
         spread[: len(values[:2])] = values[:2]
     if spread[0] < MIN_SPREAD:
-        missing = "mass and centre of mass"
+        along, missing = "one direction", "mass and centre of mass"
     elif spread[1] < MIN_SPREAD:
-        missing = "centre of mass in one direction"
+        along, missing = "two directions", "centre of mass in one direction"
     else:
         return
     raise CannotAnswerError(
         f"force sensor: {K} unloaded reading{'s' * (K != 1)} with gravity along "
-        f"{_directions(spread)} of the sensor do not determine the tool's {missing}; measure "
+        f"{along} of the sensor do not determine the tool's {missing}; measure "
         "unloaded at 3 or more poses that turn the flange about two different horizontal axes, "
         "30° or more"
     )
-
-
-def _directions(spread: Floats) -> str:
-    """How many directions of gravity there are, in words."""
-    return "one direction" if spread[0] < MIN_SPREAD else "two directions"

@@ -220,14 +220,20 @@ class Sensors:
             "timestamp": lambda: (self._now,),
             "actual_q": self._q,
             "target_q": lambda: motion.q,
-            "actual_qd": self._qd,
+            "actual_qd": lambda: (
+                motion.qd + self._noise(_SPEED_STD) if motion.moving else motion.qd
+            ),
             "target_qd": lambda: motion.qd,
             "target_moment": self._torque,
             "target_current": self._target_current,
-            "actual_current": self._current,
+            "actual_current": lambda: (
+                np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
+            ),
             "actual_current_as_torque": self._measured_torque,
             "joint_control_output": self._target_current,
-            "joint_temperatures": self._temperatures,
+            "joint_temperatures": lambda: (
+                self._truth["joint_temperature"] if self._is_told else _TEMPERATURES
+            ),
             "joint_mode": lambda: powered[arm.robot_mode is not RobotMode.RUNNING],
             "actual_joint_voltage": lambda: (47.5,) * 6,
             "actual_main_voltage": lambda: (48.0,),
@@ -238,7 +244,7 @@ class Sensors:
             "actual_TCP_speed": lambda: self._tool_speed(np.array(self.value("actual_qd"))),
             "target_TCP_speed": lambda: self._tool_speed(motion.qd),
             "actual_TCP_force": self._tool_force,
-            "ft_raw_wrench": self._raw_wrench,
+            "ft_raw_wrench": self._wrench,
             "tcp_offset": lambda: arm.tcp,
             "payload": lambda: (arm.payload,),
             "payload_cog": lambda: arm.payload_com,
@@ -280,10 +286,6 @@ class Sensors:
         off = np.abs(np.array(self.value("actual_q")) - np.array(self.value("target_q")))
         return (float(off.max() / _DEVIATION_STOP),)
 
-    def _qd(self) -> Floats:
-        motion = self._arm.trajectory
-        return motion.qd + self._noise(_SPEED_STD) if motion.moving else motion.qd
-
     def _torque(self) -> Floats:
         if self._is_told:
             return np.asarray(self._truth["drive_torque"])
@@ -295,9 +297,6 @@ class Sensors:
             return np.zeros(6)
         return np.asarray(np.array(self.value("target_moment")) / _TORQUE_PER_AMPERE)
 
-    def _current(self) -> Floats:
-        return np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
-
     def _measured_torque(self) -> Floats:
         """What the drives exert: against load and weight, and against the friction of the arrival.
 
@@ -305,9 +304,6 @@ class Sensors:
         """
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
-
-    def _temperatures(self) -> Floats:
-        return np.asarray(self._truth["joint_temperature"]) if self._is_told else _TEMPERATURES
 
     def _tool_pose(self, q: Floats) -> Floats:
         return pose(self._flange(q) @ transform(self._arm.tcp))
@@ -331,9 +327,6 @@ class Sensors:
         """What the sensor in the flange feels, flange axes, with its offset and noise."""
         felt = self._truth["sensor_wrench"] if self._is_told else self._weight()
         return np.asarray(felt + _FORCE_OFFSET + _FORCE_STD * self._rng.standard_normal(6))
-
-    def _raw_wrench(self) -> Floats:
-        return self._wrench()
 
     def _tool_force(self) -> Floats:
         """Remainder after the compensation of the payload, at the tool point, base axes."""
