@@ -54,7 +54,7 @@ from hilcal.present.plan import brief_plan, next_report, plan_report, plan_scree
 from hilcal.present.progress import Say, working
 from hilcal.present.running import check_report
 from hilcal.procedure.next_plan import Doubt, doubt_to_settle, next_plan, without
-from hilcal.procedure.shared import reference_in
+from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan, load_plan
 from hilcal.tables.write import plan_csv
 from hilcal.whole_file import replace_file

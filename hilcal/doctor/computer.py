@@ -17,7 +17,7 @@ from datetime import datetime
 from importlib import metadata
 from pathlib import Path
 
-from hilcal.doctor.finding import Finding
+from hilcal.doctor.ports import Finding
 
 COMPUTER = "computer"
 LEAST_FREE = 1e9

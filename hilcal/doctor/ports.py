@@ -1,4 +1,4 @@
-"""Serial adapters and the network: what there is, who may use it, and how late it answers."""
+"""What was found: serial adapters and the network, who may use them, how late they answer."""
 
 import grp
 import os
@@ -9,10 +9,31 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from serial.tools import list_ports
 
-from hilcal.doctor.finding import Finding, State
+State = Literal["ok", "warning", "problem"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at.
+
+    Attributes:
+        topic: "program", "computer", "serial ports", "network" or "cell".
+        name: of the thing, e.g. "clock".
+        state: "ok"; "warning" where a campaign runs but may suffer; "problem" where it does not.
+        said: how it is, in words.
+        mend: what to do about it; empty where nothing is to be done.
+    """
+
+    topic: str
+    name: str
+    state: State
+    said: str
+    mend: str = ""
+
 
 PORTS = "serial ports"
 LATE_MS = 1

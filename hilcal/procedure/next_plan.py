@@ -22,7 +22,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
-from hilcal.procedure.shared import reference_in
+from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan
 from hilcal.types import Floats
 

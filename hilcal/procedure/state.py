@@ -8,10 +8,11 @@ from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan
+from hilcal.store.plan import REFERENCE, Plan, read_plan
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import PLAN, RunLog
+from hilcal.types import Floats
 
 Kind = Literal[
     "plan",
@@ -238,3 +239,14 @@ def _missing(kind: Kind, campaign: CampaignFile) -> ProcedureStep | None:
     share = len(left) / len(last.steps)
     seconds = share * duration_of(last)
     return ProcedureStep(kind, campaign.path, len(left), len(last.steps), changes, seconds)
+
+
+def reference_in(file: CampaignFile) -> Floats | None:
+    """Return the joints (n,) of a campaign's reference pose; None where it has no plan."""
+    text = file.about(PLAN)
+    return None if text is None else reference_of(read_plan(text, f"{file.path}, its plan"))
+
+
+def reference_of(plan: Plan) -> Floats | None:
+    """Return the joints (n,) of a plan's reference pose."""
+    return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None

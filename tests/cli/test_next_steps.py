@@ -386,7 +386,7 @@ NO_STEP = {
     "discovery/write_effect",
     "present/viewer/fleet",
     "present/viewer/plan",
-    "procedure/shared",
+    "procedure/procedure",
     "store/run_log",
     "tables/guessing/proposal",
     "workbench/server",
