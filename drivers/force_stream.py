@@ -316,7 +316,6 @@ class ForceStream:
             raise DeviceError(f"{DEVICE}: {wrong}")
 
     def _silence(self) -> str:
-        """Why there is no frame, in one line."""
         if self._failure:
             return self._failure
         now = time.monotonic()

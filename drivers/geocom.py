@@ -300,7 +300,6 @@ class GeoComTracker:
         return answer.values if answer.code == geo.OK and answer.values else None
 
     def _answers(self, until: float) -> bool:
-        """Whether the line still works."""
         try:
             self._link.ask(geo.NULL, until=until)
         except DeviceError:

@@ -192,7 +192,6 @@ class Link:
             raise self._connection.broken
 
     def _silence(self) -> str:
-        """Say what came instead of a GeoCOM line."""
         came = self._connection.came
         if not came:
             return (

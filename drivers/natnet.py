@@ -219,7 +219,6 @@ class NatNetTracker:
         )
 
     def _joined(self, server: nn.NatNetServer) -> socket.socket:
-        """Return a socket to which the frames of a multicast group come."""
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -232,7 +231,6 @@ class NatNetTracker:
         return line
 
     def _found(self) -> tuple[int, str]:
-        """Return streaming ID and name of the rigid body."""
         content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
         try:
             names = nn.names(content, self._server.version)
@@ -277,7 +275,6 @@ class NatNetTracker:
 
 
 def _drain(line: socket.socket) -> None:
-    """Throw away what has come."""
     line.setblocking(False)
     while True:
         try:

@@ -93,7 +93,6 @@ def close_port(port: Closable) -> None:
 
 
 def _why_not_open(path: str, error: Exception) -> str:
-    """One line on a port that does not open."""
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return f"port {path} is in use by another program; end that one, then try again"
@@ -109,7 +108,6 @@ def _why_not_open(path: str, error: Exception) -> str:
 
 
 def _why_broken(path: str, error: Exception) -> str:
-    """One line on a port that failed while it was open."""
     if not os.path.exists(path):
         return f"port {path} is gone; was its adapter unplugged?"
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)

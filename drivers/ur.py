@@ -347,7 +347,6 @@ def _is_foreign(problem: str) -> bool:
 
 
 def _lacking(python: tuple[int, ...]) -> str:
-    """Say what to do where ur-rtde is not installed."""
     why, mend = "is not installed", install("rtde_control")
     if python >= NO_WHEEL:
         why = f"has no wheel for Python {python[0]}.{python[1]}"

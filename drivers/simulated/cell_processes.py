@@ -353,7 +353,6 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 def _devices(
     world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
-    """Return what has to be started."""
     noise = world.noise
     file = config.robot.calibration
     calibration = () if file is None else ("--calibration", str(base_dir / file))

@@ -343,7 +343,6 @@ def _simulated(
 
 
 def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
-    """Refuse what cannot be hidden, by name."""
     if mode not in READINGS_MODES:
         raise InputError(f"readings {mode!r} is unknown; valid: {', '.join(READINGS_MODES)}")
     if m not in (3, 6):

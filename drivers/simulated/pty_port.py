@@ -253,7 +253,6 @@ class PtyPort:
             return None
 
     def _spoilt(self, frame: bytes) -> bytes:
-        """Return what the faults make of a frame."""
         if self.flip and self._rng.random() < self.flip:
             spoilt = bytearray(frame)
             spoilt[self._rng.integers(len(spoilt))] ^= 1 << int(self._rng.integers(8))

@@ -242,7 +242,6 @@ class World:
         )
 
     def _elasticity(self, states: States) -> Elasticity:
-        """Return the elastic law in N states."""
         hidden, tree = self.physics, self._tree
         return elasticity(
             tree,

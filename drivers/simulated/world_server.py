@@ -128,7 +128,6 @@ def _listed(array: Floats) -> dict[str, Any]:
 
 
 def _array(data: dict[str, Any]) -> Floats:
-    """Return the array of `_listed`."""
     return np.array(data["values"], dtype=np.float64).reshape(data["shape"])
 
 

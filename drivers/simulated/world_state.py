@@ -319,11 +319,9 @@ class WorldState:
         return names.index(name) + 1
 
     def _name(self, number: int) -> str:
-        """Return the name of a load by number."""
         return self._loads[number - 1].name if number else "none"
 
     def _note(self, event: str) -> None:
-        """Remember an event."""
         self._log.append({"time": self._board.time, "event": event})
 
 

@@ -169,7 +169,6 @@ def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
 
 
 def _wait_for(receiver: Receiver, wanted: tuple[int, ...], seconds: float) -> None:
-    """Wait until the robot's program is in one of the wanted states."""
     end = time.monotonic() + seconds
     while (runtime := receiver.read().runtime) not in wanted:
         if time.monotonic() > end:

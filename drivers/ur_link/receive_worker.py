@@ -69,7 +69,6 @@ def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
 
 
 def _rate(link: Any, seconds: float, stale: float) -> dict[str, Any]:
-    """Count the packets of a while."""
     count, begun = 0, time.monotonic()
     while time.monotonic() - begun < seconds:
         _next_stamp(link, stale)

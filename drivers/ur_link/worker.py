@@ -134,7 +134,6 @@ class Worker:
             return answer
 
     def _dead(self) -> WorkerError:
-        """Describe the end of a process whose line is closed."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)
         self.kill()

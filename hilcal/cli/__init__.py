@@ -106,7 +106,6 @@ def _loading(name: str) -> Iterator[None]:
 
 
 def _group(command: Command) -> typer.Typer:
-    """Return a command that has commands of its own."""
     app = application(command.summary, alone=bool(command.place))
     for name, place in command.subcommands:
         app.command(name)(load(place))

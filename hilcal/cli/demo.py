@@ -436,7 +436,6 @@ def _law_name(output: Path) -> str:
 
 
 def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:
-    """Whether the invented law was found, and that in words."""
     own = r.world.own
     if own is None:
         return False, "Nothing was hidden."
@@ -455,7 +454,6 @@ def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, 
 
 
 def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:
-    """Whether the hidden effect was found, and that in words."""
     added = [s.added for s in found.steps if s.added]
     if r.hidden == NOTHING:
         if not added and found.verdict == "adequate":

@@ -153,11 +153,7 @@ def vector(words: str, unit: str) -> list[float]:
 
 
 def _quantities(words: str, unit: str) -> list[float]:
-    """Read numbers with their units; empty where anything else is among them.
-
-    Raises:
-        InputError: an unknown unit, or a unit behind some of the numbers only.
-    """
+    """Read numbers with their units; empty where anything else is among them."""
     known, found = UNITS[unit], _QUANTITY.findall(words)
     if _QUANTITY.sub("", words).strip("[](),; \t").replace(",", "").replace(";", "").strip():
         return []

@@ -162,11 +162,6 @@ def new(
 
 
 def _check_name(name: str) -> None:
-    """Refuse a name that an effect cannot have.
-
-    Raises:
-        InputError: lists what would be valid.
-    """
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise InputError(
             f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "

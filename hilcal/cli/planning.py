@@ -382,12 +382,7 @@ def _without_suspects(
     say: Say,
     prior: CarriedPrior | None,
 ) -> Doubt:
-    """Return the effects to separate, and a fit whose model does not hold them.
-
-    Raises:
-        InputError: the revision is not in scaling gc; a prior that is not one of these readings.
-        CannotAnswerError: nothing is in doubt; says what else to do.
-    """
+    """Return the effects to separate, and a fit whose model does not hold them."""
     number, newest = fit_of(t, o, say, revision)
     o.require_gc(number, newest.scaling, "next")
     if prior is not None:
@@ -400,7 +395,6 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Split and check --suspects."""
     if text is None:
         return None
     try:

@@ -248,11 +248,7 @@ def workbench(
 def _import(
     t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
 ) -> None:
-    """Make the campaign file of a table; one that is there stays.
-
-    Raises:
-        InputError: there is one, or anything in table or cell cannot be right.
-    """
+    """Make the campaign file of a table; one that is there stays."""
     if run.exists():
         raise InputError(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "

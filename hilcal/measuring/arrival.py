@@ -333,11 +333,6 @@ class ArrivalReader:
         name: str,
         force: WrenchSample | None,
     ) -> MeasuredStop:
-        """Aim at a target and measure it.
-
-        Raises:
-            TargetLostError: it is not there, or another one is measured.
-        """
 
         def aim() -> None:
             tracker.aim(places[k], self._radius)

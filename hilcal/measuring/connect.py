@@ -165,7 +165,6 @@ def _factory(one: _Wanted) -> Factory:
 
 
 def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]:
-    """Open a device; returns it, or why it failed."""
     try:
         return factory(config), ""
     except Exception as error:  # a driver of somebody else's may fail in any way

@@ -328,7 +328,6 @@ class Feasibility:
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
 
     def _moment(self, chain: Chain, load: str) -> "_Bounds":
-        """The moment that tool and load exert on the force sensor."""
         sensor, cell, pull = self.config.force_sensor, self.cell, self._pull(load)
         if sensor is None:
             raise ValueError("the cell has no force sensor")

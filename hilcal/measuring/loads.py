@@ -117,7 +117,6 @@ class Hook:
         self._asked(partial(operator.confirm, question))
 
     def _carry(self, load: CellLoad | None) -> None:
-        """Tell the controller what it carries."""
         self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:

@@ -223,7 +223,6 @@ class SettleWindow:
         return self._settled
 
     def _judge(self) -> bool:
-        """Test the window after a new sample."""
         window = self._window()
         trend = _trend(window, self._scale)
         if trend.moment == 0.0:
@@ -282,7 +281,6 @@ class _Trend:
 
 
 def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
-    """Least squares of a line."""
     time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9 * scale
     span = float(time[-1])
     time -= time.mean()
@@ -457,11 +455,7 @@ class Measurer:
     def _search(
         self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]
     ) -> int:
-        """Search the target; returns how often that has been done.
-
-        Raises:
-            TargetLostError: it was lost or not found too often.
-        """
+        """Search the target; returns how often that has been done."""
         while searches < SEARCHES:
             searches += 1
             self._watcher.notify(Remark(f"{name}: {error}; searching the target"))

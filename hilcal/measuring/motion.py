@@ -200,7 +200,6 @@ class Mover:
         self.side = np.where(moved == 0.0, self.side, moved)
 
     def _go(self, start: Floats, q: Floats, name: str) -> None:
-        """Command a motion and look at it until it has arrived."""
         motion = self._motion
         self._arm.start_move(q, motion.speed_rad_s, motion.acceleration_rad_s2)
         usual = duration(start, q, motion.speed_rad_s, motion.acceleration_rad_s2)

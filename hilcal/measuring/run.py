@@ -110,7 +110,6 @@ def _note(store: RunLog, error: BaseException, trouble: str) -> None:
 
 
 def _raise(error: BaseException, trouble: str) -> None:
-    """Raise the error with how to go on."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     text = _line(error)
@@ -128,7 +127,6 @@ def _sentence(text: str) -> str:
 
 
 def _line(error: BaseException) -> str:
-    """Return an error as one line."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     words = " ".join(str(error).split()).rstrip(".;")

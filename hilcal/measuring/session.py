@@ -145,7 +145,6 @@ class Session:
         self._finish()
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
-        """Go to a stop, change the load, tare, measure."""
 
         def visit() -> tuple[Readings, float] | None:
             self._move(stop)
@@ -236,9 +235,6 @@ class Session:
 
         Returns:
             the mean wrench and the joint angles (n,), rad; None without a sensor.
-
-        Raises:
-            LoadChangedError: by the zero so far, something hangs or touches the tool.
         """
         meter, watch = self._meter, self._mover.watch
         if meter is None or watch is None:
@@ -262,7 +258,6 @@ class Session:
         self._tared = name != UNLOADED
 
     def _identify(self) -> None:
-        """Find the tool from all unloaded readings so far."""
         if self._meter is None:
             return
         self._identified = len(self._state.tared_wrenches)
@@ -327,10 +322,6 @@ class Session:
         """Refuse the readings of an arrival of another target or another load.
 
         They are kept as doubted.
-
-        Raises:
-            LoadChangedError: what hangs is not what should hang.
-            DeviceError: one cannot be its target's.
         """
         wrong = next(filter(None, map(self._doubt, found)), None)
         if wrong is not None:
@@ -362,7 +353,6 @@ class Session:
         return LoadChangedError(wrong) if wrong else None
 
     def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
-        """One reading, and what is stored with it."""
         measured, tared = one.measured, self._tared_wrench(one.measured)
         elapsed = self._elapsed + one.ended - self._begun
         reading = reading_of(

@@ -203,7 +203,6 @@ def shift(wrench: Floats, arm: Floats) -> Floats:
 
 
 def _check(wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats) -> None:
-    """Refuse arrays that cannot be readings."""
     K = len(wrench)
     wanted = {"wrench": (K, 6), "covariance": (K, 6, 6), "rotation": (K, 3, 3), "gravity": (3,)}
     given = {

@@ -181,7 +181,6 @@ def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -
 
 
 def _told(of: CorrectedPoints, order: Ints, found: Compensation) -> list[dict[str, Any]]:
-    """Return what is expected of each point, for the plan's file."""
     before, band = found.before.error_m, found.after.band_m
     return [
         {

@@ -147,7 +147,6 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
 
 
 def _work(fitted: States, config: CellConfig) -> States:
-    """Return states where the error is predicted."""
     loaded = np.flatnonzero(np.any(fitted.wrench != 0, axis=1))
     rows = loaded if len(loaded) else np.arange(len(fitted))
     rows = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(np.int64)]

@@ -385,11 +385,7 @@ class Procedure:
         return shares
 
     def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
-        """Record the hash of the validation campaign; later it has to be the same.
-
-        Raises:
-            InputError: it is another.
-        """
+        """Record the hash of the validation campaign; later it has to be the same."""
         frozen, readings = log.last(FROZEN), unseen.readings()
         hashed = content_hash(readings)
         if frozen is None:
@@ -478,11 +474,6 @@ class Procedure:
         return usual_mode(readings, self.settings.readings)
 
     def _record(self, o: Campaign) -> RevisionRecord:
-        """Return the revision that the last refinement ended with.
-
-        Raises:
-            InputError: there is none.
-        """
         refined = ProcedureLog(o.file).last(REFINED)
         if refined is None:
             raise InputError(f"{self.run}: not refined yet")
@@ -505,7 +496,6 @@ class Procedure:
         return with_arm_scatter(cell, found, ArmScatter.from_json(scatter))
 
     def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
-        """Make the file of a campaign that tests the model."""
         more = {
             PURPOSE: purpose,
             CALIBRATION: identity(self.run),
@@ -516,7 +506,6 @@ class Procedure:
         create_run(path, config, self.base_dir, plan, source=source, more=more).close()
 
     def _source(self, what: str = "") -> str:
-        """Say where the readings of a file come from."""
         how = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
         return f"{what}{how} by hilcal calibrate"
 

@@ -82,7 +82,6 @@ Counting = Callable[[str, int], AbstractContextManager[Advance]]
 
 
 def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
-    """Show no progress."""
     return nullcontext(lambda step: None)
 
 
@@ -354,11 +353,7 @@ class _StreamMinimum:
 
 
 def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
-    """Return the minimum from parameters (P,) on.
-
-    Raises:
-        CannotAnswerError: fewer measured elements than parameters.
-    """
+    """Return the minimum from parameters (P,) on."""
     space = problem.coordinates
     found = minimum(problem, space.of_theta(theta), None)
     point, by, converged = found.point, found.by, found.converged
