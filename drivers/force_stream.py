@@ -41,24 +41,17 @@ FIRST_FRAME_S, OLD_S = 1.0, 0.05
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFormat:
-    """What a sensor puts on its line.
+    """What a sensor puts on its line."""
 
-    Attributes:
-        name: the maker's, for people.
-        frame: its frames; of no meaning where they come as datagrams.
-        body: what is between header and checksum; field `wrench` (6), and where it gives them
-            `status`, `ticks` (device clock) and `temperature` (°C).
-        unit: (6,) N and N·m per count of `wrench`.
-        losses: makes the counter of lost frames.
-        overload: (wrench (6,), status) to what is wrong with such a frame, "" where nothing.
-    """
-
-    name: str
-    frame: FrameFormat
+    name: str  # the maker's, for people
+    frame: FrameFormat  # its frames; of no meaning where they come as datagrams
     body: np.dtype[Any]
-    unit: Floats
-    losses: Callable[[], LossCounter]
+    """What is between header and checksum; field `wrench` (6), and where it gives them `status`,
+    `ticks` (device clock) and `temperature` (°C)."""
+    unit: Floats  # (6,) N and N·m per count of `wrench`
+    losses: Callable[[], LossCounter]  # makes the counter of lost frames
     overload: Callable[[Floats, int], str]
+    """(wrench (6,), status) to what is wrong with such a frame, "" where nothing."""
 
 
 class Port(Protocol):

@@ -44,27 +44,16 @@ LARGEST_TILT = 0.5 * np.pi
 
 @dataclass(frozen=True, slots=True)
 class PolarReading:
-    """One measurement as the instrument gives it.
+    """One measurement as the instrument gives it."""
 
-    Attributes:
-        host_ns: `time.monotonic_ns` right after it came.
-        hz: horizontal angle, rad.
-        v: angle from the zenith, rad.
-        distance: slope distance, m; 0 is none.
-        angle_std: what it states of both angles, rad; 0 where it does not tell.
-        tilt: inclination across and along, rad.
-        measured_ms: when the distance was measured, ms of its own clock; 0 is unknown.
-        warning: what it remarks.
-    """
-
-    host_ns: int
-    hz: float
-    v: float
-    distance: float
-    angle_std: float = 0.0
-    tilt: tuple[float, float] | None = None
-    measured_ms: float = 0.0
-    warning: str = ""
+    host_ns: int  # `time.monotonic_ns` right after it came
+    hz: float  # horizontal angle, rad
+    v: float  # angle from the zenith, rad
+    distance: float  # slope distance, m; 0 is none
+    angle_std: float = 0.0  # what it states of both angles, rad; 0 where it does not tell
+    tilt: tuple[float, float] | None = None  # inclination across and along, rad
+    measured_ms: float = 0.0  # when the distance was measured, ms of its own clock; 0 is unknown
+    warning: str = ""  # what it remarks
 
 
 class GeoComOptions(Section):

@@ -36,17 +36,12 @@ _MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply whose checksum and transaction were right.
+    """A reply whose checksum and transaction were right."""
 
-    Attributes:
-        code: the return code, of the line if that is not 0, else of the request.
-        values: what came with it; empty where it is not of the form that was asked for.
-        host_ns: `time.monotonic_ns` right after it came.
-    """
-
-    code: int
+    code: int  # the return code, of the line if that is not 0, else of the request
     values: tuple[Any, ...]
-    host_ns: int
+    """What came with it; empty where it is not of the form that was asked for."""
+    host_ns: int  # `time.monotonic_ns` right after it came
 
 
 class _Connection(SerialConnection):

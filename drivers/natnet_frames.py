@@ -53,19 +53,13 @@ def connect(version: Version) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class NatNetServer:
-    """Who answered, and how it sends frames.
-
-    Attributes:
-        version: of NatNet in which it sends frames.
-        data_port: where it sends frames to; 0 where it does not tell.
-        group: multicast address; empty where it sends to each client.
-    """
+    """Who answered, and how it sends frames."""
 
     name: str
     program: str
-    version: Version
-    data_port: int = 0
-    group: str = ""
+    version: Version  # of NatNet in which it sends frames
+    data_port: int = 0  # where it sends frames to; 0 where it does not tell
+    group: str = ""  # multicast address; empty where it sends to each client
 
 
 def server(content: bytes) -> NatNetServer:
@@ -83,18 +77,12 @@ def server(content: bytes) -> NatNetServer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A rigid body in a frame.
-
-    Attributes:
-        position: (3,) of its pivot, m.
-        quaternion: (4,) scalar last.
-        error: mean distance of its markers from where they should be, m.
-    """
+    """A rigid body in a frame."""
 
     number: int
-    position: Floats
-    quaternion: Floats
-    error: float
+    position: Floats  # (3,) of its pivot, m
+    quaternion: Floats  # (4,) scalar last
+    error: float  # mean distance of its markers from where they should be, m
     tracked: bool
 
 

@@ -62,20 +62,16 @@ SETS = {
 
 @dataclass(slots=True, eq=False)
 class SimulatedTracker:
-    """What the tracker is set to and what it answers.
-
-    Attributes:
-        rng: of the orientation's noise.
-        settings: what the commands have set, by the command that reads it.
-        failing: status and how many next answers have it, by command.
-    """
+    """What the tracker is set to and what it answers."""
 
     station: Station
     noise: SimulatedNoise
-    rng: np.random.Generator
+    rng: np.random.Generator  # of the orientation's noise
     initialized: bool = True
     settings: dict[int, bytes] = field(default_factory=lambda: dict(DEFAULTS))
+    """What the commands have set, by the command that reads it."""
     failing: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Status and how many next answers have it, by command."""
     mute: bool = False
     client: socket.socket | None = None
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=10_000))

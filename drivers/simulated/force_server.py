@@ -41,25 +41,17 @@ ROOM = 22.0
 class StrainGauge:
     """The sensor's measuring bridge: what strain gauges make of the true wrench.
 
-        wrench = true + bias + drift (T - T_start) + overload + noise
-
-    Attributes:
-        bias: (6,) when the world begins, N and N·m.
-        drift: (6,) per K.
-        noise: (6,) standard deviation of one frame.
-        overload: (6,) wrench added by a fault.
-        on: how long the sensor has been on when the world begins, s.
-        frozen: (6,) what it reads whatever it feels; None is the truth.
+    wrench = true + bias + drift (T - T_start) + overload + noise
     """
 
     board: Blackboard
     rng: np.random.Generator
-    bias: Floats
-    drift: Floats
-    noise: Floats
-    overload: Floats
-    on: float
-    frozen: Floats | None = None
+    bias: Floats  # (6,) when the world begins, N and N·m
+    drift: Floats  # (6,) per K
+    noise: Floats  # (6,) standard deviation of one frame
+    overload: Floats  # (6,) wrench added by a fault
+    on: float  # how long the sensor has been on when the world begins, s
+    frozen: Floats | None = None  # (6,) what it reads whatever it feels; None is the truth
 
     @staticmethod
     def draw(
@@ -322,22 +314,15 @@ KINDS: dict[str, type[SensorProtocol]] = {"bota": Bota, "ft300": Ft300, "hex": H
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """The sensor's clock: frame k is due at start + k / rate.
-
-    Attributes:
-        stalled: whether frames are made but not sent.
-        number: of the next frame, since power-on.
-        due: when it is due, `time.monotonic`.
-        lost: frames that came too late to be sent.
-    """
+    """The sensor's clock: frame k is due at start + k / rate."""
 
     sensor: SensorProtocol
     gauge: StrainGauge
     port: PtyPort
-    stalled: bool = False
-    number: int = 0
-    due: float = 0.0
-    lost: int = 0
+    stalled: bool = False  # whether frames are made but not sent
+    number: int = 0  # of the next frame, since power-on
+    due: float = 0.0  # when it is due, `time.monotonic`
+    lost: int = 0  # frames that came too late to be sent
 
     def step(self) -> None:
         """Wait for the next batch or for a request, and serve it."""

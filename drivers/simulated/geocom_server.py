@@ -38,19 +38,13 @@ _REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
 
 @dataclass(frozen=True, slots=True)
 class GeocomRequest:
-    """One request, taken apart.
-
-    Attributes:
-        transaction: number that the answer repeats.
-        checked: whether it came with a checksum, so the answer carries one too.
-        error: code of the communication, `OK` where the request is sound.
-    """
+    """One request, taken apart."""
 
     rpc: int
-    transaction: int
+    transaction: int  # number that the answer repeats
     parameters: tuple[str, ...]
-    checked: bool
-    error: int = OK
+    checked: bool  # whether it came with a checksum, so the answer carries one too
+    error: int = OK  # code of the communication, `OK` where the request is sound
 
 
 def parse(line: str) -> GeocomRequest | None:

@@ -14,17 +14,11 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class PolarPoint:
-    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV.
+    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV."""
 
-    Attributes:
-        hz: horizontal angle, 0 to 2 pi, rad.
-        v: zenith angle, 0 to pi, rad.
-        distance: m.
-    """
-
-    hz: float
-    v: float
-    distance: float
+    hz: float  # horizontal angle, 0 to 2 pi, rad
+    v: float  # zenith angle, 0 to pi, rad
+    distance: float  # m
 
     @staticmethod
     def of(point: Floats) -> "PolarPoint":
@@ -48,16 +42,12 @@ class PolarPoint:
 class Beam:
     """Noise of one measurement at the distance d.
 
-        sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
-        sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
-
-    Attributes:
-        range_std: (a, b) in m and m/m.
-        transverse_std: (c, e) in m and m/m.
+    sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
+    sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
     """
 
-    range_std: tuple[float, float]
-    transverse_std: tuple[float, float]
+    range_std: tuple[float, float]  # (a, b) in m and m/m
+    transverse_std: tuple[float, float]  # (c, e) in m and m/m
 
     def angle_std(self, distance: float) -> float:
         """Return sigma_transverse / d, rad."""

@@ -52,18 +52,12 @@ def typical_tilt(arm: Arm) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Draws one effect's parameters in a plausible direction and of a plausible size.
-
-    Attributes:
-        compliance: (n,) the drives' compliances, which stiffening belongs to, rad/(N·m).
-        torque: (n,) the largest torque at each drive in the states at hand, N·m.
-        harmonics: number of harmonics of the transmission error.
-    """
+    """Draws one effect's parameters in a plausible direction and of a plausible size."""
 
     arm: Arm
-    compliance: Floats
-    torque: Floats
-    harmonics: int = 6
+    compliance: Floats  # (n,) the drives' compliances, which stiffening belongs to, rad/(N·m)
+    torque: Floats  # (n,) the largest torque at each drive in the states at hand, N·m
+    harmonics: int = 6  # number of harmonics of the transmission error
 
     def effect(self, name: str, rng: np.random.Generator) -> Floats:
         """Return the parameters of the named effect, shaped as in `Truth`."""

@@ -55,36 +55,26 @@ _COUNT = struct.Struct("<I")
 
 @dataclass(slots=True, eq=False)
 class Cameras:
-    """What the cameras see and whom they tell.
-
-    Attributes:
-        frame_std: of a frame, m.
-        waves: (6, 4) per coordinate and turn: direction and phase of the distortion.
-        distortion: its amplitude, m.
-        group: multicast group; empty for none.
-        clients: version and when it was heard of last, by address.
-        others: rigid bodies beside it.
-        paused: whether the same frame is sent again and again.
-        insist: whether the version that a client asks for when it connects is not heard.
-    """
+    """What the cameras see and whom they tell."""
 
     board: Blackboard
     rng: np.random.Generator
     line: socket.socket
     version: Version
-    frame_std: float
-    waves: Floats
-    distortion: float
-    group: str = ""
+    frame_std: float  # of a frame, m
+    waves: Floats  # (6, 4) per coordinate and turn: direction and phase of the distortion
+    distortion: float  # its amplitude, m
+    group: str = ""  # multicast group; empty for none
     clients: dict[tuple[str, int], tuple[Version, float]] = field(default_factory=dict)
+    """Version and when it was heard of last, by address."""
     name: str = "tool"
-    others: int = 0
+    others: int = 0  # rigid bodies beside it
     number: int = 0
     hidden: bool = False
     stalled: bool = False
-    paused: bool = False
+    paused: bool = False  # whether the same frame is sent again and again
     lose: float = 0.0
-    insist: bool = False
+    insist: bool = False  # whether the version that a client asks for when it connects is not heard
     seen: tuple[Floats, Floats] | None = None
 
     def pose(self) -> tuple[Floats, Floats]:

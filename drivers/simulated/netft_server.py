@@ -40,31 +40,22 @@ _FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}
 
 @dataclass(slots=True, eq=False)
 class NetFt:
-    """The sensor: who is sent to, and how far it has counted.
-
-    Attributes:
-        client: address that asked for records; None is nobody.
-        left: how many records are left to send; 0 is without end.
-        due: when the next one is due, `time.monotonic`.
-        twice: share of datagrams that come again later.
-        cut: share of datagrams that are cut short.
-        status: sent instead of its own where it is not None.
-    """
+    """The sensor: who is sent to, and how far it has counted."""
 
     gauge: StrainGauge
     rng: np.random.Generator
     rate: float
     line: socket.socket
-    client: tuple[str, int] | None = None
-    left: int = 0
+    client: tuple[str, int] | None = None  # address that asked for records; None is nobody
+    left: int = 0  # how many records are left to send; 0 is without end
     number: int = 0
-    due: float = 0.0
+    due: float = 0.0  # when the next one is due, `time.monotonic`
     begun: float = field(default_factory=time.monotonic)
     stalled: bool = False
     lose: float = 0.0
-    twice: float = 0.0
-    cut: float = 0.0
-    status: int | None = None
+    twice: float = 0.0  # share of datagrams that come again later
+    cut: float = 0.0  # share of datagrams that are cut short
+    status: int | None = None  # sent instead of its own where it is not None
     elements: dict[str, str] = field(default_factory=dict)
 
     def page(self) -> str:

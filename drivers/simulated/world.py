@@ -42,16 +42,12 @@ class SimulatedNoise:
     The defaults are half of a maximum permissible error of ±15 µm + 6 µm/m across the line
     of sight, a range that is steadier than the angles, and half of ±0.01° for the target's
     orientation: the usual class of laser trackers with a six-degrees-of-freedom probe.
-
-    Attributes:
-        range_std: (a, b) in m and m/m.
-        transverse_std: (c, e) in m and m/m, each of the two directions across the sight.
-        orientation_std: rad, about each axis of the tracker.
     """
 
-    range_std: tuple[float, float] = (5e-6, 0.5e-6)
+    range_std: tuple[float, float] = (5e-6, 0.5e-6)  # (a, b) in m and m/m
     transverse_std: tuple[float, float] = (7.5e-6, 3e-6)
-    orientation_std: float = 8.7e-5
+    """(c, e) in m and m/m, each of the two directions across the sight."""
+    orientation_std: float = 8.7e-5  # rad, about each axis of the tracker
 
     def covariance(self, position: Floats, m: int) -> Floats:
         """Return the (N, m, m) covariance at (N, 3) positions in station axes, m.
@@ -108,17 +104,11 @@ def _across(sight: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IdealReading:
-    """What the tracker would read of N states without any noise.
+    """What the tracker would read of N states without any noise."""
 
-    Attributes:
-        position: (N, 3) of the target, sensor axes, m.
-        rotation: (N, 3, 3) of the target, sensor axes.
-        jacobian: (N, 6, n) twist of the target per displacement of a drive, sensor axes.
-    """
-
-    position: Floats
-    rotation: Floats
-    jacobian: Floats
+    position: Floats  # (N, 3) of the target, sensor axes, m
+    rotation: Floats  # (N, 3, 3) of the target, sensor axes
+    jacobian: Floats  # (N, 6, n) twist of the target per displacement of a drive, sensor axes
 
     def value(self, m: int) -> Floats:
         """Return (N, m): the position and, for m = 6, the rotation vector."""
@@ -129,30 +119,20 @@ class IdealReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """One simulated cell with everything about it that the program is not told.
+    """One simulated cell with everything about it that the program is not told."""
 
-    Attributes:
-        cell: the cell as configured: what the program believes.
-        physics: the hidden parameters.
-        registration: (4, 4) the true T_sensor_base, before `physics.base_frame`.
-        station: (4, 4) T_station_sensor: where the instrument stands.
-        noise: the tracker's noise.
-        joint_std: (n,) the arm's repeatability at each joint, rad.
-        joint_reference: temperature at which joints do not drift, °C.
-        offsets: (T, 3) where each of several targets truly is beyond its configured place, flange
-            axes, m; None for none. `physics.target_offset` moves all of them.
-        own: an effect of a user's own, on top of what the mechanics do; None for none.
-    """
-
-    cell: Cell
-    physics: Truth
-    registration: Floats
-    station: Floats
-    noise: SimulatedNoise
-    joint_std: Floats
-    joint_reference: float = 22.0
+    cell: Cell  # the cell as configured: what the program believes
+    physics: Truth  # the hidden parameters
+    registration: Floats  # (4, 4) the true T_sensor_base, before `physics.base_frame`
+    station: Floats  # (4, 4) T_station_sensor: where the instrument stands
+    noise: SimulatedNoise  # the tracker's noise
+    joint_std: Floats  # (n,) the arm's repeatability at each joint, rad
+    joint_reference: float = 22.0  # temperature at which joints do not drift, °C
     offsets: Floats | None = None
+    """(T, 3) where each of several targets truly is beyond its configured place, flange axes, m;
+    None for none. `physics.target_offset` moves all of them."""
     own: OwnLaw | None = None
+    """An effect of a user's own, on top of what the mechanics do; None for none."""
     _tree: ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:

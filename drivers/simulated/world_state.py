@@ -21,15 +21,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedMount:
-    """Where the force sensor sits: everything beyond it weighs on it.
+    """Where the force sensor sits: everything beyond it weighs on it."""
 
-    Attributes:
-        origin: (3,) of the sensor, flange axes, m.
-        axes: (3, 3) the sensor's axes in flange axes: maps sensor into flange components.
-    """
-
-    origin: Floats
-    axes: Floats
+    origin: Floats  # (3,) of the sensor, flange axes, m
+    axes: Floats  # (3, 3) the sensor's axes in flange axes: maps sensor into flange components
 
     @classmethod
     def of(cls, config: CellConfig) -> "SimulatedMount":
@@ -70,17 +65,11 @@ _STRONGEST = 2000.0  # N and N·m that may push or swing
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """A load that swings after it was hung, ever less.
+    """A load that swings after it was hung, ever less."""
 
-    Attributes:
-        wrench: (6,) in the beginning, base axes, N and N·m.
-        period: s.
-        decay: time constant, s.
-    """
-
-    wrench: Floats
-    period: float
-    decay: float
+    wrench: Floats  # (6,) in the beginning, base axes, N and N·m
+    period: float  # s
+    decay: float  # time constant, s
 
     def at(self, time: float) -> Floats:
         """Return the (6,) wrench so long after the load was hung, s."""

@@ -33,16 +33,11 @@ UNWATCHED = "nobody watched its motion for 0.5 s, so it was stopped"
 
 @dataclass(frozen=True, slots=True)
 class Halt:
-    """How a stop ended.
+    """How a stop ended."""
 
-    Attributes:
-        reading: after the stop; None where the arm's state cannot be read.
-        lost: why the state could not be read before it was connected to anew; else empty.
-    """
-
-    reading: Reading | None
+    reading: Reading | None  # after the stop; None where the arm's state cannot be read
     stands: bool
-    lost: str
+    lost: str  # why the state could not be read before it was connected to anew; else empty
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,15 +26,10 @@ _NO_COG = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """State of the control worker.
+    """State of the control worker."""
 
-    Attributes:
-        expired: the motion was stopped because its lease was not renewed.
-        late: the longest pause between two signs of life that was too long, s; 0 for none.
-    """
-
-    expired: bool
-    late: float
+    expired: bool  # the motion was stopped because its lease was not renewed
+    late: float  # the longest pause between two signs of life that was too long, s; 0 for none
 
 
 class Control:

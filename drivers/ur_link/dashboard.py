@@ -14,21 +14,13 @@ NOT_UNDERSTOOD = "could not understand"
 
 @dataclass(frozen=True, slots=True)
 class RobotFacts:
-    """State of the robot by its dashboard server or Robot API; empty where it does not say.
+    """State of the robot by its dashboard server or Robot API; empty where it does not say."""
 
-    Attributes:
-        model: e.g. "UR10".
-        serial: serial number.
-        version: of the software, as the robot writes it.
-        remote: whether it is in remote control; None where the robot has no such mode.
-        program: "PLAYING", "PAUSED", "STOPPED" and the name of the loaded program.
-    """
-
-    model: str
-    serial: str
-    version: str
-    remote: bool | None
-    program: str
+    model: str  # e.g. "UR10"
+    serial: str  # serial number
+    version: str  # of the software, as the robot writes it
+    remote: bool | None  # whether it is in remote control; None where the robot has no such mode
+    program: str  # "PLAYING", "PAUSED", "STOPPED" and the name of the loaded program
 
 
 @dataclass(frozen=True, slots=True)

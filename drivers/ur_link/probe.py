@@ -22,15 +22,10 @@ _STREAM_HZ = 125.0
 
 @dataclass(frozen=True, slots=True)
 class ControllerFacts:
-    """Version and outputs of a controller.
+    """Version and outputs of a controller."""
 
-    Attributes:
-        version: major, minor, bugfix, build.
-        outputs: those of the wanted outputs that it has.
-    """
-
-    version: tuple[int, ...]
-    outputs: tuple[str, ...]
+    version: tuple[int, ...]  # major, minor, bugfix, build
+    outputs: tuple[str, ...]  # those of the wanted outputs that it has
 
 
 def controller(host: str, outputs: tuple[str, ...], seconds: float) -> ControllerFacts:

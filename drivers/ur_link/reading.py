@@ -59,19 +59,12 @@ class ReadingError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """The sample for the run, and what the driver itself looks at.
+    """The sample for the run, and what the driver itself looks at."""
 
-    Attributes:
-        sample: the arm's state.
-        mode: robot mode, 7 is running.
-        runtime: state of the robot's program, 2 is playing.
-        safety_bits: the safety state as bits.
-    """
-
-    sample: ArmSample
-    mode: int
-    runtime: int
-    safety_bits: int
+    sample: ArmSample  # the arm's state
+    mode: int  # robot mode, 7 is running
+    runtime: int  # state of the robot's program, 2 is playing
+    safety_bits: int  # the safety state as bits
 
 
 def read(answer: dict[str, Any]) -> Reading:

@@ -20,18 +20,14 @@ Supervision = Dashboard | RobotApi
 
 @dataclass(frozen=True, slots=True)
 class Generation:
-    """How a controller of one generation is supervised and commanded.
-
-    Attributes:
-        script_port: takes programs: the real-time port, of PolyScope X the primary one.
-        upper: whether commands go by the upper half of the registers (24 to 47), which no fieldbus
-            uses. ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any
-            newer one, where the flag for the upper half would leave program and client apart.
-    """
+    """How a controller of one generation is supervised and commanded."""
 
     supervision: Supervision
-    script_port: int
+    script_port: int  # takes programs: the real-time port, of PolyScope X the primary one
     upper: bool
+    """Whether commands go by the upper half of the registers (24 to 47), which no fieldbus uses.
+    ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any newer one, where
+    the flag for the upper half would leave program and client apart."""
 
     @property
     def registers(self) -> tuple[str, str]:

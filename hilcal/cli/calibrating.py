@@ -201,16 +201,11 @@ def _asked(
 
 @dataclass(frozen=True, slots=True)
 class _Continuation:
-    """How an interrupted calibration is continued, for people.
-
-    Attributes:
-        on: the command that goes on.
-        again: the command that begins.
-    """
+    """How an interrupted calibration is continued, for people."""
 
     t: Terminal
-    on: str
-    again: str
+    on: str  # the command that goes on
+    again: str  # the command that begins
 
     @contextmanager
     def how_to_go_on(self, p: Procedure) -> Iterator[None]:

@@ -59,21 +59,14 @@ NAMED = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """What is to be compensated.
+    """What is to be compensated."""
 
-    Attributes:
-        points: the points.
-        tool: (4, 4) T_flange_tool; the tracked target where None.
-        program: text of the program that the points are of.
-        waypoints: of that program, those that are left too.
-        other: a program of another maker than UR, in place of the two.
-    """
-
-    points: Points
-    tool: Floats | None
-    program: str | None = None
-    waypoints: tuple[Waypoint, ...] = ()
+    points: Points  # the points
+    tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
+    program: str | None = None  # text of the program that the points are of
+    waypoints: tuple[Waypoint, ...] = ()  # of that program, those that are left too
     other: UnderstoodProgram | None = None
+    """A program of another maker than UR, in place of the two."""
 
 
 def compensate(

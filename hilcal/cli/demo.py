@@ -107,18 +107,13 @@ SHARE = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Doubted:
-    """A first diagnosis, and the plan that would settle it.
-
-    Attributes:
-        hashed: hash of these readings.
-        plan: the measurements that separate the suspects; None where nothing is in doubt.
-    """
+    """A first diagnosis, and the plan that would settle it."""
 
     fit: Fit
     diagnosis: Diagnosis
-    hashed: str
+    hashed: str  # hash of these readings
     readings: int
-    plan: Plan | None
+    plan: Plan | None  # the measurements that separate the suspects; None where nothing is in doubt
     document: dict[str, object]
 
 

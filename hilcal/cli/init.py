@@ -45,15 +45,10 @@ LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
 
 @dataclass(slots=True)
 class Draft:
-    """A cell in the making; every answer is checked as it comes.
+    """A cell in the making; every answer is checked as it comes."""
 
-    Attributes:
-        base_dir: to which paths in it refer.
-        data: the sections so far, as TOML has them.
-    """
-
-    base_dir: Path
-    data: dict[str, Any] = field(default_factory=dict)
+    base_dir: Path  # to which paths in it refer
+    data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
 
     def set(self, section: str, **values: object) -> None:
         """Set keys of a section.
@@ -187,23 +182,14 @@ def ports() -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One thing that is asked for.
+    """One thing that is asked for."""
 
-    Attributes:
-        option: that gives it without a question.
-        question: in words.
-        take: puts the answer into a draft.
-        needs: section that must be there for it to be asked.
-        again: whether there may be several.
-        without: what an empty answer means.
-    """
-
-    option: str
-    question: str
-    take: Callable[[Draft, str], None]
-    needs: str = ""
-    again: bool = False
-    without: str = ""
+    option: str  # that gives it without a question
+    question: str  # in words
+    take: Callable[[Draft, str], None]  # puts the answer into a draft
+    needs: str = ""  # section that must be there for it to be asked
+    again: bool = False  # whether there may be several
+    without: str = ""  # what an empty answer means
 
 
 def _set(section: str, key: str, read: Callable[[str], object]) -> Callable[[Draft, str], None]:

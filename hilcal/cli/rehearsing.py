@@ -62,21 +62,16 @@ BREAK = 600.0
 
 @dataclass(frozen=True, slots=True)
 class RehearsalSettings:
-    """What a rehearsal is of.
-
-    Attributes:
-        choice: an effect that is hidden, "random" or "nothing".
-        base_dir: directory that paths in the configuration are relative to.
-        lacking: the same with what is hidden, where the models cannot have that.
-    """
+    """What a rehearsal is of."""
 
     config: CellConfig
-    choice: str
+    choice: str  # an effect that is hidden, "random" or "nothing"
     seed: int
     output: Path
-    base_dir: Path
+    base_dir: Path  # directory that paths in the configuration are relative to
     catalogue: Catalogue
     lacking: Catalogue | None = None
+    """The same with what is hidden, where the models cannot have that."""
 
     @property
     def world(self) -> Catalogue:
@@ -90,17 +85,12 @@ class RehearsalSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RehearsedCampaign:
-    """A first campaign, in a simulated cell that is still there.
+    """A first campaign, in a simulated cell that is still there."""
 
-    Attributes:
-        rehearsal: the cell, and all readings.
-        further: measures one further plan, into the same campaign; returns all readings.
-        measure: measures what is missing of another campaign, in the same cell.
-    """
-
-    rehearsal: Rehearsal
+    rehearsal: Rehearsal  # the cell, and all readings
     further: Callable[[Plan], Rehearsal]
-    measure: Measure
+    """Measures one further plan, into the same campaign; returns all readings."""
+    measure: Measure  # measures what is missing of another campaign, in the same cell
 
 
 def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:

@@ -24,19 +24,12 @@ WIDTH = 100
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """The two streams.
+    """The two streams."""
 
-    Attributes:
-        json: whether stdout is for one JSON document.
-        people: where tables and words for people go.
-        progress: where progress and notices go.
-        out: where the document goes.
-    """
-
-    json: bool
-    people: Console
-    progress: Console
-    out: TextIO
+    json: bool  # whether stdout is for one JSON document
+    people: Console  # where tables and words for people go
+    progress: Console  # where progress and notices go
+    out: TextIO  # where the document goes
 
     def show(self, parts: Iterable[RenderableType] | RenderableType) -> None:
         """Print for people."""

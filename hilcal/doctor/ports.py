@@ -18,21 +18,14 @@ State = Literal["ok", "warning", "problem"]
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One thing that was looked at."""
 
-    Attributes:
-        topic: "program", "computer", "serial ports", "network" or "cell".
-        name: of the thing, e.g. "clock".
-        state: "ok"; "warning" where a campaign runs but may suffer; "problem" where it does not.
-        said: how it is, in words.
-        mend: what to do about it; empty where nothing is to be done.
-    """
-
-    topic: str
-    name: str
+    topic: str  # "program", "computer", "serial ports", "network" or "cell"
+    name: str  # of the thing, e.g. "clock"
     state: State
-    said: str
-    mend: str = ""
+    """"ok"; "warning" where a campaign runs but may suffer; "problem" where it does not."""
+    said: str  # how it is, in words
+    mend: str = ""  # what to do about it; empty where nothing is to be done
 
 
 PORTS = "serial ports"

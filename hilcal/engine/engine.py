@@ -31,13 +31,9 @@ Advance = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Engine:
-    """Computes many items; made by `open_engine`.
+    """Computes many items; made by `open_engine`."""
 
-    Attributes:
-        workers: what computes; None where this process does.
-    """
-
-    workers: Processes | Cluster | None
+    workers: Processes | Cluster | None  # what computes; None where this process does
 
     def map(
         self,

@@ -110,30 +110,19 @@ _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFrame:
-    """Where the sensor is at one pose of the arm, base axes.
+    """Where the sensor is at one pose of the arm, base axes."""
 
-    Attributes:
-        rotation: (3, 3) R_base_sensor.
-        arm: (3,) from the sensor's origin to the load point, m.
-    """
-
-    rotation: Floats
-    arm: Floats
+    rotation: Floats  # (3, 3) R_base_sensor
+    arm: Floats  # (3,) from the sensor's origin to the load point, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaredWrench:
-    """One mean wrench against the zero of its session, and the pose where it was felt.
+    """One mean wrench against the zero of its session, and the pose where it was felt."""
 
-    Attributes:
-        wrench: (6,) sensor axes, N and N·m.
-        covariance: (6, 6) of this mean.
-        q: (n,) joint angles, rad.
-    """
-
-    wrench: Floats
-    covariance: Floats
-    q: Floats
+    wrench: Floats  # (6,) sensor axes, N and N·m
+    covariance: Floats  # (6, 6) of this mean
+    q: Floats  # (n,) joint angles, rad
 
 
 class ForceMeter:

@@ -59,23 +59,14 @@ _MEAN_STEPS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Average:
-    """The mean of K samples.
+    """The mean of K samples."""
 
-    Attributes:
-        value: (m,) position in m and, for m = 6, rotation vector in rad, sensor axes.
-        covariance: (m, m) of `value`; rotations as small rotations about the sensor's axes.
-        scatter: mean square of the scatter over what is stated; 1 is expected.
-        scatter_p: how probable at least as much scatter is under the stated noise.
-        left_out: numbers of the samples (from 0) that were gross outliers.
-        warnings: what a person should know, one line each.
-    """
-
-    value: Floats
-    covariance: Floats
-    scatter: float
-    scatter_p: float
-    left_out: tuple[int, ...]
-    warnings: tuple[str, ...]
+    value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
+    covariance: Floats  # (m, m) of `value`; rotations as small rotations about the sensor's axes
+    scatter: float  # mean square of the scatter over what is stated; 1 is expected
+    scatter_p: float  # how probable at least as much scatter is under the stated noise
+    left_out: tuple[int, ...]  # numbers of the samples (from 0) that were gross outliers
+    warnings: tuple[str, ...]  # what a person should know, one line each
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
@@ -259,25 +250,15 @@ class SettleWindow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trend:
-    """A line through a window.
+    """A line through a window."""
 
-    Attributes:
-        slope: (m,) per s of cell time.
-        white_slope: (m,) the same, whitened by the mean stated covariance.
-        moment: Σ (t_k - t̄)², s².
-        span: from the first to the last sample, s.
-        scatter: mean square about the line over what is stated.
-        scatter_p: how probable at least as much is.
-        dof: m (K - 2).
-    """
-
-    slope: Floats
-    white_slope: Floats
-    moment: float
-    span: float
-    scatter: float
-    scatter_p: float
-    dof: int
+    slope: Floats  # (m,) per s of cell time
+    white_slope: Floats  # (m,) the same, whitened by the mean stated covariance
+    moment: float  # Σ (t_k - t̄)², s²
+    span: float  # from the first to the last sample, s
+    scatter: float  # mean square about the line over what is stated
+    scatter_p: float  # how probable at least as much is
+    dof: int  # m (K - 2)
 
 
 def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
@@ -305,26 +286,19 @@ PATIENCE = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredStop:
-    """What was measured at one stop.
+    """What was measured at one stop."""
 
-    Attributes:
-        mean: of the tracker's measurements, with its covariance, sensor axes.
-        q: (n,) mean actual joint angles meanwhile, rad.
-        torque: (n,) mean torques that the drives were measured to exert meanwhile, N·m; None
-            where the arm does not tell them.
-        force: mean wrench of the force sensor; None without one.
-        settling: how long it took until all was settled, cell seconds.
-    """
-
-    mean: Average
-    q: Floats
+    mean: Average  # of the tracker's measurements, with its covariance, sensor axes
+    q: Floats  # (n,) mean actual joint angles meanwhile, rad
     before: ArmSample
     after: ArmSample
     tracker: tuple[TrackerSample, ...]
-    force: WrenchSample | None
-    settling: float
+    force: WrenchSample | None  # mean wrench of the force sensor; None without one
+    settling: float  # how long it took until all was settled, cell seconds
     remarks: tuple[str, ...]
     torque: Floats | None = None
+    """(n,) mean torques that the drives were measured to exert meanwhile, N·m; None where the arm
+    does not tell them."""
 
 
 class Measurer:

@@ -16,20 +16,14 @@ APPROACH_RAD = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A point of the route where the arm comes to rest.
-
-    Attributes:
-        q: (n,) commanded joint angles, rad.
-        hanging: name of the load under which the arm comes here.
-        change_to: name of the load that is hung here; None where nothing is changed.
-        step: the reading that is taken here; None where none is.
-    """
+    """A point of the route where the arm comes to rest."""
 
     name: str
-    q: Floats
-    hanging: str
+    q: Floats  # (n,) commanded joint angles, rad
+    hanging: str  # name of the load under which the arm comes here
     change_to: str | None = None
-    step: Step | None = None
+    """Name of the load that is hung here; None where nothing is changed."""
+    step: Step | None = None  # the reading that is taken here; None where none is
 
 
 def home(plan: Plan) -> str:

@@ -17,15 +17,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """How far a return lies from the first reading at the reference pose.
+    """How far a return lies from the first reading at the reference pose."""
 
-    Attributes:
-        metres: (3,) difference of the positions, sensor axes, m.
-        sigma: its size d in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d).
-    """
-
-    metres: Floats
-    sigma: float
+    metres: Floats  # (3,) difference of the positions, sensor axes, m
+    sigma: float  # its size d in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
 
     def words(self, limit: float) -> str:
         """Return for people that it is over a limit, sigma."""

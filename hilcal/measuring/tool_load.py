@@ -25,27 +25,16 @@ MIN_SPREAD = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolLoad:
-    """A sensor's zero and the tool it carries.
+    """A sensor's zero and the tool it carries."""
 
-    Attributes:
-        bias: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        mass: of the tool beyond the sensor, kg.
-        moment: (3,) mass times centre of mass, kg·m, sensor axes from its origin.
-        covariance: (10, 10) of (bias, mass, moment); zero for what was not estimated.
-        gravity: (3,) base axes, m/s².
-        chi2: sum of squared whitened residuals.
-        dof: its degrees of freedom; 0 after a tare.
-        poses: number of readings used.
-    """
-
-    bias: Floats
-    mass: float
-    moment: Floats
-    covariance: Floats
-    gravity: Floats
-    chi2: float
-    dof: int
-    poses: int
+    bias: Floats  # (6,) what the sensor reads with nothing on it, N and N·m, sensor axes
+    mass: float  # of the tool beyond the sensor, kg
+    moment: Floats  # (3,) mass times centre of mass, kg·m, sensor axes from its origin
+    covariance: Floats  # (10, 10) of (bias, mass, moment); zero for what was not estimated
+    gravity: Floats  # (3,) base axes, m/s²
+    chi2: float  # sum of squared whitened residuals
+    dof: int  # its degrees of freedom; 0 after a tare
+    poses: int  # number of readings used
 
     @property
     def com(self) -> Floats:

@@ -34,18 +34,12 @@ POINTS, LEFT_OUT = "points", "left_out"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPoints:
-    """K readings of a validation campaign whose poses are to be corrected.
+    """K readings of a validation campaign whose poses are to be corrected."""
 
-    Attributes:
-        rows: (K,) of the readings.
-        unloaded: (K,) rows of their unloaded readings, for a fit to deflections; -1 otherwise.
-        loads: name of each one's load.
-    """
-
-    rows: Ints
-    unloaded: Ints
+    rows: Ints  # (K,) of the readings
+    unloaded: Ints  # (K,) rows of their unloaded readings, for a fit to deflections; -1 otherwise
     names: tuple[str, ...]
-    loads: tuple[str, ...]
+    loads: tuple[str, ...]  # name of each one's load
 
 
 def points_of(readings: Readings, mode: str) -> CorrectedPoints:

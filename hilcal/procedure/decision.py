@@ -36,40 +36,29 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True)
 class PredictedError:
-    """Distances within which 95 % of points are after compensation, as the fit states them.
+    """Distances within which 95 % of points are after compensation, as the fit states them."""
 
-    Attributes:
-        now_m: all of it.
-        floor_m: what no further reading lowers: the arm's repeatability, and what the model leaves.
-    """
-
-    now_m: float
+    now_m: float  # all of it
     floor_m: float
+    """What no further reading lowers: the arm's repeatability, and what the model leaves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What to do after a refinement.
-
-    Attributes:
-        reason: "adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured;
-            "floor", "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs
-            too much; the verdict where no measurement would help.
-        then_m: the same after the further plan; None where it is about a doubt.
-        suspects: effects in doubt.
-        power: least chance of separating two of them after the further plan.
-        plan: the further plan, that is measured unless the reason is "time"; None without one.
-        seconds: how long it takes, cell s.
-    """
+    """What to do after a refinement."""
 
     reason: str
+    """"adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured; "floor",
+    "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs too much; the
+    verdict where no measurement would help."""
     verdict: str
     error: PredictedError
-    then_m: float | None = None
-    suspects: tuple[str, ...] = ()
-    power: float | None = None
+    then_m: float | None = None  # the same after the further plan; None where it is about a doubt
+    suspects: tuple[str, ...] = ()  # effects in doubt
+    power: float | None = None  # least chance of separating two of them after the further plan
     plan: Plan | None = None
-    seconds: float = 0.0
+    """The further plan, that is measured unless the reason is "time"; None without one."""
+    seconds: float = 0.0  # how long it takes, cell s
 
     @property
     def measures(self) -> bool:

@@ -32,17 +32,12 @@ POSES = 20
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """What is to be separated.
+    """What is to be separated."""
 
-    Attributes:
-        fit: of a model without the suspects.
-        suspects: the effects.
-        alone: the misfit where more poses, unloaded, are what tells of it; None else.
-    """
-
-    fit: Fit
-    suspects: tuple[str, ...]
+    fit: Fit  # of a model without the suspects
+    suspects: tuple[str, ...]  # the effects
     alone: PoseAlone | None = None
+    """The misfit where more poses, unloaded, are what tells of it; None else."""
 
 
 def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
@@ -103,17 +98,11 @@ def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NextPlan:
-    """The next measurements.
+    """The next measurements."""
 
-    Attributes:
-        doubt: what they separate.
-        found: how well, pair by pair.
-        made: the plan, which may be run.
-    """
-
-    doubt: Doubt
-    found: Next
-    made: CheckedPlan
+    doubt: Doubt  # what they separate
+    found: Next  # how well, pair by pair
+    made: CheckedPlan  # the plan, which may be run
 
 
 def next_plan(

@@ -85,13 +85,9 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """The files of a calibration.
+    """The files of a calibration."""
 
-    Attributes:
-        run: the campaign that is fitted.
-    """
-
-    run: Path
+    run: Path  # the campaign that is fitted
 
     @property
     def validation(self) -> Path:
@@ -109,23 +105,14 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class ProcedureStep:
-    """What a calibration does next.
+    """What a calibration does next."""
 
-    Attributes:
-        kind: what.
-        path: the campaign that it is about.
-        missing: readings that are missing, where the arm moves.
-        planned: readings of the plan, where the arm moves.
-        load_changes: how often a person has to change the load, where the arm moves.
-        seconds: how long the arm takes for what is missing, roughly, cell s.
-    """
-
-    kind: Kind
-    path: Path
-    missing: int = 0
-    planned: int = 0
-    load_changes: int = 0
-    seconds: float = 0.0
+    kind: Kind  # what
+    path: Path  # the campaign that it is about
+    missing: int = 0  # readings that are missing, where the arm moves
+    planned: int = 0  # readings of the plan, where the arm moves
+    load_changes: int = 0  # how often a person has to change the load, where the arm moves
+    seconds: float = 0.0  # how long the arm takes for what is missing, roughly, cell s
 
     @property
     def moves(self) -> bool:

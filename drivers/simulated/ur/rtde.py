@@ -110,13 +110,9 @@ def outputs_since(version: tuple[int, int, int, int]) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Variables that travel together in one data frame.
+    """Variables that travel together in one data frame."""
 
-    Attributes:
-        number: its id on the connection, 1 or more.
-    """
-
-    number: int
+    number: int  # its id on the connection, 1 or more
     names: tuple[str, ...]
     kinds: tuple[str, ...]
     layout: struct.Struct
@@ -366,19 +362,15 @@ class Faults:
 
 @dataclass(slots=True, eq=False)
 class RtdeLinks:
-    """All RTDE clients of one controller.
-
-    Attributes:
-        taken: called after each input package.
-        owners: which connection may write an input variable.
-    """
+    """All RTDE clients of one controller."""
 
     arm: ArmState
     sensors: Sensors
     faults: Faults
-    taken: Callable[[], None]
+    taken: Callable[[], None]  # called after each input package
     links: set["RtdeLink"] = field(default_factory=set)
     owners: dict[str, "RtdeLink"] = field(default_factory=dict)
+    """Which connection may write an input variable."""
 
     def due(self, now: float) -> float:
         """Return when the next package is due, real time in s; infinite where none is."""
