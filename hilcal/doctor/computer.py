@@ -188,9 +188,8 @@ def _python() -> Finding:
 def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
     """Return whether the packages of a distribution are there and load.
 
-    Args:
-        requirements: as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'.
-            One for earlier Pythons alone has no wheel for this one.
+    Requirements are as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'. One for
+    earlier Pythons alone has no wheel for this one.
     """
     there, out = [], []
     lacking: dict[str, list[str]] = {}

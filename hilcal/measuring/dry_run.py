@@ -21,21 +21,13 @@ AIMING_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What a plan would do.
+    """What a plan would do."""
 
-    Attributes:
-        problems: why it must not be run, one line each; empty where it may.
-        remarks: what people should know of it.
-        duration: how long it takes, roughly, cell seconds.
-        motions: how often the arm moves.
-        load_changes: how often a person is asked for another load.
-    """
-
-    problems: tuple[str, ...]
-    remarks: tuple[str, ...]
-    duration: float
-    motions: int
-    load_changes: int
+    problems: tuple[str, ...]  # why it must not be run, one line each; empty where it may
+    remarks: tuple[str, ...]  # what people should know of it
+    duration: float  # how long it takes, roughly, cell seconds
+    motions: int  # how often the arm moves
+    load_changes: int  # how often a person is asked for another load
 
 
 def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:

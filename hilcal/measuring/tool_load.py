@@ -64,9 +64,7 @@ class ToolLoad:
     def load_wrench(self, wrench: Floats, rotation: Floats) -> Floats:
         """Return the load's wrench (..., 6) at the sensor's origin, base axes, N and N·m.
 
-        Args:
-            wrench: (..., 6) readings, sensor axes.
-            rotation: (..., 3, 3) R_base_sensor.
+        Readings (..., 6) are in sensor axes; `rotation` (..., 3, 3) is R_base_sensor.
         """
         own = np.asarray(wrench) - self.tool_wrench(rotation)
         parts = own.reshape(*own.shape[:-1], 2, 3)
@@ -75,11 +73,8 @@ class ToolLoad:
     def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
         """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
 
-        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R) and D the design matrix.
-
-        Args:
-            covariance: (6, 6) of the reading (a mean's, if a mean), sensor axes.
-            rotation: (3, 3) R_base_sensor.
+        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R), R = R_base_sensor, and D the
+        design matrix; that of the reading (a mean's, if a mean) is in sensor axes.
         """
         D = design(np.asarray(rotation), self.gravity)
         B = np.kron(np.eye(2), rotation)
@@ -89,9 +84,7 @@ class ToolLoad:
 def design(rotation: Floats, gravity: Floats) -> Floats:
     """Return D (..., 6, 10) with reading = D x for x = (b_f, b_M, m, m c) and no load.
 
-    Args:
-        rotation: (..., 3, 3) R_base_sensor.
-        gravity: (3,) base axes, m/s².
+    `rotation` (..., 3, 3) is R_base_sensor, gravity (3,) in base axes, m/s².
     """
     u = np.swapaxes(rotation, -1, -2) @ np.asarray(gravity, dtype=np.float64)
     out = np.zeros((*u.shape[:-1], 6, PARAMETERS))
@@ -178,13 +171,9 @@ def tare(
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
-    """Return a wrench (..., 6) taken at a point that lies `arm` further, same axes.
+    """Return a wrench (..., 6) taken at a point that lies `arm` (..., 3) further, same axes, SI.
 
     f' = f,  M' = M - arm × f
-
-    Args:
-        wrench: (..., 6) force and moment, N and N·m.
-        arm: (..., 3) from the old point to the new one, m.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
     force, moment = wrench[..., :3], wrench[..., 3:]

@@ -175,10 +175,8 @@ class Procedure:
     def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
         """Make the campaign file with its first plan.
 
-        Args:
-            plan: the plan.
-            config: the configuration that the file holds, with the devices that are used.
-            covers: what the covariance of the readings will cover.
+        `config` is what the file holds, with the devices that are used; `covers` what the
+        covariance of the readings will cover.
 
         Raises:
             InputError: it cannot be written, or is there already.

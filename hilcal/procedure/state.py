@@ -46,32 +46,23 @@ SUFFIX = ".hilcal"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a calibration was asked for; kept in its campaign.
+    """What a calibration was asked for; kept in its campaign."""
 
-    Attributes:
-        poses: size of the first plan, and of further ones.
-        validation: poses of the validation campaign.
-        max_time_s: how long measuring may last in all plans together, as they state it, cell s.
-        goal_m: the error that is wanted after compensation: 95 % of the points within it; None for
-            no goal beside an adequate model.
-        limit_m: the largest error that is allowed at corrected targets; None for none.
-        seed: of everything random.
-        readings: kind of readings that is fitted.
-        hide: what a rehearsal hides in its simulated cell; None on real devices.
-        prior: file of the campaign or the posterior that is the prior of every fit; None without.
-        under_load: whether the model is tested under loads alone, where there are any.
-    """
-
-    poses: int = 20
-    validation: int = 20
+    poses: int = 20  # size of the first plan, and of further ones
+    validation: int = 20  # poses of the validation campaign
     max_time_s: float = 7200.0
+    """How long measuring may last in all plans together, as they state it, cell s."""
     goal_m: float | None = None
+    """The error that is wanted after compensation: 95 % of the points within it; None for no goal
+    beside an adequate model."""
     limit_m: float | None = None
-    seed: int = 0
-    readings: Mode = "deflection"
-    hide: str | None = None
-    under_load: bool = False
+    """The largest error that is allowed at corrected targets; None for none."""
+    seed: int = 0  # of everything random
+    readings: Mode = "deflection"  # kind of readings that is fitted
+    hide: str | None = None  # what a rehearsal hides in its simulated cell; None on real devices
+    under_load: bool = False  # whether the model is tested under loads alone, where there are any
     prior: str | None = None
+    """File of the campaign or the posterior that is the prior of every fit; None without."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""
