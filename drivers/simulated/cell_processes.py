@@ -353,53 +353,42 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 def _devices(
     world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
-    noise = world.noise
-    file = config.robot.calibration
-    calibration = () if file is None else ("--calibration", str(base_dir / file))
+    noise, arm, sensor = world.noise, config.robot, config.force_sensor
+    stated = {"range_std": noise.range_std, "transverse_std": noise.transverse_std}
+    at: dict[str, object] = {"host": host}
+    of_tracker: dict[str, dict[str, object]] = {
+        "geocom": {**stated},
+        "emscon": {
+            **at, "port": EMSCON_PORT, **stated, "orientation_std": noise.orientation_std,
+        },
+        "natnet": {**at, "port": NATNET_PORT},  # its errors are its own
+    }  # fmt: skip
     tracker = config.tracker.driver or TRACKERS[0]
-    stated = (
-        *("--range-std", *map(repr, map(float, noise.range_std))),
-        *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
-    )
-    of_tracker = {
-        "geocom": stated,
-        "emscon": (
-            *("--host", host, "--port", str(EMSCON_PORT), *stated),
-            *("--orientation-std", repr(float(noise.orientation_std))),
-        ),
-        "natnet": ("--host", host, "--port", str(NATNET_PORT)),  # its errors are its own
-    }[tracker]
 
-    def device(name: str, server: str, *arguments: str) -> DeviceProcess:
-        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, arguments)
+    def device(name: str, server: str, number: int, options: dict[str, object]) -> DeviceProcess:
+        words = ["--seed", str(number)]
+        for key, value in options.items():
+            values = value if isinstance(value, tuple) else (value,)
+            told = (repr(float(v)) if isinstance(v, float) else str(v) for v in values)
+            words += [f"--{key.replace('_', '-')}", *told]
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
 
+    of_arm: tuple[str, dict[str, object]] = "arm_server", {}
+    if is_ur(world.cell.arm):
+        version = config.simulation.controller_version
+        of_arm = "ur_server", {**at, "robot": arm.model, "version": version}
+        if arm.calibration is not None:
+            of_arm[1]["calibration"] = base_dir / arm.calibration
     out = {
-        "world": device("world", "world_server", "--seed", str(seed)),
-        "arm": device(
-            "arm",
-            *(
-                (
-                    *("ur_server", "--host", host, "--robot", config.robot.model),
-                    *("--version", config.simulation.controller_version, *calibration),
-                )
-                if is_ur(world.cell.arm)
-                else ("arm_server",)
-            ),
-            *("--seed", str(seed + 3)),
-        ),
-        "tracker": device(
-            "tracker",
-            f"{tracker}_server",
-            *of_tracker,
-            *("--seed", str(seed + 1)),
-        ),
+        "world": device("world", "world_server", seed, {}),
+        "arm": device("arm", of_arm[0], seed + 3, of_arm[1]),
+        "tracker": device("tracker", f"{tracker}_server", seed + 1, of_tracker[tracker]),
     }
-    if config.force_sensor is not None:
-        server, *kind = ("force_server", "--kind", config.force_sensor.driver)
-        if config.force_sensor.driver == "netft":
-            server, *kind = "netft_server", "--host", host, "--port", str(RDT_PORT)
-            kind += ("--web-port", str(WEB_PORT))
-        out["force"] = device("force", server, *kind, "--seed", str(seed + 2))
+    if sensor is not None:
+        of_sensor: tuple[str, dict[str, object]] = "force_server", {"kind": sensor.driver}
+        if sensor.driver == "netft":
+            of_sensor = "netft_server", {**at, "port": RDT_PORT, "web_port": WEB_PORT}
+        out["force"] = device("force", of_sensor[0], seed + 2, of_sensor[1])
     return out
 
 

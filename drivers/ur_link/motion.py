@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 from hilcal.drivers.ur_link.reading import Reading
+from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
 STANDS_RAD_S = 0.01
@@ -18,16 +19,6 @@ SLOWEST = 0.02
 _TARGET_RAD = 1e-5
 _BRAKE_S = 0.15
 _BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
-
-
-def duration(distance: float, speed: float, acceleration: float) -> float:
-    """Return the time of a motion from rest to rest with a trapezoid of speed, s.
-
-    d / v + v / a where the full speed is reached, else 2 sqrt(d / a).
-    """
-    if distance * acceleration >= speed * speed:
-        return distance / speed + speed / acceleration
-    return 2.0 * float(np.sqrt(distance / acceleration))
 
 
 def deceleration(speed: float) -> float:
@@ -63,8 +54,7 @@ class MotionInProgress:
         """
         self.brake = deceleration(speed)
         self._goal, self._arrival = goal, arrival
-        distance = float(np.abs(goal - start).max())
-        self._usual = duration(distance, speed, acceleration) / clock
+        self._usual = duration(start, goal, speed, acceleration) / clock
         self._spent = 0.0
         self._looked = time.monotonic()
         self._paused: float | None = None

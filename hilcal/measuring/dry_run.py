@@ -29,6 +29,13 @@ class DryRun:
     motions: int  # how often the arm moves
     load_changes: int  # how often a person is asked for another load
 
+    @property
+    def first(self) -> str:
+        """The first problem, and how many others there are."""
+        more = len(self.problems) - 1
+        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
+        return f"{self.problems[0]}{others}"
+
 
 def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     """Check a plan against every limit of the cell; all problems at once.

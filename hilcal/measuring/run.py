@@ -75,11 +75,7 @@ def refuse(checked: DryRun) -> None:
         InputError: names the first problem, and how many more there are.
     """
     if checked.problems:
-        more = len(checked.problems) - 1
-        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-        raise InputError(
-            f"the plan is not safe to run, nothing has moved: {checked.problems[0]}{others}"
-        )
+        raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
 
 
 def _stop(arm: ArmDevice) -> str:
