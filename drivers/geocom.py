@@ -52,7 +52,6 @@ class PolarReading:
     distance: float  # slope distance, m; 0 is none
     angle_std: float = 0.0  # what it states of both angles, rad; 0 where it does not tell
     tilt: tuple[float, float] | None = None  # inclination across and along, rad
-    measured_ms: float = 0.0  # when the distance was measured, ms of its own clock; 0 is unknown
     warning: str = ""  # what it remarks
 
 
@@ -240,7 +239,7 @@ class GeoComTracker:
                 "before again, not a new one; is another program using it?"
             )
         self._last_ms = ms
-        return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), ms, warning)
+        return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), warning)
 
     def _simple(self, until: float, measuring: float) -> PolarReading:
         """Measurement without a word on its accuracy, as older instruments know it."""

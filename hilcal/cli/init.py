@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hilcal.cell import cell_from_config
-from hilcal.cli.options import Json, argument, check_folder, check_new, option
+from hilcal.cli.options import Force, Json, argument, check_folder, check_new, option
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
@@ -354,7 +354,7 @@ def init(
     tracker_place: Annotated[
         str | None, option("--tracker-place X,Y,Z", "Of the tracker in base axes, m.")
     ] = None,
-    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""

@@ -173,11 +173,11 @@ LONGEST = 10
 class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
-    def __init__(self, count: int, scale: float = 1.0) -> None:
-        """Start empty; 3 samples or more are judged, at `scale` cell seconds per real second."""
+    def __init__(self, count: int) -> None:
+        """Start empty; 3 samples or more are judged."""
         if count < 3:
             raise ValueError(f"count = {count}: a trend takes at least 3 samples")
-        self._count, self._scale = count, scale
+        self._count = count
         self._samples: list[TrackerSample] = []
         self._settled = self._has_drifted = False
 
@@ -187,35 +187,13 @@ class SettleWindow:
         del self._samples[: -2 * LONGEST * self._count]
         self._settled = len(self._samples) >= self._count and self._judge()
 
-    def clear(self) -> None:
-        """Forget everything: the arm has moved, or the load has changed."""
-        self._samples.clear()
-        self._settled = self._has_drifted = False
-
-    def __len__(self) -> int:
-        """Number of samples since the start, as far as they are remembered."""
-        return len(self._samples)
-
-    @property
-    def latest(self) -> tuple[TrackerSample, ...]:
-        """The last K samples, fewer if there are not as many yet."""
-        return tuple(self._samples[-self._count :])
-
-    @property
-    def drift(self) -> Floats:
-        """Slope (m,) over the window, m/s and rad/s of cell time; zeros before 2 samples."""
-        window = self._window()
-        if len(window) < 2:
-            return np.zeros(window[0].value.shape[0] if window else 3)
-        return _trend(window, self._scale).slope
-
     def settled(self) -> bool:
         """Whether the readings are at rest; False before K samples."""
         return self._settled
 
     def _judge(self) -> bool:
         window = self._window()
-        trend = _trend(window, self._scale)
+        trend = _trend(window)
         if trend.moment == 0.0:
             return False  # all at one time: no word on a trend
         noise = 1.0
@@ -227,7 +205,7 @@ class SettleWindow:
         over_window = np.linalg.norm(trend.white_slope) * trend.span
         if over_window < NEGLIGIBLE * np.sqrt(noise / len(window)):
             return True
-        m, drift = len(trend.slope), trend.moment * float(np.sum(trend.white_slope**2))
+        m, drift = len(trend.white_slope), trend.moment * float(np.sum(trend.white_slope**2))
         if noise == 1.0:
             p = float(stats.chi2.sf(drift, m))
         else:
@@ -242,8 +220,8 @@ class SettleWindow:
     def _shrinking(self) -> bool:
         """Whether the second half of all samples scatters less than the first (F test)."""
         half = len(self._samples) // 2
-        first = _trend(self._samples[:half], self._scale)
-        second = _trend(self._samples[-half:], self._scale)
+        first = _trend(self._samples[:half])
+        second = _trend(self._samples[-half:])
         ratio = first.scatter / max(second.scatter, np.finfo(float).tiny)
         return bool(stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
 
@@ -252,8 +230,7 @@ class SettleWindow:
 class _Trend:
     """A line through a window."""
 
-    slope: Floats  # (m,) per s of cell time
-    white_slope: Floats  # (m,) the same, whitened by the mean stated covariance
+    white_slope: Floats  # (m,) per s, whitened by the mean stated covariance
     moment: float  # Σ (t_k - t̄)², s²
     span: float  # from the first to the last sample, s
     scatter: float  # mean square about the line over what is stated
@@ -261,8 +238,8 @@ class _Trend:
     dof: int  # m (K - 2)
 
 
-def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
-    time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9 * scale
+def _trend(samples: Sequence[TrackerSample]) -> _Trend:
+    time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9
     span = float(time[-1])
     time -= time.mean()
     moment = float(time @ time)
@@ -273,7 +250,7 @@ def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
     dof = residuals.shape[1] * (len(samples) - 2)
     total = float(np.sum(about**2))
     scatter, p = (total / dof, float(stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
-    return _Trend(slope, root @ slope, moment, span, scatter, p, dof)
+    return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
 SEARCHES = 2
@@ -356,10 +333,10 @@ class Measurer:
         begun = clock.now()
         rest: float | None = None
         taken = 0
-        window = self._window()
+        window = SettleWindow(acquire.samples)
         while True:
             if not self._mover.at_rest(self._mover.look()):
-                rest, window = None, self._window()
+                rest, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
                 rest = clock.now() if rest is None else rest
@@ -374,9 +351,6 @@ class Measurer:
                     f"{name}: not settled within {acquire.settle_timeout_s:g} s: {what}. Look for "
                     "a swinging load, a loose target or a warming tracker"
                 )
-
-    def _window(self) -> SettleWindow:
-        return SettleWindow(self._config.acquire.samples, self._clock.scale)
 
     def _averaged(
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
