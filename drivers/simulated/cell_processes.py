@@ -359,10 +359,13 @@ def _devices(
     of_tracker: dict[str, dict[str, object]] = {
         "geocom": {**stated},
         "emscon": {
-            **at, "port": EMSCON_PORT, **stated, "orientation_std": noise.orientation_std,
+            **at,
+            "port": EMSCON_PORT,
+            **stated,
+            "orientation_std": noise.orientation_std,
         },
         "natnet": {**at, "port": NATNET_PORT},  # its errors are its own
-    }  # fmt: skip
+    }
     tracker = config.tracker.driver or TRACKERS[0]
 
     def device(name: str, server: str, number: int, options: dict[str, object]) -> DeviceProcess:

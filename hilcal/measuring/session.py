@@ -64,9 +64,13 @@ class Session:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
         self._mover = Mover(
-            rig.arm, self._meter, self._guard, config, clock,
+            rig.arm,
+            self._meter,
+            self._guard,
+            config,
+            clock,
             lambda q: watcher.notify(ArmAt(tuple(q.tolist()))),
-        )  # fmt: skip
+        )
         self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
