@@ -204,8 +204,12 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
     def freeze(on: bool = True) -> None:
         arm.frozen_q = arm.trajectory.q.copy() if on else None
 
+    def state() -> dict[str, Any]:
+        return _state(server)
+
     known = admin.Operations(
         {
+            "state": state,
             "protective_stop": lambda: controller.protective_stop("admin"),
             "emergency_stop": controller.emergency_stop,
             "release_emergency_stop": controller.release_emergency_stop,
@@ -225,7 +229,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
             "set": lambda **settings: _set(server, settings),
             "log": lambda: list(arm.log),
         },
-        lambda: _state(server),
+        state,
     )
 
     async def do(op: str, arguments: dict[str, Any]) -> Any:
@@ -236,7 +240,7 @@ def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handl
         done = known(op, arguments)
         if inspect.isawaitable(done):
             await done
-            return _state(server)
+            return state()
         return done
 
     def handler(op: str, arguments: dict[str, Any]) -> Any:
