@@ -13,11 +13,26 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
-from hilcal.doctor.ports import Finding
+State = Literal["ok", "warning", "problem"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    topic: str  # "program", "computer", "serial ports", "network" or "cell"
+    name: str  # of the thing, e.g. "clock"
+    state: State
+    """"ok"; "warning" where a campaign runs but may suffer; "problem" where it does not."""
+    said: str  # how it is, in words
+    mend: str = ""  # what to do about it; empty where nothing is to be done
+
 
 COMPUTER = "computer"
 LEAST_FREE = 1e9

@@ -9,24 +9,10 @@ import time
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from serial.tools import list_ports
 
-State = Literal["ok", "warning", "problem"]
-
-
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """One thing that was looked at."""
-
-    topic: str  # "program", "computer", "serial ports", "network" or "cell"
-    name: str  # of the thing, e.g. "clock"
-    state: State
-    """"ok"; "warning" where a campaign runs but may suffer; "problem" where it does not."""
-    said: str  # how it is, in words
-    mend: str = ""  # what to do about it; empty where nothing is to be done
-
+from hilcal.doctor.computer import Finding, State
 
 PORTS = "serial ports"
 LATE_MS = 1
