@@ -8,8 +8,7 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_sensor import checked_config, open_streaming
-from hilcal.drivers.force_stream import SensorFormat
+from hilcal.drivers.force_stream import SensorFormat, checked_config, open_streaming
 from hilcal.drivers.frame_losses import ByDeviceClock
 from hilcal.drivers.frames import FrameFormat, crc_x25
 from hilcal.measuring.devices import ForceSensorDevice
@@ -19,10 +18,6 @@ BAUD = 460800
 SKIPPED = 1
 _STATUS = ((2, "is loaded over its range; take the load off"), (4, "measures nothing valid"),
            (8, "sends raw values; configure it to send N and N·m"))  # fmt: skip
-
-
-def _checksum(frame: bytes) -> bytes:
-    return crc_x25(frame[1:]).to_bytes(2, "little")
 
 
 def _overload(wrench: Floats, status: int) -> str:
@@ -37,7 +32,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = SensorFormat(
     name="Bota sensor",
-    frame=FrameFormat(b"\xaa", 37, _checksum),
+    frame=FrameFormat(b"\xaa", 37, lambda frame: crc_x25(frame[1:]).to_bytes(2, "little")),
     body=np.dtype(
         [("status", "<u2"), ("wrench", "<f4", 6), ("ticks", "<u4"), ("temperature", "<f4")]
     ),

@@ -75,15 +75,10 @@ class EmsconConnection:
 
     Attributes:
         changes: changes of its state that nobody has looked at yet.
-        open: whether it can still be used.
     """
 
     def __init__(self, host: str, port: int) -> None:
-        """Connect.
-
-        Raises:
-            DeviceError: nobody answers there, within `CONNECT_S`.
-        """
+        """Connect; raises DeviceError where nobody answers within `CONNECT_S`."""
         self.where = f"{host}:{port}"
         with network_failures(DEVICE, self.where):
             self._socket = socket.create_connection((host, port), CONNECT_S)
@@ -163,9 +158,7 @@ class EmsconConnection:
     def _packet(self, until: float) -> tuple[int, bytes]:
         """Return type and content of the next packet; changes of state are kept aside.
 
-        Raises:
-            BlockingIOError: until is 0 and none waits.
-            DeviceError: as `ask`.
+        With `until` 0, BlockingIOError tells that none waits.
         """
         while True:
             if len(self._came) >= es.HEADER.size:
@@ -241,9 +234,7 @@ class EmsconTracker:
     def measure(self) -> TrackerSample:
         """Measure once, see `hilcal.measuring.devices.TrackerDevice.measure`.
 
-        Raises:
-            TargetLostError: beam broken, no reflector, or zeros lost.
-            DeviceError: the tracker or the connection failed, or another reflector is set.
+        Also refused is a reading of another reflector than the one that was set.
         """
         found = self._measure()
         self._distance = float(np.linalg.norm(found.position))
@@ -260,16 +251,7 @@ class EmsconTracker:
         return TrackerSample(time.monotonic_ns(), value, covariance, remarks)
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a reflector is expected and hold the one that is there.
-
-        Args:
-            position: (3,) the tracker's axes, m.
-            radius: a reflector farther from there is another one, m.
-
-        Raises:
-            TargetLostError: there is none.
-            DeviceError: the tracker or the connection failed.
-        """
+        """Turn to where a reflector is expected and hold it; see `PointingTracker.aim`."""
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = self._ready(moving)
         self._search(min(radius, self._options.search_m), until)
@@ -277,12 +259,7 @@ class EmsconTracker:
         self._find("turning to the target", es.GO_POSITION, place, until)
 
     def find_target(self) -> None:
-        """Find the zeros again where they are lost, and search for the reflector.
-
-        Raises:
-            TargetLostError: not found.
-            DeviceError: the tracker or the connection failed.
-        """
+        """Find the zeros again where they are lost, and search for the reflector."""
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         until = self._ready(moving)
         if self._system(until)[1] != es.INITIALIZED:
@@ -299,11 +276,7 @@ class EmsconTracker:
         )
 
     def report(self) -> Report:
-        """Ask the tracker who it is and how it is, and measure once; nothing turns.
-
-        Raises:
-            DeviceError: the connection failed.
-        """
+        """Ask the tracker who it is and how it is, and measure once; nothing turns."""
         until = self._ready()
         status, body = self._line.ask(es.GET_TRACKER_INFO, until=until)
         name, serial = "emScon tracker", 0
@@ -354,11 +327,7 @@ class EmsconTracker:
         return self._sound(*self._line.result(until=until))
 
     def _sound(self, kind: int, status: int, body: bytes) -> es.Measurement:
-        """Return a result that can be.
-
-        Raises:
-            DeviceError: it failed, or is none that the tracker can give.
-        """
+        """Return a result that can be; else raise why it failed, or is none of this tracker."""
         if status != es.OK or kind == es.ERROR:
             raise es.failure("measuring", status)
         wanted = es.STATIONARY_6D if self._options.target == "pose" else es.STATIONARY
@@ -511,11 +480,7 @@ class EmsconTracker:
             raise TargetLostError(f"{DEVICE}: {doing}: it is not found (status {status})")
 
     def _do(self, doing: str, command: int, parameters: bytes = b"", *, until: float) -> bytes:
-        """Carry out a command and return what it returns.
-
-        Raises:
-            DeviceError: it did not work.
-        """
+        """Carry out a command and return what it returns; a failure is raised."""
         status, body = self._line.ask(command, parameters, until=until)
         if status not in es.GOOD:
             raise es.failure(doing, status)

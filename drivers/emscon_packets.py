@@ -89,12 +89,7 @@ _MEANING = {
 
 
 def failure(doing: str, status: int) -> DeviceError:
-    """Return the exception for a status that is not `OK`.
-
-    Args:
-        doing: what was asked for, e.g. "measuring".
-        status: of the command or of the result.
-    """
+    """Return the exception for a status that is not `OK`, e.g. of "measuring"."""
     if status in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[status]} (status {status})")
     words = _MEANING.get(status)
@@ -111,23 +106,15 @@ def text(field: bytes) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measurement:
-    """A result of one stationary measurement, in the units that were set (m, rad, °C, mbar, %).
+    """A result of one stationary measurement, in the units that were set (m, rad, °C, mbar, %)."""
 
-    Attributes:
-        position: (3,) m.
-        covariance: (3, 3) that the instrument expects of it (a priori), m²; zero: it states none.
-        quaternion: (4,) scalar first, of a 6-D target; None of a reflector.
-        angles: (3,) the same as rotations about x, y, z, rad.
-        angle_covariance: (3, 3) of these, rad²; zero: it states none.
-        environment: temperature °C, pressure mbar, relative humidity %.
-    """
-
-    position: Floats
+    position: Floats  # (3,) m
     covariance: Floats
-    quaternion: Floats | None
-    angles: Floats
-    angle_covariance: Floats
-    environment: tuple[float, float, float]
+    """(3, 3) that the instrument expects of it (a priori), m²; zero: it states none."""
+    quaternion: Floats | None  # (4,) scalar first, of a 6-D target; None of a reflector
+    angles: Floats  # (3,) the same as rotations about x, y, z, rad
+    angle_covariance: Floats  # (3, 3) of these, rad²; zero: it states none
+    environment: tuple[float, float, float]  # temperature °C, pressure mbar, relative humidity %
 
 
 _SINGLE, _SINGLE2 = struct.Struct("<Ii17d"), struct.Struct("<Ii23d")

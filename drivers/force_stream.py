@@ -1,4 +1,4 @@
-"""A force sensor's stream, read in the background: newest frame, means, counters.
+"""A force sensor that sends by itself, read in the background: newest frame, means, counters.
 
 One thread takes what waits on the line every few milliseconds (the kernel keeps 4096 bytes,
 110 frames of the longest kind), finds the frames and keeps the last ones in a ring.
@@ -13,11 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from hilcal.config import CellConfig
+from hilcal.config.rig import PORT
+from hilcal.config.rig import ForceSensor as Section
 from hilcal.drivers.frame_losses import LossCounter
 from hilcal.drivers.frames import Deframer, FrameFormat
-from hilcal.drivers.serial_line import line_failures
-from hilcal.errors import DeviceError
-from hilcal.measuring.devices import Losses, WrenchSample
+from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
+from hilcal.errors import DeviceError, InputError
+from hilcal.measuring.devices import Losses, Report, WrenchSample
 from hilcal.types import Floats, Ints
 
 DEVICE = "force sensor"
@@ -33,28 +36,22 @@ MIN_SHARE = 0.5
 FEW, MAX_LOST = 5, 0.01
 """So many lost frames, and this share of all, are no problem yet."""
 RING = 4096
+FIRST_FRAME_S, OLD_S = 1.0, 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFormat:
-    """What a sensor puts on its line.
+    """What a sensor puts on its line."""
 
-    Attributes:
-        name: the maker's, for people.
-        frame: its frames; of no meaning where they come as datagrams.
-        body: what is between header and checksum; field `wrench` (6), and where it gives them
-            `status`, `ticks` (device clock) and `temperature` (°C).
-        unit: (6,) N and N·m per count of `wrench`.
-        losses: makes the counter of lost frames.
-        overload: (wrench (6,), status) to what is wrong with such a frame, "" where nothing.
-    """
-
-    name: str
-    frame: FrameFormat
+    name: str  # the maker's, for people
+    frame: FrameFormat  # its frames; of no meaning where they come as datagrams
     body: np.dtype[Any]
-    unit: Floats
-    losses: Callable[[], LossCounter]
+    """What is between header and checksum; field `wrench` (6), and where it gives them `status`,
+    `ticks` (device clock) and `temperature` (°C)."""
+    unit: Floats  # (6,) N and N·m per count of `wrench`
+    losses: Callable[[], LossCounter]  # makes the counter of lost frames
     overload: Callable[[Floats, int], str]
+    """(wrench (6,), status) to what is wrong with such a frame, "" where nothing."""
 
 
 class Port(Protocol):
@@ -92,23 +89,31 @@ class FrameSource(Protocol):
 
 
 class ForceStream:
-    """Reads a sensor that is sending, until `stop`; it uses the port and does not close it."""
+    """A sensor that is sending; see `hilcal.measuring.devices.ForceSensorDevice`."""
 
     def __init__(
         self,
         port: Port,
         sensor: SensorFormat,
+        name: str = "",
+        facts: tuple[tuple[str, str], ...] = (),
+        *,
         deframer: FrameSource | None = None,
         failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
+        before_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start to read.
+        """Start to read an open port, which `close` closes.
 
         Args:
             port: open.
             sensor: what it sends.
+            name: the maker's, with the serial number where known.
+            facts: for the report, besides those of the stream.
             deframer: takes the frames out of the bytes where `sensor.frame` does not tell how.
             failures: turns what the port raises into DeviceError, from the device and its place.
+            before_close: sends the last command to the sensor; must not raise.
         """
+        self._name, self._facts, self._before_close = name or sensor.name, facts, before_close
         self._port, self._sensor, self._failures = port, sensor, failures
         self._path = str(port.port)
         self._deframer: FrameSource = Deframer(sensor.frame) if deframer is None else deframer
@@ -127,11 +132,7 @@ class ForceStream:
         self._thread.start()
 
     def wait_for_first(self, seconds: float) -> None:
-        """Return when a frame has come.
-
-        Raises:
-            DeviceError: none came in time, or the line failed.
-        """
+        """Return when a frame has come; raises DeviceError where none came or the line failed."""
         end = time.monotonic() + seconds
         while not self._kept and not self._failure and time.monotonic() < end:
             time.sleep(POLL_S)
@@ -139,7 +140,11 @@ class ForceStream:
             raise DeviceError(self._silence())
 
     def latest(self) -> WrenchSample:
-        """Return the newest frame; see `hilcal.measuring.devices.ForceSensorDevice`."""
+        """Return the newest frame, at most `STALE_S` old.
+
+        Raises:
+            DeviceError: the stream is dead or stale, or the sensor is loaded over its range.
+        """
         self._check()
         with self._lock:
             at = (self._kept - 1) % RING
@@ -149,7 +154,12 @@ class ForceStream:
         return WrenchSample(int(stamp), wrench, np.zeros((6, 6)), 1, temperature)
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean over the next seconds; see `measuring.devices.ForceSensorDevice`."""
+        """Return the mean of the frames of the next so many real seconds.
+
+        Raises:
+            DeviceError: the stream is dead, gave under half of its frames, or the sensor was
+                loaded over its range meanwhile.
+        """
         if not np.isfinite(seconds) or seconds < 0.0:
             raise ValueError(f"seconds = {seconds}; valid: 0 or more")
         self._check()
@@ -195,48 +205,47 @@ class ForceStream:
         """Frames per second as the sensor sends them; 0 while that is unknown."""
         return self._counter.rate
 
-    def facts(self) -> list[tuple[str, str]]:
-        """What the stream tells, for people."""
-        count = self.losses()
-        facts = [("port", self._path)]
+    def report(self) -> Report:
+        """Say who answered, rate, temperature, counters, and every problem."""
+        count, warm = self.losses(), self._temperature
+        facts = [*self._facts, ("port", self._path)]
         if self.rate:
             facts.append(("rate", f"{self.rate:.0f} Hz"))
-        if self._temperature is not None:
-            facts.append(("temperature", f"{self._temperature:.1f} °C"))
+        if warm is not None:
+            facts.append(("temperature", f"{warm:.1f} °C"))
         facts.append(("frames", f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"))
-        return facts
-
-    def fields(self) -> list[tuple[str, object]]:
-        """The same for scripts."""
-        count = self.losses()
-        return [
+        fields: list[tuple[str, object]] = [
+            *((what.replace(" ", "_"), value) for what, value in self._facts),
             ("port", self._path),
             ("rate_Hz", self.rate or None),
-            ("temperature_degC", self._temperature),
+            ("temperature_degC", warm),
             ("frames", count.frames),
             ("lost", count.lost),
             ("corrupt", count.corrupt),
         ]
+        return Report(DEVICE, self._name, tuple(facts), self._problems(), tuple(fields))
 
-    def problems(self) -> list[str]:
-        """What has to be put right, one line each."""
+    def _problems(self) -> tuple[str, ...]:
         try:
             self.latest()
         except DeviceError as error:
-            return [str(error)]
+            return (str(error),)
         count = self.losses()
-        if count.lost > FEW + MAX_LOST * (count.frames + count.lost):
-            return [
-                f"{DEVICE}: {count.lost} of {count.frames + count.lost} frames lost on port "
-                f"{self._path}; check its cable"
-            ]
-        return []
+        if count.lost <= FEW + MAX_LOST * (count.frames + count.lost):
+            return ()
+        return (
+            f"{DEVICE}: {count.lost} of {count.frames + count.lost} frames lost on port "
+            f"{self._path}; check its cable",
+        )
 
-    def stop(self) -> None:
-        """Stop to read; the port is free for its owner. Never raises."""
-        self._running = False
-        self._thread.join(2.0)
-        self._failure = self._failure or f"{DEVICE}: port {self._path} is closed"
+    def close(self) -> None:
+        """Stop to read, give the port back. Never raises, may be called twice."""
+        if self._running:
+            self._running = False
+            self._thread.join(2.0)
+            self._failure = self._failure or f"{DEVICE}: port {self._path} is closed"
+            self._before_close()
+            close_port(self._port)
 
     def _read(self) -> None:
         """Take what waits on the line, again and again (the thread)."""
@@ -300,7 +309,6 @@ class ForceStream:
             raise DeviceError(f"{DEVICE}: {wrong}")
 
     def _silence(self) -> str:
-        """Why there is no frame, in one line."""
         if self._failure:
             return self._failure
         now = time.monotonic()
@@ -316,3 +324,65 @@ class ForceStream:
             f"{where}: bytes come{at}, but no whole frame {since}; {wrong}the line is disturbed, "
             f"or it is no {self._sensor.name}"
         )
+
+
+def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStream:
+    """Return a stream whose first frame has come; it is closed where none does.
+
+    Raises:
+        DeviceError: nothing or nothing sensible came in time.
+    """
+    try:
+        stream.wait_for_first(seconds)
+    except BaseException:
+        stream.close()
+        raise
+    return stream
+
+
+def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceStream:
+    """Open the port of a sensor that streams from power-on, and wait for the first frame.
+
+    The rate of the configuration comes before `baud`, the one of the sensor as delivered, Bd.
+
+    Raises:
+        DeviceError: no such port, in use, nothing or nothing sensible comes.
+    """
+    path = serial_port(section)
+    port = open_port(DEVICE, path, section.baud or baud)
+    try:
+        with line_failures(DEVICE, path):
+            drain(port, quiet=OLD_S, limit=OLD_S)  # adapters keep some of what came before
+    except BaseException:
+        close_port(port)
+        raise
+    return streaming(ForceStream(port, sensor))
+
+
+def serial_port(section: Section) -> str:
+    """Return the serial port of a sensor that needs one.
+
+    Raises:
+        InputError: there is none.
+    """
+    if section.port is None:
+        raise InputError(f'[force_sensor] driver = "{section.driver}" lacks "port": {PORT}')
+    return section.port
+
+
+def checked_config(config: CellConfig, options: tuple[str, ...] = ()) -> Section:
+    """Return [force_sensor], with no option that the driver does not know.
+
+    Raises:
+        InputError: the section is missing, or has an unknown option.
+    """
+    section = config.force_sensor
+    if section is None:
+        raise InputError("[force_sensor] is missing; give driver and port")
+    for name in section.options:
+        if name not in options:
+            valid = f"valid: {', '.join(options)}" if options else "it has none"
+            raise InputError(
+                f'[force_sensor] options: driver "{section.driver}" has no option "{name}"; {valid}'
+            )
+    return section

@@ -2,35 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
-
-
-class LossCounter(Protocol):
-    """Counts from what comes.
-
-    Attributes:
-        lost: frames so far.
-        rate: frames per second as the sensor sends them; 0 while that is unknown.
-    """
-
-    lost: int
-
-    @property
-    def rate(self) -> float:
-        """See above."""
-        ...
-
-    def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """Take frames that came together; return which of them are in their place.
-
-        Args:
-            count: their number.
-            ticks: the device's clock at each, empty where it has none.
-            now: when they were read, s; nothing was left to read then.
-        """
-        ...
 
 
 class ByDeviceClock:
@@ -38,6 +11,9 @@ class ByDeviceClock:
 
     A frame whose time is not shortly after its predecessor's is out of place, unless its
     successor follows on it (then the device has begun to count anew).
+
+    Attributes:
+        lost: frames so far.
     """
 
     LEARN = 20
@@ -54,11 +30,15 @@ class ByDeviceClock:
 
     @property
     def rate(self) -> float:
-        """Frames per second of device time."""
+        """Frames per second of device time; 0 while that is unknown."""
         return 1.0 / (self._period * self._tick) if self._period else 0.0
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """See `LossCounter.follow`."""
+        """Take frames that came together; return which of them are in their place.
+
+        `ticks` is the device's clock at each, empty where it has none; `now` is when they were
+        read, s, and nothing was left to read.
+        """
         return [self._in_place(tick) for tick in ticks]
 
     def _in_place(self, tick: int) -> bool:
@@ -108,7 +88,7 @@ class ByArrival:
         self._doubt_until = -math.inf  # until then missing ones may only be held up
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """See `LossCounter.follow`."""
+        """See `ByDeviceClock.follow`; all are in their place."""
         period = 1.0 / self.rate
         self._due = now if self._due is None else self._due + count * period
         late = (now - self._due) / period  # periods
@@ -125,3 +105,7 @@ class ByArrival:
             follow = 0.0
         self._due += (missing + follow * late) * period
         return [True] * count
+
+
+LossCounter = ByDeviceClock | ByArrival
+"""Counts from what comes."""

@@ -39,20 +39,15 @@ def crc_x25(data: bytes) -> int:
 
 @dataclass(frozen=True, slots=True)
 class FrameFormat:
-    """What a frame of fixed length looks like: header, body, two bytes of checksum.
+    """What a frame of fixed length looks like: header, body, two bytes of checksum."""
 
-    Attributes:
-        header: the bytes that every frame begins with.
-        size: of a whole frame, bytes.
-        checksum: what the last two bytes must be, from all the bytes before them.
-        weak: whether the checksum is a mere sum; then a frame counts only once the header of
-            the next one follows it directly.
-    """
-
-    header: bytes
-    size: int
+    header: bytes  # the bytes that every frame begins with
+    size: int  # of a whole frame, bytes
     checksum: Callable[[bytes], bytes]
+    """What the last two bytes must be, from all the bytes before them."""
     weak: bool = False
+    """Whether the checksum is a mere sum; then a frame counts only once the header of the next one
+    follows it directly."""
 
 
 class Deframer:
@@ -63,7 +58,6 @@ class Deframer:
     once a second good frame follows it directly.
 
     Attributes:
-        frames: good frames so far.
         corrupt: frames with a wrong checksum; several candidates inside one length count once.
         skipped: bytes that belonged to no good frame; both from the first good frame on, for
             who begins to listen comes into the middle of one.

@@ -4,20 +4,30 @@ Robotiq FT 300 Instruction Manual: 19200 Bd, slave 9, registers 500 firmware, 51
 number; 0x0200 in register 410 starts the stream of 100 frames per second, fifty bytes FF end
 it. Frame: `20 4E`; six int16, N × 100 and N·m × 1000; CRC-16/MODBUS; all little-endian. While
 it streams it answers no request, and it streams on when the program that started it has died.
+Requests go by minimalmodbus, on a line that may be noisy or streaming. Modbus over Serial Line,
+Specification and Implementation Guide V1.02 (modbus.org, 2006).
 """
 
 import contextlib
 import termios
+from collections.abc import Callable
+from typing import TypeVar
 
+import minimalmodbus
 import numpy as np
 import serial
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_sensor import StreamingSensor, checked_config, serial_port
-from hilcal.drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from hilcal.drivers.force_stream import (
+    DEVICE,
+    ForceStream,
+    SensorFormat,
+    checked_config,
+    serial_port,
+    streaming,
+)
 from hilcal.drivers.frame_losses import ByArrival
 from hilcal.drivers.frames import FrameFormat, crc_modbus
-from hilcal.drivers.modbus_rtu import NoAnswerError, RefusedError, read_registers, write_register
 from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
@@ -33,10 +43,53 @@ RANGE = np.repeat((300.0, 30.0), 3)
 """Full scale, N and N·m."""
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 FIRST_FRAME_S = 0.5
+T = TypeVar("T")
+QUIET_S, TRIES, WRITE_MULTIPLE = 0.03, 2, 16
 
 
-def _checksum(frame: bytes) -> bytes:
-    return crc_modbus(frame).to_bytes(2, "little")
+class NoAnswerError(DeviceError):
+    """No sound answer came; `heard` is whether anything came at all."""
+
+    def __init__(self, heard: bool) -> None:
+        """Without a text: the caller knows what device it is."""
+        super().__init__("no answer")
+        self.heard = heard
+
+
+class RefusedError(DeviceError):
+    """The device answered that it does not do this."""
+
+
+def read_registers(port: serial.Serial, slave: int, address: int, count: int) -> tuple[int, ...]:
+    """Return `count` holding registers (16 bits each) from an address on.
+
+    Raises:
+        NoAnswerError: no sound answer, twice.
+        RefusedError: the device has no such registers.
+        OSError: the port failed; termios.error likewise.
+    """
+    return tuple(_ask(port, slave, lambda device: device.read_registers(address, count)))
+
+
+def write_register(port: serial.Serial, slave: int, address: int, value: int) -> None:
+    """Write one register; raises as `read_registers` does."""
+    _ask(port, slave, lambda device: device.write_register(address, value, 0, WRITE_MULTIPLE))
+
+
+def _ask(port: serial.Serial, slave: int, request: Callable[[minimalmodbus.Instrument], T]) -> T:
+    heard = False
+    device = minimalmodbus.Instrument(port, slave)
+    for _ in range(TRIES):
+        drain(port, QUIET_S, 4 * QUIET_S)
+        try:
+            return request(device)
+        except minimalmodbus.SlaveReportedException as error:
+            raise RefusedError(f"the request is refused ({error})") from None
+        except minimalmodbus.NoResponseError:
+            continue
+        except minimalmodbus.ModbusException:
+            heard = True
+    raise NoAnswerError(heard)
 
 
 def _overload(wrench: Floats, status: int) -> str:
@@ -53,7 +106,7 @@ def _overload(wrench: Floats, status: int) -> str:
 
 SENSOR = SensorFormat(
     name="Robotiq FT 300",
-    frame=FrameFormat(b"\x20\x4e", 16, _checksum),
+    frame=FrameFormat(b"\x20\x4e", 16, lambda frame: crc_modbus(frame).to_bytes(2, "little")),
     body=np.dtype([("wrench", "<i2", 6)]),
     unit=1.0 / np.repeat((100.0, 1000.0), 3),
     losses=lambda: ByArrival(RATE_HZ),
@@ -71,20 +124,17 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     section = checked_config(config)
     path = serial_port(section)
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
-    stream: ForceStream | None = None
     try:
         with line_failures(DEVICE, path):
             firmware, number = _begin(port)
-        stream = ForceStream(port, SENSOR)
-        stream.wait_for_first(FIRST_FRAME_S)
     except BaseException:
-        if stream is not None:
-            stream.stop()
         _end(port)
         close_port(port)
         raise
     name = f"{SENSOR.name}, serial number {number}"
-    return StreamingSensor(port, stream, name, (("firmware", firmware),), lambda: _end(port))
+    facts = (("firmware", firmware),)
+    stream = ForceStream(port, SENSOR, name, facts, before_close=lambda: _end(port))
+    return streaming(stream, FIRST_FRAME_S)
 
 
 def _begin(port: serial.Serial) -> tuple[str, str]:

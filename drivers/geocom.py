@@ -44,27 +44,15 @@ LARGEST_TILT = 0.5 * np.pi
 
 @dataclass(frozen=True, slots=True)
 class PolarReading:
-    """One measurement as the instrument gives it.
+    """One measurement as the instrument gives it."""
 
-    Attributes:
-        host_ns: `time.monotonic_ns` right after it came.
-        hz: horizontal angle, rad.
-        v: angle from the zenith, rad.
-        distance: slope distance, m; 0 is none.
-        angle_std: what it states of both angles, rad; 0 where it does not tell.
-        tilt: inclination across and along, rad.
-        measured_ms: when the distance was measured, ms of its own clock; 0 is unknown.
-        warning: what it remarks.
-    """
-
-    host_ns: int
-    hz: float
-    v: float
-    distance: float
-    angle_std: float = 0.0
-    tilt: tuple[float, float] | None = None
-    measured_ms: float = 0.0
-    warning: str = ""
+    host_ns: int  # `time.monotonic_ns` right after it came
+    hz: float  # horizontal angle, rad
+    v: float  # angle from the zenith, rad
+    distance: float  # slope distance, m; 0 is none
+    angle_std: float = 0.0  # what it states of both angles, rad; 0 where it does not tell
+    tilt: tuple[float, float] | None = None  # inclination across and along, rad
+    warning: str = ""  # what it remarks
 
 
 class GeoComOptions(Section):
@@ -114,16 +102,7 @@ class GeoComTracker:
         return TrackerSample(polar.host_ns, value, covariance, polar.warning)
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a target is expected, aim at the one that is there, lock on it.
-
-        Args:
-            position: (3,) sensor axes, m.
-            radius: a target farther from there is another one, m.
-
-        Raises:
-            TargetLostError: there is none.
-            DeviceError: the instrument or its line failed.
-        """
+        """Turn to where a target is expected, aim at it, lock on it; see `PointingTracker.aim`."""
         x, y, z = (float(v) for v in position)
         moving = max(_LEAST_S, self._clock.real(SEARCHING_S))
         hz, v = np.arctan2(x, y) % (2 * np.pi), np.arctan2(np.hypot(x, y), z)
@@ -137,12 +116,7 @@ class GeoComTracker:
         self._find(min(2 * radius / distance, self._options.search_rad), search=False)
 
     def find_target(self) -> None:
-        """Aim at the target, search for it where it is not in sight, lock on it.
-
-        Raises:
-            TargetLostError: not found.
-            DeviceError: the instrument or its line failed.
-        """
+        """Aim at the target, search for it where it is not in sight, lock on it."""
         self._find(self._options.search_rad, search=True)
 
     def _find(self, window: float, search: bool) -> None:
@@ -169,13 +143,9 @@ class GeoComTracker:
                 raise TargetLostError(f"{DEVICE}: the instrument does not hold its target locked")
 
     def report(self) -> Report:
-        """Ask the instrument who it is and how it is, and measure once; nothing turns.
-
-        Raises:
-            DeviceError: the line failed.
-        """
+        """Ask the instrument who it is and how it is, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
-        name = self._told(until, geo.NAME, _text) or ("GeoCOM instrument",)
+        name = self._told(until, geo.NAME, lambda told: told.strip('"')) or ("GeoCOM instrument",)
         serial = self._told(until, geo.SERIAL_NUMBER, int)
         facts: list[tuple[str, str]] = []
         fields: list[tuple[str, object]] = [("name", name[0])]
@@ -269,7 +239,7 @@ class GeoComTracker:
                 "before again, not a new one; is another program using it?"
             )
         self._last_ms = ms
-        return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), ms, warning)
+        return PolarReading(answer.host_ns, hz, v, distance, std, (cross, length), warning)
 
     def _simple(self, until: float, measuring: float) -> PolarReading:
         """Measurement without a word on its accuracy, as older instruments know it."""
@@ -318,7 +288,6 @@ class GeoComTracker:
         return answer.values if answer.code == geo.OK and answer.values else None
 
     def _answers(self, until: float) -> bool:
-        """Whether the line still works."""
         try:
             self._link.ask(geo.NULL, until=until)
         except DeviceError:
@@ -347,11 +316,6 @@ def open_tracker(config: CellConfig) -> GeoComTracker:
     options = check_section(tracker.options, GeoComOptions, "[tracker] options")
     link = Link(tracker.port, tracker.baud or BAUD)
     return GeoComTracker(link, tracker, options, Clock(config.simulation.clock))
-
-
-def _text(value: str) -> str:
-    """Text without its quotation marks."""
-    return value.strip('"')
 
 
 def usable(answer: Reply) -> str:

@@ -82,26 +82,18 @@ _MEANING = {
 """What the commonest codes say, alone or after a colon."""
 
 
-def _spelled(name: str) -> str:
-    """Return geocompy's name of a code as words in quotes."""
-    return f'"{name.replace("_", " ").lower()}"'
-
-
 def words(code: int) -> str:
     """Return a return code for people: what it means, and the number."""
     try:
-        return f"{_MEANING.get(code) or _spelled(GeoComCode(code).name)} (code {code})"
+        name = GeoComCode(code).name.replace("_", " ").lower()
+        known = _MEANING.get(code) or f'"{name}"'
+        return f"{known} (code {code})"
     except ValueError:
         return f"code {code}"
 
 
 def failure(doing: str, code: int) -> DeviceError:
-    """Return the exception for a return code that gave no reading.
-
-    Args:
-        doing: what was asked for, e.g. "measuring".
-        code: any code but `OK` and `WARNINGS`.
-    """
+    """Return the exception for a return code that gave no reading, e.g. of "measuring"."""
     if code in LOST:
         return TargetLostError(f"tracker: {doing}: {LOST[code]} (code {code})")
     advice = f"; {_ADVICE[code]}" if code in _ADVICE else ""

@@ -36,17 +36,12 @@ _MISMATCH, _CLIENT_CHECKSUM = 3093, 3102
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """A reply whose checksum and transaction were right.
+    """A reply whose checksum and transaction were right."""
 
-    Attributes:
-        code: the return code, of the line if that is not 0, else of the request.
-        values: what came with it; empty where it is not of the form that was asked for.
-        host_ns: `time.monotonic_ns` right after it came.
-    """
-
-    code: int
+    code: int  # the return code, of the line if that is not 0, else of the request
     values: tuple[Any, ...]
-    host_ns: int
+    """What came with it; empty where it is not of the form that was asked for."""
+    host_ns: int  # `time.monotonic_ns` right after it came
 
 
 class _Connection(SerialConnection):
@@ -115,12 +110,9 @@ class Link:
     ) -> Reply:
         """Send a request until it is answered without damage.
 
-        Args:
-            request: its number.
-            values: its arguments; floats stay floats on the line.
-            parsers: one per value of the reply.
-            until: deadline of all tries together, `time.monotonic` s.
-            seconds: how long one answer may take, s.
+        `values` are its arguments, of which floats stay floats on the line; `parsers` one per value
+        of the reply; `until` the deadline of all tries together, `time.monotonic` s; `seconds` how
+        long one answer may take.
 
         Raises:
             DeviceError: the line is broken, mute or garbled; says which.
@@ -195,7 +187,6 @@ class Link:
             raise self._connection.broken
 
     def _silence(self) -> str:
-        """Say what came instead of a GeoCOM line."""
         came = self._connection.came
         if not came:
             return (

@@ -85,12 +85,7 @@ class NatNetTracker:
                 raise
 
     def measure(self) -> TrackerSample:
-        """Average the next frames, see the module.
-
-        Raises:
-            TargetLostError: the rigid body is not seen.
-            DeviceError: no frames come, or the same one again and again.
-        """
+        """Average the next frames, see the module; one that comes again and again is refused."""
         bodies = self._frames(self._options.frames)
         position = np.array([b.position for b in bodies])
         turns = Rotation.from_quat(np.array([b.quaternion for b in bodies]))
@@ -111,20 +106,11 @@ class NatNetTracker:
         return TrackerSample(time.monotonic_ns(), value[:m], covariance[:m, :m])
 
     def find_target(self) -> None:
-        """Wait until the rigid body is seen; cameras do not turn.
-
-        Raises:
-            TargetLostError: it is not.
-            DeviceError: no frames come.
-        """
+        """Wait until the rigid body is seen; cameras do not turn."""
         self._frames(1)
 
     def report(self) -> Report:
-        """Say who answered, and measure once.
-
-        Raises:
-            DeviceError: no frames come.
-        """
+        """Say who answered, and measure once."""
         s = self._server
         version = f"{s.version[0]}.{s.version[1]}"
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
@@ -233,7 +219,6 @@ class NatNetTracker:
         )
 
     def _joined(self, server: nn.NatNetServer) -> socket.socket:
-        """Return a socket to which the frames of a multicast group come."""
         line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             line.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -246,7 +231,6 @@ class NatNetTracker:
         return line
 
     def _found(self) -> tuple[int, str]:
-        """Return streaming ID and name of the rigid body."""
         content = self._ask(nn.message(nn.REQUEST_DESCRIPTIONS), nn.DESCRIPTIONS)
         try:
             names = nn.names(content, self._server.version)
@@ -291,7 +275,6 @@ class NatNetTracker:
 
 
 def _drain(line: socket.socket) -> None:
-    """Throw away what has come."""
     line.setblocking(False)
     while True:
         try:

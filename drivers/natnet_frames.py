@@ -36,11 +36,7 @@ def message(number: int, content: bytes = b"") -> bytes:
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return number and content of a message.
-
-    Raises:
-        struct.error: it is cut short.
-    """
+    """Return number and content of a message; raises struct.error where it is cut short."""
     number, size = _HEAD.unpack_from(data)
     if len(data) < _HEAD.size + size:
         raise struct.error("cut short")
@@ -57,32 +53,21 @@ def connect(version: Version) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class NatNetServer:
-    """Who answered, and how it sends frames.
-
-    Attributes:
-        name: of the program.
-        program: its version.
-        version: of NatNet in which it sends frames.
-        data_port: where it sends frames to; 0 where it does not tell.
-        group: multicast address; empty where it sends to each client.
-    """
+    """Who answered, and how it sends frames."""
 
     name: str
     program: str
-    version: Version
-    data_port: int = 0
-    group: str = ""
+    version: Version  # of NatNet in which it sends frames
+    data_port: int = 0  # where it sends frames to; 0 where it does not tell
+    group: str = ""  # multicast address; empty where it sends to each client
 
 
 def server(content: bytes) -> NatNetServer:
-    """Return what the answer to a connection says.
-
-    Raises:
-        struct.error: it is cut short.
-    """
+    """Return what the answer to a connection says; raises struct.error where it is cut short."""
     name, *numbers = _SERVER.unpack_from(content)
     version = numbers[4], numbers[5]
-    known = NatNetServer(_text(name), ".".join(map(str, numbers[:4])), version)
+    called = name.split(b"\0")[0].decode("utf-8", "replace")
+    known = NatNetServer(called, ".".join(map(str, numbers[:4])), version)
     if len(content) < _SERVER.size + _CONNECTION.size:
         return known
     _, port, multicast, *group = _CONNECTION.unpack_from(content, _SERVER.size)
@@ -92,46 +77,30 @@ def server(content: bytes) -> NatNetServer:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """A rigid body in a frame.
-
-    Attributes:
-        number: its streaming ID.
-        position: (3,) of its pivot, m.
-        quaternion: (4,) scalar last.
-        error: mean distance of its markers from where they should be, m.
-        tracked: whether it was seen in this frame.
-    """
+    """A rigid body in a frame."""
 
     number: int
-    position: Floats
-    quaternion: Floats
-    error: float
+    position: Floats  # (3,) of its pivot, m
+    quaternion: Floats  # (4,) scalar last
+    error: float  # mean distance of its markers from where they should be, m
     tracked: bool
 
 
 class Reader:
-    """Reads a content from its beginning on."""
+    """Reads a content from its beginning on; raises struct.error where that ends before."""
 
     def __init__(self, content: bytes, version: Version) -> None:
         """Begin."""
         self.content, self.version, self.at = content, version, 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:
-        """Return the next numbers.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Return the next numbers."""
         values = layout.unpack_from(self.content, self.at)
         self.at += layout.size
         return values
 
     def count(self) -> int:
-        """Return the next number.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Return the next number."""
         return int(self.take(_COUNT)[0])
 
     def listed(self) -> tuple[int, int]:
@@ -141,11 +110,7 @@ class Reader:
         return count, self.at + size if size else 0
 
     def text(self) -> str:
-        """Return the next text.
-
-        Raises:
-            struct.error: it does not end.
-        """
+        """Return the next text."""
         end = self.content.find(b"\0", self.at)
         if end < 0:
             raise struct.error("a text without an end")
@@ -154,11 +119,7 @@ class Reader:
         return words
 
     def skip(self, size: int) -> None:
-        """Leave bytes out.
-
-        Raises:
-            struct.error: it ends before.
-        """
+        """Leave bytes out."""
         self.at += size
         if not 0 <= self.at <= len(self.content):
             raise struct.error("cut short")
@@ -221,7 +182,3 @@ def names(content: bytes, version: Version) -> dict[int, str]:
         if end:
             r.skip(end - r.at)
     return found
-
-
-def _text(field: bytes) -> str:
-    return field.split(b"\0")[0].decode("utf-8", "replace")

@@ -21,8 +21,13 @@ from pydantic import Field
 
 from hilcal.config import CellConfig
 from hilcal.config.rig import Whole
-from hilcal.drivers.force_sensor import FIRST_FRAME_S, StreamingSensor, checked_config
-from hilcal.drivers.force_stream import DEVICE, ForceStream, SensorFormat
+from hilcal.drivers.force_stream import (
+    DEVICE,
+    ForceStream,
+    SensorFormat,
+    checked_config,
+    streaming,
+)
 from hilcal.drivers.frame_losses import ByDeviceClock
 from hilcal.drivers.frames import FrameFormat
 from hilcal.drivers.network import address, network_failures
@@ -254,12 +259,7 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
             ("tool transformation", f"{moved} ({units}): origin_m and rotvec_rad must include it")
         )
     line = Datagrams(host, port)
-    stream = ForceStream(line, sensor, line, network_failures)
-    try:
-        stream.wait_for_first(FIRST_FRAME_S)
-    except BaseException:
-        stream.stop()
-        line.close()
-        raise
     known = tuple((what, told) for what, told in facts if told)
-    return StreamingSensor(line, stream, sensor.name, known)
+    return streaming(
+        ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
+    )

@@ -11,13 +11,7 @@ _ADDRESS = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
 
 
 def address(section: str, driver: str, host: str | None, port: int) -> tuple[str, int]:
-    """Return the host and the port of an instrument.
-
-    Args:
-        section: of the configuration that gives the address, for messages.
-        driver: that needs it, for messages.
-        host: "address" or "address:port".
-        port: where none is given.
+    """Return the host and the port of an instrument: "address" or "address:port".
 
     Raises:
         InputError: the address is missing, or none.
@@ -60,11 +54,6 @@ def network_failures(device: str, where: str) -> Iterator[None]:
 
 def own_axes(tracker: Tracker, driver: str, port: int) -> tuple[str, int]:
     """Return host and port of a tracker that measures in its own axes.
-
-    Args:
-        tracker: its section.
-        driver: name of the driver, for messages.
-        port: where none is given.
 
     Raises:
         InputError: [tracker] lacks the host, or states another frame.

@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_sensor import checked_config, open_streaming
-from hilcal.drivers.force_stream import SensorFormat
+from hilcal.drivers.force_stream import SensorFormat, checked_config, open_streaming
 from hilcal.drivers.frame_losses import ByDeviceClock
 from hilcal.drivers.frames import FrameFormat
 from hilcal.errors import InputError

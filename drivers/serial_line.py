@@ -26,11 +26,8 @@ BY_ID = Path("/dev/serial/by-id")
 def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial.Serial:
     """Open a serial port, 8N1, raw, locked against every other program that asks.
 
-    Args:
-        device: its part in the cell for messages, e.g. "tracker".
-        path: of the port, e.g. a link in /dev/serial/by-id.
-        baud: rate, Bd.
-        timeout: of reads and writes, s; 0.5 by default.
+    `device` is its part in the cell, for messages; `baud` the rate, Bd; `timeout` of reads and
+    writes, s.
 
     Raises:
         DeviceError: there is no such port, it is in use by another program, may not be used, or
@@ -67,16 +64,7 @@ def line_failures(device: str, path: str) -> Iterator[None]:
 
 
 def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
-    """Throw away what comes until the line has been quiet for so long.
-
-    Args:
-        port: an open port.
-        quiet: how long nothing may come, s.
-        limit: when to give up, s.
-
-    Returns:
-        Whether it became quiet within the limit.
-    """
+    """Throw away what comes until the line has been quiet for so long, s; False after `limit` s."""
     now = time.monotonic()
     end, still_since = now + limit, now
     while now < end:
@@ -105,7 +93,6 @@ def close_port(port: Closable) -> None:
 
 
 def _why_not_open(path: str, error: Exception) -> str:
-    """One line on a port that does not open."""
     number = getattr(error, "errno", None)
     if number in (errno.EAGAIN, errno.EBUSY):
         return f"port {path} is in use by another program; end that one, then try again"
@@ -121,7 +108,6 @@ def _why_not_open(path: str, error: Exception) -> str:
 
 
 def _why_broken(path: str, error: Exception) -> str:
-    """One line on a port that failed while it was open."""
     if not os.path.exists(path):
         return f"port {path} is gone; was its adapter unplugged?"
     number = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)

@@ -63,11 +63,6 @@ class TerminalOperator:
         self._ask(f"Look at the arm: {question}.", ["May it go on?"], "it goes on")
 
     def _ask(self, warning: str, request: list[str], said: str) -> None:
-        """Ask and wait for Enter.
-
-        Raises:
-            DeviceError: the person gives up, or nobody is there to be asked.
-        """
         if not _is_terminal():
             raise DeviceError(_NO_TERMINAL)
         self._say()
@@ -146,5 +141,4 @@ def _is_terminal() -> bool:
 
 
 def _numbers(values: tuple[float, float, float]) -> str:
-    """Return a vector for people."""
     return "[" + ", ".join(f"{x:g}" for x in values) + "]"

@@ -17,15 +17,28 @@ from typing import NoReturn
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.ur_link import cause, probe, states
-from hilcal.drivers.ur_link.brakes import Brakes
+from hilcal.drivers.ur_link import probe, states
+from hilcal.drivers.ur_link.brakes import (
+    UNWATCHED,
+    Brakes,
+    cause_of,
+    not_commanded,
+    program_ended,
+)
 from hilcal.drivers.ur_link.control import Control, take
-from hilcal.drivers.ur_link.failure import CHECK_LINK, CONTROL, HOLD_ON, failure
 from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.motion import MotionInProgress, deceleration, stands
-from hilcal.drivers.ur_link.options import UrOptions
-from hilcal.drivers.ur_link.reading import OPTIONAL, OUTPUTS, N, Reading
-from hilcal.drivers.ur_link.receiver import PATIENCE_S, STALE_S, Receiver
+from hilcal.drivers.ur_link.reading import (
+    OPTIONAL,
+    OUTPUTS,
+    PATIENCE_S,
+    STALE_S,
+    N,
+    Reading,
+    Receiver,
+)
+from hilcal.drivers.ur_link.services import UrOptions
+from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
 from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
 from hilcal.drivers.ur_link.survey import survey
 from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
@@ -153,7 +166,7 @@ class UrArm:
         try:
             control.set_payload(mass, com)
         except WorkerError as error:
-            self._not_done(cause.not_commanded(error))
+            self._not_done(not_commanded(error))
         end = time.monotonic() + _PAYLOAD_S
         while True:
             reading = self._read()
@@ -192,7 +205,7 @@ class UrArm:
         reading = self._read()
         self._check_state(reading)
         if reading.runtime != states.PLAYING:
-            self._fail(cause.program_ended(reading, 0.0))
+            self._fail(program_ended(reading, 0.0))
         motion = MotionInProgress(
             reading.sample.q, q, speed, acceleration, self._arrival, self._clock
         )
@@ -200,7 +213,7 @@ class UrArm:
         try:
             taken = control.move(q, speed, acceleration, motion.brake)
         except WorkerError as error:
-            self._not_done(cause.not_commanded(error))
+            self._not_done(not_commanded(error))
         if not taken:
             self._not_done("it did not take the motion")
 
@@ -219,9 +232,9 @@ class UrArm:
         try:
             pulse = control.alive()
         except WorkerError as error:
-            self._fail(cause.not_commanded(error))
+            self._fail(not_commanded(error))
         if pulse.expired:
-            self._fail(cause.UNWATCHED)
+            self._fail(UNWATCHED)
         if motion.arrived(reading):
             self._motion = None
             with contextlib.suppress(WorkerError):  # at rest; the next command tells
@@ -307,14 +320,14 @@ class UrArm:
         with contextlib.suppress(LinkError):  # the stop finds it lost, too
             reading = self._receiver.read(STALE_S)
             if reading.runtime != states.PLAYING:
-                noticed = f"{noticed}: {cause.program_ended(reading, 0.0)}"
+                noticed = f"{noticed}: {program_ended(reading, 0.0)}"
         self._fail(noticed)
 
     def _fail(self, noticed: str, lost: str = "") -> NoReturn:
         """Stop the arm first, then find out the cause and raise it."""
         halt = self._brakes.halt(self._control, self._brake, lost)
         self._control = self._motion = None
-        self._fault, advice = cause.find(self._generation.supervision, halt, noticed)
+        self._fault, advice = cause_of(self._generation.supervision, halt, noticed)
         if not halt.stands:
             advice = f"{HOLD_ON}; {advice}"
         raise failure(self._host, self._fault, advice)
@@ -325,8 +338,8 @@ def _why_ended(reading: Reading, control: Control) -> str:
     try:
         pulse = control.alive(_PULSE_S)
     except WorkerError:
-        return cause.program_ended(reading, 0.0)
-    return cause.UNWATCHED if pulse.expired else cause.program_ended(reading, pulse.late)
+        return program_ended(reading, 0.0)
+    return UNWATCHED if pulse.expired else program_ended(reading, pulse.late)
 
 
 def _is_foreign(problem: str) -> bool:
@@ -334,7 +347,6 @@ def _is_foreign(problem: str) -> bool:
 
 
 def _lacking(python: tuple[int, ...]) -> str:
-    """Say what to do where ur-rtde is not installed."""
     why, mend = "is not installed", install("rtde_control")
     if python >= NO_WHEEL:
         why = f"has no wheel for Python {python[0]}.{python[1]}"

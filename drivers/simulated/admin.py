@@ -88,7 +88,7 @@ class Operations:
     ) -> None:
         """Take the functions, and one that returns the state."""
         self._state = state or (lambda: None)
-        self.functions = {**functions, "die": _die}
+        self.functions = {**functions, "die": threading.Timer(0.02, os._exit, (70,)).start}
         if state is not None:
             self.functions["state"] = state
 
@@ -104,8 +104,14 @@ class Operations:
         return self._state() if result is None else result
 
 
-def _die() -> None:
-    threading.Timer(0.02, os._exit, (70,)).start()
+def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Callable[..., None]:
+    """Return the operation that sets an attribute to its one argument, whatever that is called."""
+
+    def store(**given: Any) -> None:
+        (value,) = given.values()
+        setattr(target, name, kind(value))
+
+    return store
 
 
 def device_parser(doc: str | None) -> argparse.ArgumentParser:

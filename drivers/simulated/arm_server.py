@@ -52,11 +52,7 @@ class ArmController:
             if motion.moving and time.monotonic() - self._asked > WATCHDOG_S:
                 motion.stop(_STOPPING, self._clock.now)
             motion.advance(self._clock.now)
-            self._board.write(
-                "arm", alive=1.0, q=motion.q, qd=motion.qd, side=motion.side,
-                arrivals=motion.arrivals, moving=float(motion.moving), payload=self._payload,
-                payload_com=self._com,
-            )  # fmt: skip
+            motion.publish(self._board, self._payload, self._com)
             return motion.moving
 
     def sample(self) -> dict[str, Any]:

@@ -92,11 +92,7 @@ class Blackboard:
     def create(cls, path: Path, scale: float, begun: float = 0.0, joints: int = 6) -> "Blackboard":
         """Make the file and start the world's clock.
 
-        Args:
-            path: the file.
-            scale: world seconds per real second.
-            begun: world time that it starts at, s.
-            joints: of the arm.
+        It begins at `begun`, s, and goes `scale` world seconds per real second.
         """
         number = np.array([0, joints], "<i8").tobytes()
         path.write_bytes(number + bytes(_offsets(joints)[1] - len(number)))

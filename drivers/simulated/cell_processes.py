@@ -1,7 +1,6 @@
 """A whole simulated cell: one process per device, all looking into one physical world."""
 
 import contextlib
-import os
 import secrets
 import socket
 import subprocess
@@ -9,7 +8,6 @@ import sys
 import time
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -19,11 +17,11 @@ from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.world import World
 from hilcal.drivers.simulated.world_server import open_board, write_world
+from hilcal.drivers.ur_link.worker import environment
 from hilcal.errors import DeviceError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-_ROOT = Path(__file__).resolve().parents[2]
 _END = 2.0  # s that a process has to end by itself, and again after it was asked to
 
 
@@ -32,11 +30,6 @@ class DeviceProcess:
 
     Its standard input is a pipe held by this process, whose end it follows; its output goes
     to DIR/NAME.log; it is ready when DIR/NAME.sock appears.
-
-    Attributes:
-        name: of the device: "world", "arm", "tracker", "force".
-        socket: its admin socket.
-        log: the file of its output.
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:
@@ -54,19 +47,13 @@ class DeviceProcess:
         """Start the process, after ending one that still runs; returns at once."""
         self.kill()
         self.socket.unlink(missing_ok=True)
-        path = os.environ.get("PYTHONPATH")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
-            "OMP_NUM_THREADS": "1",
-        }
         with self.log.open("wb") as log:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 self._command,
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
-                env=environment,
+                env={**environment(), "OMP_NUM_THREADS": "1"},
                 start_new_session=True,  # Ctrl-C is for the one who started it
             )
 
@@ -156,7 +143,6 @@ class SimulatedCell:
 
     Attributes:
         config: the given configuration, with the simulated devices filled in.
-        directory: where the devices meet.
     """
 
     def __init__(
@@ -207,7 +193,8 @@ class SimulatedCell:
             write_world(directory / "world.json", world, config, base_dir)
             board = open_board(directory, config.simulation.clock, begun, world.cell.arm.n)
             if not is_ur(world.cell.arm):
-                board.write("arm", q=_standing(world.cell.arm) if home is None else home)
+                usual = np.mean(world.cell.arm.usual_range, axis=0)
+                board.write("arm", q=usual if home is None else home)
         except OSError as error:
             raise InputError(
                 f"simulated cell: {directory} cannot be used ({error}); "
@@ -267,12 +254,7 @@ class SimulatedCell:
         """Return the running cell."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End every process."""
         self.close()
 
@@ -371,66 +353,51 @@ def _check(world: World, config: CellConfig, directory: Path) -> None:
 def _devices(
     world: World, config: CellConfig, directory: Path, seed: int, host: str, base_dir: Path
 ) -> dict[str, DeviceProcess]:
-    """Return what has to be started."""
-    noise = world.noise
-    file = config.robot.calibration
-    calibration = () if file is None else ("--calibration", str(base_dir / file))
-    tracker = config.tracker.driver or TRACKERS[0]
-    stated = (
-        *("--range-std", *map(repr, map(float, noise.range_std))),
-        *("--transverse-std", *map(repr, map(float, noise.transverse_std))),
-    )
-    of_tracker = {
-        "geocom": stated,
-        "emscon": (
-            *("--host", host, "--port", str(EMSCON_PORT), *stated),
-            *("--orientation-std", repr(float(noise.orientation_std))),
-        ),
-        "natnet": ("--host", host, "--port", str(NATNET_PORT)),  # its errors are its own
-    }[tracker]
-
-    def device(name: str, server: str, *arguments: str) -> DeviceProcess:
-        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, arguments)
-
-    out = {
-        "world": device("world", "world_server", "--seed", str(seed)),
-        "arm": device(
-            "arm",
-            *(
-                (
-                    *("ur_server", "--host", host, "--robot", config.robot.model),
-                    *("--version", config.simulation.controller_version, *calibration),
-                )
-                if is_ur(world.cell.arm)
-                else ("arm_server",)
-            ),
-            *("--seed", str(seed + 3)),
-        ),
-        "tracker": device(
-            "tracker",
-            f"{tracker}_server",
-            *of_tracker,
-            *("--seed", str(seed + 1)),
-        ),
+    noise, arm, sensor = world.noise, config.robot, config.force_sensor
+    stated = {"range_std": noise.range_std, "transverse_std": noise.transverse_std}
+    at: dict[str, object] = {"host": host}
+    of_tracker: dict[str, dict[str, object]] = {
+        "geocom": {**stated},
+        "emscon": {
+            **at,
+            "port": EMSCON_PORT,
+            **stated,
+            "orientation_std": noise.orientation_std,
+        },
+        "natnet": {**at, "port": NATNET_PORT},  # its errors are its own
     }
-    if config.force_sensor is not None:
-        server, *kind = ("force_server", "--kind", config.force_sensor.driver)
-        if config.force_sensor.driver == "netft":
-            server, *kind = "netft_server", "--host", host, "--port", str(RDT_PORT)
-            kind += ("--web-port", str(WEB_PORT))
-        out["force"] = device("force", server, *kind, "--seed", str(seed + 2))
+    tracker = config.tracker.driver or TRACKERS[0]
+
+    def device(name: str, server: str, number: int, options: dict[str, object]) -> DeviceProcess:
+        words = ["--seed", str(number)]
+        for key, value in options.items():
+            values = value if isinstance(value, tuple) else (value,)
+            told = (repr(float(v)) if isinstance(v, float) else str(v) for v in values)
+            words += [f"--{key.replace('_', '-')}", *told]
+        return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
+
+    of_arm: tuple[str, dict[str, object]] = "arm_server", {}
+    if is_ur(world.cell.arm):
+        version = config.simulation.controller_version
+        of_arm = "ur_server", {**at, "robot": arm.model, "version": version}
+        if arm.calibration is not None:
+            of_arm[1]["calibration"] = base_dir / arm.calibration
+    out = {
+        "world": device("world", "world_server", seed, {}),
+        "arm": device("arm", of_arm[0], seed + 3, of_arm[1]),
+        "tracker": device("tracker", f"{tracker}_server", seed + 1, of_tracker[tracker]),
+    }
+    if sensor is not None:
+        of_sensor: tuple[str, dict[str, object]] = "force_server", {"kind": sensor.driver}
+        if sensor.driver == "netft":
+            of_sensor = "netft_server", {**at, "port": RDT_PORT, "web_port": WEB_PORT}
+        out["force"] = device("force", of_sensor[0], seed + 2, of_sensor[1])
     return out
 
 
 def is_ur(arm: Arm) -> bool:
     """Whether an arm is one of Universal Robots in the catalogue: its own protocol is simulated."""
     return arm.name.startswith("ur") and arm.n == len(UR_JOINTS) and arm.joint_names == UR_JOINTS
-
-
-def _standing(arm: Arm) -> Floats:
-    """(n,) the middle of what the joints are used in."""
-    low, high = arm.usual_range
-    return np.asarray(0.5 * (low + high))
 
 
 def _filled_in(config: CellConfig, directory: Path, host: str, ur: bool) -> CellConfig:

@@ -62,26 +62,16 @@ SETS = {
 
 @dataclass(slots=True, eq=False)
 class SimulatedTracker:
-    """What the tracker is set to and what it answers.
-
-    Attributes:
-        station: its beam and the reflector that it holds.
-        noise: of a measurement.
-        rng: of the orientation's noise.
-        initialized: whether it knows its zeros.
-        settings: what the commands have set, by the command that reads it.
-        failing: status and how many next answers have it, by command.
-        mute: whether it does not answer.
-        client: who is connected.
-        asked: the last commands.
-    """
+    """What the tracker is set to and what it answers."""
 
     station: Station
     noise: SimulatedNoise
-    rng: np.random.Generator
+    rng: np.random.Generator  # of the orientation's noise
     initialized: bool = True
     settings: dict[int, bytes] = field(default_factory=lambda: dict(DEFAULTS))
+    """What the commands have set, by the command that reads it."""
     failing: dict[int, tuple[int, int]] = field(default_factory=dict)
+    """Status and how many next answers have it, by command."""
     mute: bool = False
     client: socket.socket | None = None
     asked: deque[int] = field(default_factory=lambda: deque(maxlen=10_000))
@@ -209,10 +199,6 @@ def _acquire(t: SimulatedTracker, command: int) -> None:
     t.answer(command, es.OK if found else es.NO_RESULT)
 
 
-def _find(t: SimulatedTracker, body: bytes) -> None:
-    _acquire(t, es.FIND_REFLECTOR)
-
-
 def _go(t: SimulatedTracker, body: bytes) -> None:
     at = PolarPoint.of(np.array(struct.unpack("<3di", body)[:3]))
     t.station.turn(at.hz, at.v)
@@ -234,30 +220,26 @@ def _info(t: SimulatedTracker, body: bytes) -> None:
     t.answer(es.GET_TRACKER_INFO, es.OK, struct.pack("<I64si", 70, words, SERIAL) + rest)
 
 
-def _environment(t: SimulatedTracker, body: bytes) -> None:
-    t.answer(es.GET_ENVIRONMENT, es.OK, struct.pack("<3d", *t.environment()))
-
-
 def _system(t: SimulatedTracker, body: bytes) -> None:
     state = es.INITIALIZED if t.initialized else es.BOOTED
     packed = struct.pack("<4I3iI2i", es.OK, state, 3, 2, 3, 8, 900, 2, 0, SERIAL)
     t.answer(es.GET_SYSTEM_STATUS, es.OK, packed)
 
 
-def _status(t: SimulatedTracker, body: bytes) -> None:
-    t.answer(es.GET_STATUS_INFO, es.OK, struct.pack("<Ii", es.OK, t.status()))
-
-
 _DO: dict[int, Callable[[SimulatedTracker, bytes], None]] = {
     es.GET_SYSTEM_STATUS: _system,
     es.INITIALIZE: _initialize,
     es.START_MEASUREMENT: _measure,
-    es.FIND_REFLECTOR: _find,
+    es.FIND_REFLECTOR: lambda t, body: _acquire(t, es.FIND_REFLECTOR),
     es.GO_POSITION: _go,
     es.GET_REFLECTORS: _reflectors,
     es.GET_TRACKER_INFO: _info,
-    es.GET_ENVIRONMENT: _environment,
-    es.GET_STATUS_INFO: _status,
+    es.GET_ENVIRONMENT: lambda t, body: t.answer(
+        es.GET_ENVIRONMENT, es.OK, struct.pack("<3d", *t.environment())
+    ),
+    es.GET_STATUS_INFO: lambda t, body: t.answer(
+        es.GET_STATUS_INFO, es.OK, struct.pack("<Ii", es.OK, t.status())
+    ),
 }
 
 
@@ -297,18 +279,14 @@ def operations(t: SimulatedTracker) -> admin.Operations:
         }
 
     own: dict[str, Callable[..., object]] = {
-        "beam": lambda on: setattr(station, "broken", bool(on)),
-        "hide": station.hide,
-        "lock_lost": lambda: setattr(station, "locked", False),
-        "freeze": lambda on: setattr(station, "stuck", station.seen if on else None),
-        "stray": station.follow_stray,
+        **station.faults(),
         "uninitialize": uninitialize,
         "reflector": reflector,
         "fail": lambda command, status, count=1: t.failing.update({command: (status, count)}),
         "change": lambda number: t.tell(int(number)),
         "transform": transform,
         "drop": drop,
-        "mute": lambda on: setattr(t, "mute", bool(on)),
+        "mute": admin.setter(t, "mute"),
         "rubbish": rubbish,
         "log": lambda: list(t.asked),
     }

@@ -41,27 +41,17 @@ ROOM = 22.0
 class StrainGauge:
     """The sensor's measuring bridge: what strain gauges make of the true wrench.
 
-        wrench = true + bias + drift (T - T_start) + overload + noise
-
-    Attributes:
-        board: the one physical world.
-        rng: generator of the noise.
-        bias: (6,) when the world begins, N and N·m.
-        drift: (6,) per K.
-        noise: (6,) standard deviation of one frame.
-        overload: (6,) wrench added by a fault.
-        on: how long the sensor has been on when the world begins, s.
-        frozen: (6,) what it reads whatever it feels; None is the truth.
+    wrench = true + bias + drift (T - T_start) + overload + noise
     """
 
     board: Blackboard
     rng: np.random.Generator
-    bias: Floats
-    drift: Floats
-    noise: Floats
-    overload: Floats
-    on: float
-    frozen: Floats | None = None
+    bias: Floats  # (6,) when the world begins, N and N·m
+    drift: Floats  # (6,) per K
+    noise: Floats  # (6,) standard deviation of one frame
+    overload: Floats  # (6,) wrench added by a fault
+    on: float  # how long the sensor has been on when the world begins, s
+    frozen: Floats | None = None  # (6,) what it reads whatever it feels; None is the truth
 
     @staticmethod
     def draw(
@@ -107,8 +97,6 @@ class SensorProtocol:
     Attributes:
         baud: the line's rate, Bd.
         noise: of one frame, force in N and moment in N·m.
-        rate: frames per second.
-        streaming: whether it sends by itself.
     """
 
     baud = 0
@@ -121,12 +109,9 @@ class SensorProtocol:
         self.streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame.
+        """Return one frame of a wrench (6,), N and N·m, and a temperature, °C.
 
-        Args:
-            number: of the frame since power-on, lost ones counted.
-            wrench: (6,) N and N·m.
-            temperature: °C.
+        `number` counts frames since power-on, lost ones, too.
         """
         raise NotImplementedError
 
@@ -180,8 +165,8 @@ class Bota(SensorProtocol):
     def operations(self) -> dict[str, Callable[..., object]]:
         """`saturate {on}` sets the status; `clock {us}` sets the time of frame 0."""
         return {
-            "saturate": lambda on: setattr(self, "saturated", bool(on)),
-            "clock": lambda us: setattr(self, "_start_us", int(us)),
+            "saturate": admin.setter(self, "saturated"),
+            "clock": admin.setter(self, "_start_us", int),
         }
 
 
@@ -329,25 +314,15 @@ KINDS: dict[str, type[SensorProtocol]] = {"bota": Bota, "ft300": Ft300, "hex": H
 
 @dataclass(slots=True, eq=False)
 class Stream:
-    """The sensor's clock: frame k is due at start + k / rate.
-
-    Attributes:
-        sensor: its protocol.
-        gauge: its measuring bridge.
-        port: its line.
-        stalled: whether frames are made but not sent.
-        number: of the next frame, since power-on.
-        due: when it is due, `time.monotonic`.
-        lost: frames that came too late to be sent.
-    """
+    """The sensor's clock: frame k is due at start + k / rate."""
 
     sensor: SensorProtocol
     gauge: StrainGauge
     port: PtyPort
-    stalled: bool = False
-    number: int = 0
-    due: float = 0.0
-    lost: int = 0
+    stalled: bool = False  # whether frames are made but not sent
+    number: int = 0  # of the next frame, since power-on
+    due: float = 0.0  # when it is due, `time.monotonic`
+    lost: int = 0  # frames that came too late to be sent
 
     def step(self) -> None:
         """Wait for the next batch or for a request, and serve it."""
@@ -388,7 +363,7 @@ class Stream:
         own: dict[str, Callable[..., object]] = {
             "overload": self.gauge.add,
             "freeze": self.gauge.freeze,
-            "stall": lambda on: setattr(self, "stalled", bool(on)),
+            "stall": admin.setter(self, "stalled"),
         }
         return admin.Operations(own | self.sensor.operations() | self.port.faults(), self.state)
 

@@ -38,21 +38,13 @@ _REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
 
 @dataclass(frozen=True, slots=True)
 class GeocomRequest:
-    """One request, taken apart.
-
-    Attributes:
-        rpc: number of the procedure.
-        transaction: number that the answer repeats.
-        parameters: as written.
-        checked: whether it came with a checksum, so the answer carries one too.
-        error: code of the communication, `OK` where the request is sound.
-    """
+    """One request, taken apart."""
 
     rpc: int
-    transaction: int
+    transaction: int  # number that the answer repeats
     parameters: tuple[str, ...]
-    checked: bool
-    error: int = OK
+    checked: bool  # whether it came with a checksum, so the answer carries one too
+    error: int = OK  # code of the communication, `OK` where the request is sound
 
 
 def parse(line: str) -> GeocomRequest | None:
@@ -184,10 +176,6 @@ def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
     return OK, []
 
 
-def _lock_state(station: Station, parameters: tuple[str, ...]) -> Answer:
-    return OK, [str(int(station.locked))]
-
-
 def _lock_quality(station: Station, parameters: tuple[str, ...]) -> Answer:
     """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
     return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
@@ -304,7 +292,7 @@ _PROCEDURES: dict[int, Procedure] = {
     9018: _switch_atr,
     9019: lambda station, parameters: (OK, [str(int(station.atr_enabled))]),
     9020: _switch_lock,
-    9021: _lock_state,
+    9021: lambda station, parameters: (OK, [str(int(station.locked))]),
     9027: _turn,
     9037: _fine_adjust,
     11001: _constant(),
@@ -348,9 +336,6 @@ def respond(station: Station, line: str) -> bytes:
 def operations(station: Station, port: PtyPort) -> admin.Operations:
     """Return what can be asked of the station."""
 
-    def put(name: str) -> Callable[..., None]:
-        return lambda on: setattr(station, name, bool(on))
-
     def delay(rpc: int, seconds: float, count: int = 1) -> None:
         station.delays[int(rpc)] = float(seconds), int(count)
 
@@ -364,17 +349,13 @@ def operations(station: Station, port: PtyPort) -> admin.Operations:
         }
 
     own: dict[str, Callable[..., object]] = {
-        "beam": put("broken"),
-        "hide": station.hide,
-        "lock_lost": lambda: setattr(station, "locked", False),
-        "freeze": lambda on: setattr(station, "stuck", station.seen if on else None),
-        "stray": station.follow_stray,
-        "dist_error": put("dist_error"),
+        **station.faults(),
+        "dist_error": admin.setter(station, "dist_error"),
         "warn": station.warn,
-        "busy": put("busy"),
+        "busy": admin.setter(station, "busy"),
         "delay": delay,
         "wrong_trid": lambda count=1: setattr(station, "wrong_transactions", int(count)),
-        "meas_s": lambda seconds: setattr(station, "meas_s", float(seconds)),
+        "meas_s": admin.setter(station, "meas_s", float),
         "log": lambda: [[number, *values] for number, values in list(station.requests)],
     }
     return admin.Operations(own | port.faults(), state)

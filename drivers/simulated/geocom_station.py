@@ -2,28 +2,23 @@
 
 import time
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from hilcal.drivers.simulated.admin import setter
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
 from hilcal.types import Floats
 
 
 @dataclass(frozen=True, slots=True)
 class PolarPoint:
-    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV.
+    """A direction and a slope distance: x = d sinV sinHz, y = d sinV cosHz, z = d cosV."""
 
-    Attributes:
-        hz: horizontal angle, 0 to 2 pi, rad.
-        v: zenith angle, 0 to pi, rad.
-        distance: m.
-    """
-
-    hz: float
-    v: float
-    distance: float
+    hz: float  # horizontal angle, 0 to 2 pi, rad
+    v: float  # zenith angle, 0 to pi, rad
+    distance: float  # m
 
     @staticmethod
     def of(point: Floats) -> "PolarPoint":
@@ -47,16 +42,12 @@ class PolarPoint:
 class Beam:
     """Noise of one measurement at the distance d.
 
-        sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
-        sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
-
-    Attributes:
-        range_std: (a, b) in m and m/m.
-        transverse_std: (c, e) in m and m/m.
+    sigma_range = a + b d,   sigma_transverse = c + e d in each direction across the beam,
+    sigma_v = sigma_transverse / d,   sigma_hz = sigma_transverse / (d sin v)
     """
 
-    range_std: tuple[float, float]
-    transverse_std: tuple[float, float]
+    range_std: tuple[float, float]  # (a, b) in m and m/m
+    transverse_std: tuple[float, float]  # (c, e) in m and m/m
 
     def angle_std(self, distance: float) -> float:
         """Return sigma_transverse / d, rad."""
@@ -88,73 +79,58 @@ LEVEL_STD = 1e-6
 
 @dataclass(slots=True, eq=False)
 class Station:
-    """A tracking station: it holds its target through jumps as long as the beam is free.
-
-    Attributes:
-        board: the one physical world.
-        beam: its noise.
-        rng: generator.
-        meas_s: world time of one distance measurement, s.
-        locked: whether the target is held; no lock, no distance.
-        broken: whether something stands in the beam.
-        dist_error: whether distance measurements fail (1292).
-        warning: code given instead of 0 with a good measurement, 0 is none.
-        busy: whether measurements are refused (1293).
-        delays: by procedure, s of real time and how many answers are late.
-        wrong_transactions: so many next answers carry a wrong transaction number.
-        lock_enabled: what 9020 has set.
-        atr_enabled: what 9018 has set.
-        digits: decimals of floating-point numbers.
-        atmosphere: wavelength m, pressure mbar, dry and wet temperature °C.
-        settings: values of plain settings by the procedure that sets them.
-        pointing: where the telescope looks.
-        distance: the last distance, m; 0 is none.
-        distance_ms: station time of it, ms.
-        ranging: until when a distance measurement runs, `time.monotonic`; None is not.
-        tracking: whether the distance meter goes on by itself.
-        requests: the last requests: number and parameters.
-        measured: number of target measurements.
-        number: of the target that is held, or was last.
-        hidden: numbers of targets that cannot be seen.
-        several: whether the tool carries several targets.
-        seen: the last measurement.
-        stuck: what is measured to the last digit whatever the target does; None is the target.
-        stray: a reflector at rest that is followed instead; None is the target.
-    """
+    """A tracking station: it holds its target through jumps as long as the beam is free."""
 
     board: Blackboard
     beam: Beam
     rng: np.random.Generator
-    meas_s: float = 0.3
-    locked: bool = True
-    broken: bool = False
-    dist_error: bool = False
-    warning: int = 0
-    busy: bool = False
+    meas_s: float = 0.3  # world time of one distance measurement, s
+    locked: bool = True  # whether the target is held; no lock, no distance
+    broken: bool = False  # whether something stands in the beam
+    dist_error: bool = False  # whether distance measurements fail (1292)
+    warning: int = 0  # code given instead of 0 with a good measurement, 0 is none
+    busy: bool = False  # whether measurements are refused (1293)
     delays: dict[int, tuple[float, int]] = field(default_factory=dict)
-    wrong_transactions: int = 0
-    lock_enabled: bool = True
-    atr_enabled: bool = True
-    digits: int = 15
+    """By procedure, s of real time and how many answers are late."""
+    wrong_transactions: int = 0  # so many next answers carry a wrong transaction number
+    lock_enabled: bool = True  # what 9020 has set
+    atr_enabled: bool = True  # what 9018 has set
+    digits: int = 15  # decimals of floating-point numbers
     atmosphere: tuple[float, ...] = (658e-9, 1013.25, 20.0, 20.0)
+    """Wavelength m, pressure mbar, dry and wet temperature °C."""
     settings: dict[int, str] = field(
         default_factory=lambda: {2020: "2", 17019: "0", 17021: "0", 17008: "0"}
     )
+    """Values of plain settings by the procedure that sets them."""
     pointing: PolarPoint = field(default_factory=lambda: PolarPoint(0.0, np.pi / 2, 0.0))
-    distance: float = 0.0
-    distance_ms: int = 0
+    """Where the telescope looks."""
+    distance: float = 0.0  # the last distance, m; 0 is none
+    distance_ms: int = 0  # station time of it, ms
     ranging: float | None = None
-    tracking: bool = False
+    """Until when a distance measurement runs, `time.monotonic`; None is not."""
+    tracking: bool = False  # whether the distance meter goes on by itself
     requests: deque[tuple[int, tuple[str, ...]]] = field(
         default_factory=lambda: deque(maxlen=10_000)
     )
     measured: int = 0
-    number: int = 0
-    hidden: set[int] = field(default_factory=set)
+    number: int = 0  # of the target that is held, or was last
+    hidden: set[int] = field(default_factory=set)  # numbers of targets that cannot be seen
     several: bool = False
     seen: PolarPoint | None = None
     stuck: PolarPoint | None = None
+    """What is measured to the last digit whatever the target does; None is the target."""
     stray: PolarPoint | None = None
+    """A reflector at rest that is followed instead; None is the target."""
+
+    def faults(self) -> dict[str, Callable[..., None]]:
+        """Return what can go wrong between instrument and target, by name."""
+        return {
+            "beam": setter(self, "broken"),
+            "hide": self.hide,
+            "lock_lost": lambda: setattr(self, "locked", False),
+            "freeze": lambda on: setattr(self, "stuck", self.seen if on else None),
+            "stray": self.follow_stray,
+        }
 
     def hide(self, targets: Iterable[int]) -> None:
         """Cover these targets by number, and no others."""
@@ -211,8 +187,7 @@ class Station:
     def acquire(self, window: float = np.inf) -> bool:
         """Search and hold the target that is closest to where it looks: whether there is any.
 
-        Args:
-            window: of several targets, only those that are so close to where it looks, rad.
+        Of several targets only those within `window` of that direction count, rad.
         """
         self.wait(AIM_S)
         seen = self.targets()

@@ -52,19 +52,12 @@ def typical_tilt(arm: Arm) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Draw:
-    """Draws one effect's parameters in a plausible direction and of a plausible size.
-
-    Attributes:
-        arm: the arm.
-        compliance: (n,) the drives' compliances, which stiffening belongs to, rad/(N·m).
-        torque: (n,) the largest torque at each drive in the states at hand, N·m.
-        harmonics: number of harmonics of the transmission error.
-    """
+    """Draws one effect's parameters in a plausible direction and of a plausible size."""
 
     arm: Arm
-    compliance: Floats
-    torque: Floats
-    harmonics: int = 6
+    compliance: Floats  # (n,) the drives' compliances, which stiffening belongs to, rad/(N·m)
+    torque: Floats  # (n,) the largest torque at each drive in the states at hand, N·m
+    harmonics: int = 6  # number of harmonics of the transmission error
 
     def effect(self, name: str, rng: np.random.Generator) -> Floats:
         """Return the parameters of the named effect, shaped as in `Truth`."""
@@ -285,7 +278,10 @@ def hide(
     )
     before = reference.sight(states)
     pairs = None if readings_mode == "absolute" else _pairs(states, pose, cycle)
-    whiten = _whitening(reference.covariance(before, m), pairs)
+    covariance = reference.covariance(before, m)
+    if pairs is not None:
+        covariance = covariance[pairs[0]] + covariance[pairs[1]]
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def strength(factor: float) -> float:
         change = _change(hidden(factor).sight(states), before, m)
@@ -319,7 +315,8 @@ def _simulated(
             "valid: a wrench that is not zero in some states"
         )
     if effect == "thermal_joint_drift":
-        world = replace(world, joint_reference=_first_temperature(states))
+        first = 0 if states.time is None else int(np.argmin(states.time))
+        world = replace(world, joint_reference=float(joint_temperature(states)[first].mean()))
     torque = np.maximum(
         np.abs(world.drive_torque(states)).max(axis=0), 0.1 * typical_torque(world.cell.arm)
     )
@@ -340,7 +337,6 @@ def _simulated(
 
 
 def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
-    """Refuse what cannot be hidden, by name."""
     if mode not in READINGS_MODES:
         raise InputError(f"readings {mode!r} is unknown; valid: {', '.join(READINGS_MODES)}")
     if m not in (3, 6):
@@ -357,16 +353,6 @@ def _check(effect: str | OwnLaw, strength: float, mode: str, m: int) -> None:
             f'effect {effect!r} cancels in deflections; valid with readings "deflection": '
             f"{', '.join((*DEFLECTION_EFFECTS, 'none'))}"
         )
-
-
-def _first_temperature(states: States) -> float:
-    """Return the mean temperature of the joints in the first state, °C.
-
-    Raises:
-        InputError: states without temperatures of the joints.
-    """
-    first = 0 if states.time is None else int(np.argmin(states.time))
-    return float(joint_temperature(states)[first].mean())
 
 
 def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints, Ints]:
@@ -391,13 +377,6 @@ def _pairs(states: States, pose: Ints | None, cycle: Ints | None) -> tuple[Ints,
                 "valid: one state with a zero wrench per pose and cycle"
             )
     return rows, np.array([first[key] for key in keys])
-
-
-def _whitening(covariance: Floats, pairs: tuple[Ints, Ints] | None) -> Floats:
-    """Return (N, m, m) inverse Cholesky factors of a reading's or a difference's covariance."""
-    if pairs is not None:
-        covariance = covariance[pairs[0]] + covariance[pairs[1]]
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
 
 
 def _change(after: IdealReading, before: IdealReading, m: int) -> Floats:

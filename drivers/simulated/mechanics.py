@@ -68,35 +68,22 @@ class ElasticTree:
         RX RY RZ (bearing of the carriage),
         and behind the drive of a long link: PY PZ RX RY RZ (its tip, x along the beam);
         last RX RY RZ (flange).
-
-    Attributes:
-        model: the Pinocchio model, v degrees of freedom.
-        base: (3,) indices of the base's tilts about x, y, z; (0,) where nothing tilts.
-        tilt: indices of the bearings' tilts about the axes across each joint, of a slide about all;
-            (0,) where nothing tilts.
-        tilt_joint: the joint of each of them, counted from 0.
-        guide: (g, 5) indices of the errors of the guides of the g joints that slide; or (0, 5).
-        drive: (n,) indices of the joints themselves: command, errors and elasticity add.
-        beam: (b, 5) indices of the tips: two displacements, twist, two rotations.
-        beam_length: (b,) lengths, m.
-        beam_link: (b,) number k of each long link, the constant transform L_k.
-        tool: (3,) indices of the flange's tilts about its x, y, z; (0,) where it has none.
-        last: number of the last Pinocchio joint, which carries the flange.
-        flange: (4, 4) flange in the last joint's frame.
     """
 
-    model: pin.Model
-    base: Ints
+    model: pin.Model  # the Pinocchio model, v degrees of freedom
+    base: Ints  # (3,) indices of the base's tilts about x, y, z; (0,) where nothing tilts
     tilt: Ints
-    tilt_joint: Ints
-    guide: Ints
-    drive: Ints
-    beam: Ints
-    beam_length: Floats
-    beam_link: Ints
-    tool: Ints
-    last: int
-    flange: Floats
+    """Indices of the bearings' tilts about the axes across each joint, of a slide about all; (0,)
+    where nothing tilts."""
+    tilt_joint: Ints  # the joint of each of them, counted from 0
+    guide: Ints  # (g, 5) indices of the errors of the guides of the g joints that slide; or (0, 5)
+    drive: Ints  # (n,) indices of the joints themselves: command, errors and elasticity add
+    beam: Ints  # (b, 5) indices of the tips: two displacements, twist, two rotations
+    beam_length: Floats  # (b,) lengths, m
+    beam_link: Ints  # (b,) number k of each long link, the constant transform L_k
+    tool: Ints  # (3,) indices of the flange's tilts about its x, y, z; (0,) where it has none
+    last: int  # number of the last Pinocchio joint, which carries the flange
+    flange: Floats  # (4, 4) flange in the last joint's frame
 
 
 def build(
@@ -138,20 +125,14 @@ def build(
         here = pin.SE3.Identity()
         return int(model.idx_qs[last])
 
-    base = []
-    if tilts:
-        base = [
-            add(pin.JointModelRX(), "base_x"),
-            add(pin.JointModelRY(), "base_y"),
-            add(pin.JointModelRZ(), "base_z"),
-        ]
+    turns = [(pin.JointModelRX(), "x"), (pin.JointModelRY(), "y"), (pin.JointModelRZ(), "z")]
+    base = [add(kind, f"base_{axis}") for kind, axis in turns] if tilts else []
     here = pin.SE3(links[0])
     tilt, tilt_joint, drive, beam = [], [], [], []
     guide: list[list[int]] = []
     bent = long_links(arm) if beams else np.zeros(0, dtype=np.int64)
     for j in range(arm.n):
         slides = bool(arm.slides[j])
-        turns = [(pin.JointModelRX(), "x"), (pin.JointModelRY(), "y"), (pin.JointModelRZ(), "z")]
         if slides:
             drive.append(add(pin.JointModelPZ(), f"drive{j + 1}"))
             shifts = [(pin.JointModelPX(), "px"), (pin.JointModelPY(), "py")]
@@ -168,22 +149,10 @@ def build(
         if j + 1 in bent:
             tip = pin.SE3(_beam_axes(links[j + 1][:3, 3]), links[j + 1][:3, 3])
             here = tip
-            moves = (
-                pin.JointModelPY(),
-                pin.JointModelPZ(),
-                pin.JointModelRX(),
-                pin.JointModelRY(),
-                pin.JointModelRZ(),
-            )
+            moves = (pin.JointModelPY(), pin.JointModelPZ(), *(kind for kind, _ in turns))
             beam.append([add(kind, f"beam{j + 1}_{i}") for i, kind in enumerate(moves)])
             here = tip.inverse() * pin.SE3(links[j + 1])
-    hand = []
-    if tool:
-        hand = [
-            add(pin.JointModelRX(), "tool_x"),
-            add(pin.JointModelRY(), "tool_y"),
-            add(pin.JointModelRZ(), "tool_z"),
-        ]
+    hand = [add(kind, f"tool_{axis}") for kind, axis in turns] if tool else []
     carried = pin.Inertia(float(tool_mass), np.asarray(tool_com, dtype=float), np.zeros((3, 3)))
     model.appendBodyToJoint(last, carried, here)
     return ElasticTree(
@@ -225,22 +194,15 @@ class Elasticity:
 
     Where drives turn several joints, this is the law of the drives, with their torques; the joints
     then turn by T delta, and tau = Tᵀ (torques about the axes).
-
-    Attributes:
-        linear: (v, v) C, symmetric, rad/(N·m) and its like for the tips of beams.
-        cubic: (v,) s, rad/(N·m)³; negative where a gear stiffens under load.
-        play: (v,) b, rad: half of the play that a joint crosses with the sign of its torque.
-        crossing: (v,) tau_0, the torque that takes it most of the way, over 0, N·m.
-        extra: (N, v) x, compliance that belongs to one of N states, rad/(N·m); None: nothing.
-        turns: (v, v) T; None: 1.
     """
 
-    linear: Floats
-    cubic: Floats
-    play: Floats
-    crossing: Floats
+    linear: Floats  # (v, v) C, symmetric, rad/(N·m) and its like for the tips of beams
+    cubic: Floats  # (v,) s, rad/(N·m)³; negative where a gear stiffens under load
+    play: Floats  # (v,) b, rad: half of the play that a joint crosses with the sign of its torque
+    crossing: Floats  # (v,) tau_0, the torque that takes it most of the way, over 0, N·m
     extra: Floats | None = None
-    turns: Floats | None = None
+    """(N, v) x, compliance that belongs to one of N states, rad/(N·m); None: nothing."""
+    turns: Floats | None = None  # (v, v) T; None: 1
 
     def give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
         """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states.
@@ -347,20 +309,14 @@ _AT_ONCE = 512  # states that are solved together; a choice by memory
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Equilibrium:
-    """Where N states come to rest.
+    """Where N states come to rest."""
 
-    Attributes:
-        flange: (N, 4, 4) T_base_flange.
-        deflection: (N, v) elastic displacement of every degree of freedom, rad or m.
-        torque: (N, v) what weight and load exert on it there, N·m or N.
-        jacobian: (N, 6, n) twist (v, omega) of the flange, at its origin and in base axes,
-            per commanded joint angle, with the other degrees of freedom held.
-    """
-
-    flange: Floats
-    deflection: Floats
-    torque: Floats
+    flange: Floats  # (N, 4, 4) T_base_flange
+    deflection: Floats  # (N, v) elastic displacement of every degree of freedom, rad or m
+    torque: Floats  # (N, v) what weight and load exert on it there, N·m or N
     jacobian: Floats
+    """(N, 6, n) twist (v, omega) of the flange, at its origin and in base axes, per commanded joint
+    angle, with the other degrees of freedom held."""
 
 
 def equilibrium(
@@ -409,19 +365,12 @@ def equilibrium(
 
 
 class _Pull(NamedTuple):
-    """What acts on the degrees of freedom of N states where they are.
+    """What acts on the degrees of freedom of N states where they are."""
 
-    Attributes:
-        place: (N, 4, 4) last body in base axes.
-        jacobian: (N, 6, v) twist of that body, its own axes.
-        torque: (N, v) what weight and load exert.
-        slope: (N, v, v) derivative of `torque`.
-    """
-
-    place: Floats
-    jacobian: Floats
-    torque: Floats
-    slope: Floats
+    place: Floats  # (N, 4, 4) last body in base axes
+    jacobian: Floats  # (N, 6, v) twist of that body, its own axes
+    torque: Floats  # (N, v) what weight and load exert
+    slope: Floats  # (N, v, v) derivative of `torque`
 
 
 class _Loaded:

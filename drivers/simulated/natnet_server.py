@@ -55,46 +55,26 @@ _COUNT = struct.Struct("<I")
 
 @dataclass(slots=True, eq=False)
 class Cameras:
-    """What the cameras see and whom they tell.
-
-    Attributes:
-        board: the one physical world.
-        rng: generator.
-        line: UDP socket of commands.
-        version: of NatNet that it can.
-        frame_std: of a frame, m.
-        waves: (6, 4) per coordinate and turn: direction and phase of the distortion.
-        distortion: its amplitude, m.
-        group: multicast group; empty for none.
-        clients: version and when it was heard of last, by address.
-        name: of the rigid body.
-        others: rigid bodies beside it.
-        number: of the last frame.
-        hidden: whether the rigid body is not seen.
-        stalled: whether no frames are sent.
-        paused: whether the same frame is sent again and again.
-        lose: share of frames that are lost.
-        insist: whether the version that a client asks for when it connects is not heard.
-        seen: the pose in the last frame.
-    """
+    """What the cameras see and whom they tell."""
 
     board: Blackboard
     rng: np.random.Generator
     line: socket.socket
     version: Version
-    frame_std: float
-    waves: Floats
-    distortion: float
-    group: str = ""
+    frame_std: float  # of a frame, m
+    waves: Floats  # (6, 4) per coordinate and turn: direction and phase of the distortion
+    distortion: float  # its amplitude, m
+    group: str = ""  # multicast group; empty for none
     clients: dict[tuple[str, int], tuple[Version, float]] = field(default_factory=dict)
+    """Version and when it was heard of last, by address."""
     name: str = "tool"
-    others: int = 0
+    others: int = 0  # rigid bodies beside it
     number: int = 0
     hidden: bool = False
     stalled: bool = False
-    paused: bool = False
+    paused: bool = False  # whether the same frame is sent again and again
     lose: float = 0.0
-    insist: bool = False
+    insist: bool = False  # whether the version that a client asks for when it connects is not heard
     seen: tuple[Floats, Floats] | None = None
 
     def pose(self) -> tuple[Floats, Floats]:
@@ -207,22 +187,19 @@ class Cameras:
 def operations(cameras: Cameras) -> admin.Operations:
     """Return what can be asked of the cameras."""
 
-    def put(name: str) -> Callable[..., None]:
-        return lambda on: setattr(cameras, name, bool(on))
-
     def state() -> dict[str, Any]:
         versions = [list(version) for version, _ in cameras.clients.values()]
         return {"frames": cameras.number, "clients": versions, "hidden": cameras.hidden}
 
     own: dict[str, Callable[..., object]] = {
-        "beam": put("hidden"),
-        "stall": put("stalled"),
-        "pause": put("paused"),
-        "insist": put("insist"),
-        "lose": lambda share: setattr(cameras, "lose", float(share)),
+        "beam": admin.setter(cameras, "hidden"),
+        "stall": admin.setter(cameras, "stalled"),
+        "pause": admin.setter(cameras, "paused"),
+        "insist": admin.setter(cameras, "insist"),
+        "lose": admin.setter(cameras, "lose", float),
         "forget": lambda: cameras.clients.clear(),
-        "rename": lambda name: setattr(cameras, "name", str(name)),
-        "bodies": lambda count: setattr(cameras, "others", int(count)),
+        "rename": admin.setter(cameras, "name", str),
+        "bodies": admin.setter(cameras, "others", int),
     }
     return admin.Operations(own, state)
 

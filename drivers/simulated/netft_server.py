@@ -40,40 +40,22 @@ _FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}
 
 @dataclass(slots=True, eq=False)
 class NetFt:
-    """The sensor: who is sent to, and how far it has counted.
-
-    Attributes:
-        gauge: its measuring bridge.
-        rng: generator of faults.
-        rate: records per second.
-        line: its UDP socket.
-        client: address that asked for records; None is nobody.
-        left: how many records are left to send; 0 is without end.
-        number: of the last record.
-        due: when the next one is due, `time.monotonic`.
-        begun: when it was switched on.
-        stalled: whether nothing is sent.
-        lose: share of datagrams that are lost.
-        twice: share of datagrams that come again later.
-        cut: share of datagrams that are cut short.
-        status: sent instead of its own where it is not None.
-        elements: of its page, by name.
-    """
+    """The sensor: who is sent to, and how far it has counted."""
 
     gauge: StrainGauge
     rng: np.random.Generator
     rate: float
     line: socket.socket
-    client: tuple[str, int] | None = None
-    left: int = 0
+    client: tuple[str, int] | None = None  # address that asked for records; None is nobody
+    left: int = 0  # how many records are left to send; 0 is without end
     number: int = 0
-    due: float = 0.0
+    due: float = 0.0  # when the next one is due, `time.monotonic`
     begun: float = field(default_factory=time.monotonic)
     stalled: bool = False
     lose: float = 0.0
-    twice: float = 0.0
-    cut: float = 0.0
-    status: int | None = None
+    twice: float = 0.0  # share of datagrams that come again later
+    cut: float = 0.0  # share of datagrams that are cut short
+    status: int | None = None  # sent instead of its own where it is not None
     elements: dict[str, str] = field(default_factory=dict)
 
     def page(self) -> str:
@@ -157,13 +139,6 @@ class NetFt:
 def operations(sensor: NetFt) -> admin.Operations:
     """Return what can be asked of the sensor."""
 
-    def put(name: str, kind: Callable[[Any], Any]) -> Callable[..., None]:
-        def store(**given: Any) -> None:
-            (value,) = given.values()
-            setattr(sensor, name, kind(value))
-
-        return store
-
     def state() -> dict[str, Any]:
         return {
             "frames": sensor.number,
@@ -175,13 +150,13 @@ def operations(sensor: NetFt) -> admin.Operations:
     own: dict[str, Callable[..., object]] = {
         "overload": sensor.gauge.add,
         "freeze": sensor.gauge.freeze,
-        "stall": put("stalled", bool),
+        "stall": admin.setter(sensor, "stalled"),
         "restart": sensor.restart,
-        "lose": put("lose", float),
-        "twice": put("twice", float),
-        "cut": put("cut", float),
-        "status": put("status", lambda word: word),
-        "page": put("elements", dict),
+        "lose": admin.setter(sensor, "lose", float),
+        "twice": admin.setter(sensor, "twice", float),
+        "cut": admin.setter(sensor, "cut", float),
+        "status": admin.setter(sensor, "status", lambda word: word),
+        "page": admin.setter(sensor, "elements", dict),
     }
     return admin.Operations(own, state)
 

@@ -17,19 +17,13 @@ _OPTIONS = ("socket", "hand_s", "person")
 
 @dataclass(frozen=True, slots=True)
 class SimulatedOperator:
-    """A diligent person, who errs only where the world's admin line commands it.
+    """A diligent person, who errs only where the world's admin line commands it."""
 
-    Attributes:
-        socket: the world's admin socket.
-        hand: time that a change of the load takes, s of cell time.
-        clock: cell time.
-        person: who is asked at the terminal, as in a real cell; None where nobody is.
-    """
-
-    socket: Path
-    hand: float
+    socket: Path  # the world's admin socket
+    hand: float  # time that a change of the load takes, s of cell time
     clock: Clock
     person: TerminalOperator | None = None
+    """Who is asked at the terminal, as in a real cell; None where nobody is."""
 
     @property
     def at_terminal(self) -> bool:

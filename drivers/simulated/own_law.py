@@ -28,19 +28,12 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OwnLaw:
-    """An effect with its true parameters.
-
-    Attributes:
-        effect: set up for `states`.
-        states: of the campaign that it was set up for.
-        catalogue: that the effect is from.
-        theta: (P,) its parameters, SI.
-    """
+    """An effect with its true parameters."""
 
     effect: Effect
-    states: States
+    states: States  # of the campaign that it was set up for
     catalogue: Catalogue
-    theta: Floats
+    theta: Floats  # (P,) its parameters, SI
 
     @property
     def truth(self) -> dict[str, float]:

@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.simulated.admin import setter
+
 BITS_PER_BYTE = 10
 FIFO = 16384
 """Bytes that wait for a reader beyond what the terminal itself holds."""
@@ -48,20 +50,10 @@ class PtyPort:
         dropped: frames lost because nobody read them in time.
         flip: probability that one bit of a frame is flipped.
         cut: probability that a frame is truncated.
-        mute: whether nothing goes out.
     """
 
     def __init__(self, link: Path, baud: int, rng: np.random.Generator) -> None:
-        """Plug the line in.
-
-        Args:
-            link: symbolic link that is the port's name.
-            baud: the instrument's rate, Bd.
-            rng: generator for faults and garbage.
-
-        Raises:
-            ValueError: no such rate.
-        """
+        """Plug the line in; `link` is the port's name, `baud` the instrument's rate, Bd."""
         if baud not in _SPEEDS:
             raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
         self.link, self.baud = link, baud
@@ -118,9 +110,7 @@ class PtyPort:
     def send(self, frame: bytes, born: float | None = None) -> None:
         """Put a frame on the wire; it arrives by `pump` when its last bit has passed.
 
-        Args:
-            frame: bytes of one frame.
-            born: when the instrument began to send it, `time.monotonic`; None is now.
+        `born` is when the instrument began to send it, `time.monotonic`; None is now.
         """
         with self._lock:
             if self.mute or not self.plugged:
@@ -188,9 +178,9 @@ class PtyPort:
     def faults(self) -> dict[str, Callable[..., None]]:
         """Return what can go wrong on the line, by name."""
         return {
-            "flip": lambda probability: setattr(self, "flip", float(probability)),
-            "cut": lambda probability: setattr(self, "cut", float(probability)),
-            "mute": lambda on: setattr(self, "mute", bool(on)),
+            "flip": setter(self, "flip", float),
+            "cut": setter(self, "cut", float),
+            "mute": setter(self, "mute"),
             "half_frame": lambda: setattr(self, "_halve", True),
             "garbage": self.garbage,
             "unplug": self.unplug,
@@ -263,7 +253,6 @@ class PtyPort:
             return None
 
     def _spoilt(self, frame: bytes) -> bytes:
-        """Return what the faults make of a frame."""
         if self.flip and self._rng.random() < self.flip:
             spoilt = bytearray(frame)
             spoilt[self._rng.integers(len(spoilt))] ^= 1 << int(self._rng.integers(8))

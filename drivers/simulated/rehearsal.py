@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -72,10 +72,7 @@ class SimulationCase:
     """A simulated cell with something hidden in it.
 
     Attributes:
-        config: the configuration that the program is given.
-        cell: the cell of that configuration.
         mode: the kind of readings that shows the hidden effect.
-        world: the truth.
         hidden: the name of the hidden effect, or "nothing".
         strength_sigma: rms of what it does to the readings, in units of their noise.
         home: (n,) where the arm stands at first; None where no plan says it.
@@ -89,14 +86,15 @@ class SimulationCase:
     strength_sigma: float
     home: Floats | None = field(default=None, kw_only=True)
 
+    def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
+        """Return what was measured in it, with the configuration that it was measured with."""
+        kept = {f.name: getattr(self, f.name) for f in fields(SimulationCase)}
+        return Rehearsal(**{**kept, "config": config or self.config}, readings=readings)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rehearsal(SimulationCase):
-    """A simulated campaign in such a cell.
-
-    Attributes:
-        readings: what was measured.
-    """
+    """A simulated campaign in such a cell."""
 
     readings: Readings
 
@@ -168,16 +166,10 @@ def simulation_case(
     catalogue: Catalogue | None = None,
     base_dir: Path | None = None,
 ) -> SimulationCase:
-    """Make a simulated cell and hide an effect in it at the configured strength.
+    """Make a simulated cell and hide an effect in it at the strength of `[simulation]`.
 
-    Args:
-        config: the cell; `[simulation]` gives the strength.
-        choice: an effect of `choices()` or `own_choices(catalogue)`, "random" or "nothing".
-        rng: generator.
-        visit: returns the states at which the strength holds.
-        noise: the tracker's noise of one reading.
-        catalogue: has the effects of a user's own.
-        base_dir: directory that a robot's file path is relative to.
+    `choice` is one of `choices()` or `own_choices(catalogue)`, "random" or "nothing"; the strength
+    holds at the states that `visit` returns, with the tracker's `noise` of one reading.
 
     Raises:
         InputError: an unknown choice; lists the valid ones. An effect that loads show, in a cell
@@ -228,17 +220,10 @@ def simulate(
     rng: np.random.Generator,
     m: int = 3,
 ) -> Readings:
-    """Return what the tracker reads of the states, with the covariance of every reading.
+    """Return what the tracker reads of N states, with the covariance of every reading.
 
-    Args:
-        world: the simulated cell.
-        states: N states.
-        pose: (N,) index of the pose.
-        load: (N,) index into `load_names`.
-        cycle: (N,) index of the cycle.
-        load_names: names of the loads, "none" for unloaded.
-        rng: generator of the noise.
-        m: 3 for positions, 6 for poses.
+    `pose` (N,), `load` (N,) into `load_names` ("none" for unloaded) and `cycle` (N,) are their
+    indices; m is 3 for positions, 6 for poses.
 
     Raises:
         InputError: another m.
@@ -278,11 +263,7 @@ def planned_states(
     The arm takes the route of a session, which tells from which sides the joints arrive. They warm
     up as those of the cell behind the wires do.
 
-    Args:
-        cell: the cell.
-        config: its loads and motion.
-        plan: what is visited.
-        begun: when, in the time of the campaign, s.
+    The time begins at `begun`, in that of the campaign, s.
     """
     names = [UNLOADED, *(load.name for load in config.loads)]
     pulls = {load.name: load.wrench(cell.gravity) for load in config.loads}
@@ -331,14 +312,6 @@ def case_of_plan(
     Its strength holds for the readings of the plan, each the mean of several measurements; the
     world's tracker has the noise of a single one.
 
-    Args:
-        config: the cell; `[simulation]` gives the strength.
-        plan: what will be measured.
-        choice: an effect, "random" or "nothing".
-        seed: of everything random.
-        catalogue: has the effects of a user's own, which can be hidden, too.
-        base_dir: directory that a robot's file path is relative to.
-
     Raises:
         InputError: an unknown choice, or a cell without loads.
     """
@@ -360,11 +333,8 @@ def case_of_plan(
 def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float = 0.0) -> Rehearsal:
     """Draw the readings of a plan in a simulated cell that is there already.
 
-    Args:
-        s: configuration and truth of the cell.
-        plan: what is measured, each reading the mean of several measurements.
-        seed: of the noise.
-        begun: when, in the time of the campaign, s.
+    Each is the mean of several measurements; the first is taken at `begun`, in the time of the
+    campaign, s.
     """
     config = s.config
     world = replace(s.world, noise=measurement_noise(config, config.acquire.samples))
@@ -372,8 +342,7 @@ def read_plan(s: SimulationCase, plan: Plan, seed: Sequence[int], begun: float =
     names = (UNLOADED, *(load.name for load in config.loads))
     rng = np.random.default_rng(seed)
     readings = simulate(world, v.states, v.pose, v.load, v.cycle, names, rng)
-    readings = replace(readings, pose_names=plan.pose_names)
-    return Rehearsal(s.config, s.cell, s.mode, world, s.hidden, s.strength_sigma, readings)
+    return replace(s, world=world).measured(replace(readings, pose_names=plan.pose_names))
 
 
 @contextmanager
@@ -386,12 +355,7 @@ def simulated_cell(
 ) -> Iterator[SimulatedCell]:
     """Run the simulated devices of a cell; they end with the block.
 
-    Args:
-        secret: configuration and truth of the cell.
-        seed: of the devices' noise.
-        base_dir: directory that a robot's file path is relative to.
-        directory: where the devices meet; a temporary one if None.
-        begun: world time at the start, s.
+    They meet in `directory`, a temporary one if None; the world's time begins at `begun`, s.
 
     Raises:
         DeviceError: a device did not start.

@@ -49,68 +49,41 @@ def long_links(arm: Arm) -> Ints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Truth:
-    """What the program under test must find out; SI, all zero where nothing is hidden.
+    """What the program under test must find out; SI, all zero where nothing is hidden."""
 
-    Attributes:
-        joint_compliance: (n,) rad/(N·m).
-        joint_stiffening: (n,) s in dq = c tau + s tau³, rad/(N·m)³.
-        joint_tilt_compliance: (n,) rad/(N·m).
-        base_compliance: (3,) about x, y, z of the base, rad/(N·m).
-        link_compliance: (b, 2) 1/EI and 1/GJ of the long links, 1/(N·m²).
-        hysteresis: (n,) h in dq = h s, rad.
-        encoder_offset: (n,) rad.
-        joint_coupling: (n, n) k in dq_j = sum_i k_ji q_i, q as commanded, 1.
-        transmission_error: (n, h, 2) a_k, b_k in dq = sum a_k cos k q + b_k sin k q, rad;
-            q is the commanded angle.
-        link_geometry: (n + 1, 6) twist of everything beyond slot k, its axes, m and rad.
-        load_point: (3,) the load acts so far from its configured point, flange axes, m.
-        target_offset: (3,) the same of the tracked target, flange axes, m.
-        base_frame: (6,) twist of the base against its registration, base axes, m and rad.
-        tracker_drift: (6,) twist rate of the readings about the station, tracker axes, m/s
-            and rad/s: the station itself moves the other way.
-        tool_compliance: (2,) of the flange by the moment there, along and across its z axis,
-            rad/(N·m).
-        periodic_joint_compliance: (n, 2) a, b in dq = tau (a cos 2q + b sin 2q), rad/(N·m).
-        backlash: (n,) b in dq = b tanh(tau / tau_0), rad.
-        creep: (1,) k in dq = k c tau log10(1 + t / 1 s), 1 per decade of the load's time t.
-        thermal_growth: (1,) alpha: every link's translation grows by alpha (T - 20 °C), 1/K.
-        thermal_joint_drift: (n,) kappa in dq = kappa (T_j - reference), rad/K.
-        link_mass: (n, 3) first moments of the bodies beyond their own, body axes, kg·m.
-        wrench_bias: (6,) of the force sensor, flange axes, N and N·m.
-        wrench_gain: (6,) error of the gain of its six channels, 1.
-        sensor_misalignment: (3,) its axes are turned against the flange, rotation vector, rad.
-        guide_error: (g, 19) of the g joints that slide: amplitudes of Legendre's polynomials over
-            the travel, -1 to 1, of the carriage's motion: x and y of orders 2 to 4, z of
-            order 1, m; rx, ry and rz of orders 1 to 4, rad.
-        tracker_scale: (1,) s: positions read (1 + s) times as long, 1.
-    """
-
-    joint_compliance: Floats
-    joint_stiffening: Floats
-    joint_tilt_compliance: Floats
-    base_compliance: Floats
-    link_compliance: Floats
-    hysteresis: Floats
-    encoder_offset: Floats
-    joint_coupling: Floats
+    joint_compliance: Floats  # (n,) rad/(N·m)
+    joint_stiffening: Floats  # (n,) s in dq = c tau + s tau³, rad/(N·m)³
+    joint_tilt_compliance: Floats  # (n,) rad/(N·m)
+    base_compliance: Floats  # (3,) about x, y, z of the base, rad/(N·m)
+    link_compliance: Floats  # (b, 2) 1/EI and 1/GJ of the long links, 1/(N·m²)
+    hysteresis: Floats  # (n,) h in dq = h s, rad
+    encoder_offset: Floats  # (n,) rad
+    joint_coupling: Floats  # (n, n) k in dq_j = sum_i k_ji q_i, q as commanded, 1
     transmission_error: Floats
-    link_geometry: Floats
-    load_point: Floats
-    target_offset: Floats
-    base_frame: Floats
+    """(n, h, 2) a_k, b_k in dq = sum a_k cos k q + b_k sin k q, rad; q is the commanded angle."""
+    link_geometry: Floats  # (n + 1, 6) twist of everything beyond slot k, its axes, m and rad
+    load_point: Floats  # (3,) the load acts so far from its configured point, flange axes, m
+    target_offset: Floats  # (3,) the same of the tracked target, flange axes, m
+    base_frame: Floats  # (6,) twist of the base against its registration, base axes, m and rad
     tracker_drift: Floats
+    """(6,) twist rate of the readings about the station, tracker axes, m/s and rad/s: the station
+    itself moves the other way."""
     tool_compliance: Floats
-    periodic_joint_compliance: Floats
-    backlash: Floats
-    creep: Floats
-    thermal_growth: Floats
-    thermal_joint_drift: Floats
-    link_mass: Floats
-    wrench_bias: Floats
-    wrench_gain: Floats
-    sensor_misalignment: Floats
+    """(2,) of the flange by the moment there, along and across its z axis, rad/(N·m)."""
+    periodic_joint_compliance: Floats  # (n, 2) a, b in dq = tau (a cos 2q + b sin 2q), rad/(N·m)
+    backlash: Floats  # (n,) b in dq = b tanh(tau / tau_0), rad
+    creep: Floats  # (1,) k in dq = k c tau log10(1 + t / 1 s), 1 per decade of the load's time t
+    thermal_growth: Floats  # (1,) alpha: every link's translation grows by alpha (T - 20 °C), 1/K
+    thermal_joint_drift: Floats  # (n,) kappa in dq = kappa (T_j - reference), rad/K
+    link_mass: Floats  # (n, 3) first moments of the bodies beyond their own, body axes, kg·m
+    wrench_bias: Floats  # (6,) of the force sensor, flange axes, N and N·m
+    wrench_gain: Floats  # (6,) error of the gain of its six channels, 1
+    sensor_misalignment: Floats  # (3,) its axes are turned against the flange, rotation vector, rad
     guide_error: Floats
-    tracker_scale: Floats
+    """(g, 19) of the g joints that slide: amplitudes of Legendre's polynomials over the travel, -1
+    to 1, of the carriage's motion: x and y of orders 2 to 4, z of order 1, m; rx, ry and rz of
+    orders 1 to 4, rad."""
+    tracker_scale: Floats  # (1,) s: positions read (1 + s) times as long, 1
 
     @staticmethod
     def rigid(arm: Arm, harmonics: int = 0) -> "Truth":
@@ -197,11 +170,7 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
     dq_j = o_j + h_j s_j + kappa_j (T_j - reference)
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
-    Args:
-        hidden: the parameters.
-        arm: the arm.
-        states: N states.
-        reference: temperature at which joints do not drift, °C.
+    Joints do not drift at the temperature `reference`, °C.
 
     Raises:
         InputError: hysteresis without approach sides, or drifting joints without their
@@ -316,14 +285,10 @@ class Misreading:
 
     The sensor reads b + diag(1 + g) exp([delta])ᵀ acting, so G = exp([delta]) diag(1 / (1 + g)),
     the same rotation for force and moment.
-
-    Attributes:
-        gain: (6, 6) G.
-        bias: (6,) b, N and N·m.
     """
 
-    gain: Floats
-    bias: Floats
+    gain: Floats  # (6, 6) G
+    bias: Floats  # (6,) b, N and N·m
 
     @classmethod
     def of(cls, truth: Truth) -> "Misreading | None":

@@ -32,7 +32,6 @@ from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.ur.controller import Controller, DashboardServer
 from hilcal.drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
-from hilcal.drivers.simulated.ur.programs import ScriptStream
 from hilcal.drivers.simulated.ur.robot_api import RobotApiServer
 from hilcal.drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
 from hilcal.drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
@@ -156,14 +155,8 @@ class UrServer:
         await RtdeLink(self.rtde, reader, writer).run()
 
     async def _run_script(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        stream = ScriptStream()
         try:
-            while data := await reader.read(_LINE):
-                for text in stream.feed(data):
-                    self.controller.run(text)
-                self.controller.step()
-        except OSError:
-            pass
+            await self.controller.take_programs(reader)
         finally:
             writer.close()
 
@@ -189,30 +182,34 @@ def read_version(text: str) -> Version:
     raise InputError(f"version {text!r}; valid: four numbers, e.g. 5.11.6.1010327")
 
 
-class AdminOperations:
-    """What may be asked and switched; answers with the state, or the log."""
+_QUIET = ("state", "log", "set", "release_emergency_stop", "remote_mode")
+"""Operations that are no faults."""
 
-    def __init__(self, server: UrServer, loop: asyncio.AbstractEventLoop) -> None:
-        """Serve from other threads than that of the loop."""
-        self._server, self._loop = server, loop
-        arm, controller, links = server.arm, server.controller, server.rtde.links
 
-        def switch(name: str) -> Callable[..., object]:
-            return lambda on=True: setattr(server.faults, name, bool(on))
+def operations(server: UrServer, loop: asyncio.AbstractEventLoop) -> admin.Handler:
+    """Return what may be asked and switched, from other threads than that of the loop."""
+    arm, controller, links = server.arm, server.controller, server.rtde.links
 
-        def drop() -> None:
-            for link in list(links):
-                link.writer.transport.abort()
+    def switch(name: str) -> Callable[..., object]:
+        return lambda on=True: setattr(server.faults, name, bool(on))
 
-        def half_frame() -> None:
-            for link in list(links):
-                link.half()
+    def drop() -> None:
+        for link in list(links):
+            link.writer.transport.abort()
 
-        def freeze(on: bool = True) -> None:
-            arm.frozen_q = arm.trajectory.q.copy() if on else None
+    def half_frame() -> None:
+        for link in list(links):
+            link.half()
 
-        self._functions: dict[str, Callable[..., object]] = {
-            "state": lambda: None,
+    def freeze(on: bool = True) -> None:
+        arm.frozen_q = arm.trajectory.q.copy() if on else None
+
+    def state() -> dict[str, Any]:
+        return _state(server)
+
+    known = admin.Operations(
+        {
+            "state": state,
             "protective_stop": lambda: controller.protective_stop("admin"),
             "emergency_stop": controller.emergency_stop,
             "release_emergency_stop": controller.release_emergency_stop,
@@ -229,74 +226,76 @@ class AdminOperations:
             "refuse_motion": lambda on=True: setattr(arm, "refuses_motion", bool(on)),
             "freeze": freeze,
             "jog": lambda q: arm.trajectory.place(_joints(q)),
-            "set": self._set,
-            "log": lambda: None,
-        }
+            "set": lambda **settings: _set(server, settings),
+            "log": lambda: list(arm.log),
+        },
+        state,
+    )
 
-    def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out an operation in the controller's own thread."""
-        if op == "die":
-            os._exit(1)
-        work = asyncio.run_coroutine_threadsafe(self._do(op, arguments), self._loop)
-        return work.result(5.0)
-
-    async def _do(self, op: str, arguments: dict[str, Any]) -> Any:
-        server, arm = self._server, self._server.arm
-        if op not in self._functions:
-            raise InputError(f"unknown op {op!r}; valid: {', '.join((*self._functions, 'die'))}")
-        if op not in ("state", "log", "set", "release_emergency_stop", "remote_mode"):
+    async def do(op: str, arguments: dict[str, Any]) -> Any:
+        if op in known.functions and op not in _QUIET:
             if arguments.get("on", True):
                 arm.fault_ns = time.monotonic_ns()
             arm.note(f"admin: {op} {arguments or ''}".strip())
-        done = self._functions[op](**arguments)
+        done = known(op, arguments)
         if inspect.isawaitable(done):
             await done
-        server.controller.step()
-        return list(arm.log) if op == "log" else self._state()
+            return state()
+        return done
 
-    def _set(self, **settings: Any) -> None:
-        arm = self._server.arm
-        for key, value in settings.items():
-            match key:
-                case "version":
-                    arm.version = read_version(str(value))
-                case "slider":
-                    arm.slider = _share(key, value)
-                case "speed_scaling":
-                    arm.scaling = _share(key, value)
-                case "unlock_s":
-                    self._server.controller.unlock_after = float(value)
-                case _:
-                    raise InputError(
-                        f"no setting {key!r}; valid: version, slider, speed_scaling, unlock_s"
-                    )
+    def handler(op: str, arguments: dict[str, Any]) -> Any:
+        if op == "die":
+            os._exit(1)
+        return asyncio.run_coroutine_threadsafe(do(op, arguments), loop).result(5.0)
 
-    def _state(self) -> dict[str, Any]:
-        server, arm = self._server, self._server.arm
-        motion = arm.trajectory
-        return {
-            "q": motion.q.tolist(),
-            "qd": motion.qd.tolist(),
-            "side": motion.side.tolist(),
-            "moving": motion.moving,
-            "arrivals": motion.arrivals,
-            "runtime": int(arm.runtime),
-            "safety": int(arm.safety_bits),
-            "robot_mode": int(arm.robot_mode),
-            "remote": arm.remote,
-            "payload": arm.payload,
-            "payload_com": arm.payload_com.tolist(),
-            "tcp": arm.tcp.tolist(),
-            "scripts": server.controller.scripts,
-            "script_running": server.controller.program_runs,
-            "watchdog_hz": server.controller.watchdog,
-            "rtde_clients": len(server.rtde.links),
-            "dashboard_clients": server.dashboard.clients,
-            "rest_ns": arm.clock.real_ns(motion.rest_time),
-            "fault_ns": arm.fault_ns,
-            "input_ns": arm.input_ns,
-            "now_ns": time.monotonic_ns(),
-        }
+    return handler
+
+
+def _set(server: UrServer, settings: dict[str, Any]) -> None:
+    arm = server.arm
+    for key, value in settings.items():
+        match key:
+            case "version":
+                arm.version = read_version(str(value))
+            case "slider":
+                arm.slider = _share(key, value)
+            case "speed_scaling":
+                arm.scaling = _share(key, value)
+            case "unlock_s":
+                server.controller.unlock_after = float(value)
+            case _:
+                raise InputError(
+                    f"no setting {key!r}; valid: version, slider, speed_scaling, unlock_s"
+                )
+
+
+def _state(server: UrServer) -> dict[str, Any]:
+    arm = server.arm
+    server.controller.step()
+    motion = arm.trajectory
+    return {
+        "q": motion.q.tolist(),
+        "qd": motion.qd.tolist(),
+        "side": motion.side.tolist(),
+        "moving": motion.moving,
+        "arrivals": motion.arrivals,
+        "runtime": int(arm.runtime),
+        "safety": int(arm.safety_bits),
+        "robot_mode": int(arm.robot_mode),
+        "remote": arm.remote,
+        "payload": arm.payload,
+        "payload_com": arm.payload_com.tolist(),
+        "tcp": arm.tcp.tolist(),
+        "scripts": server.controller.scripts,
+        "script_running": server.controller.program_runs,
+        "watchdog_hz": server.controller.watchdog,
+        "rtde_clients": len(server.rtde.links),
+        "dashboard_clients": server.dashboard.clients,
+        "rest_ns": arm.clock.real_ns(motion.rest_time),
+        "fault_ns": arm.fault_ns,
+        "input_ns": arm.input_ns,
+        "now_ns": time.monotonic_ns(),
+    }
 
 
 def _joints(q: Any) -> Floats:
@@ -336,7 +335,7 @@ async def serve(options: argparse.Namespace) -> None:
     server = UrServer(state, board, options.host, rng, options.api_port, factory)
     await server.open()
     loop = asyncio.get_running_loop()
-    admin.serve(options.directory / "arm.sock", AdminOperations(server, loop))
+    admin.serve(options.directory / "arm.sock", operations(server, loop))
     await server.run()
 
 

@@ -42,16 +42,12 @@ class SimulatedNoise:
     The defaults are half of a maximum permissible error of ±15 µm + 6 µm/m across the line
     of sight, a range that is steadier than the angles, and half of ±0.01° for the target's
     orientation: the usual class of laser trackers with a six-degrees-of-freedom probe.
-
-    Attributes:
-        range_std: (a, b) in m and m/m.
-        transverse_std: (c, e) in m and m/m, each of the two directions across the sight.
-        orientation_std: rad, about each axis of the tracker.
     """
 
-    range_std: tuple[float, float] = (5e-6, 0.5e-6)
+    range_std: tuple[float, float] = (5e-6, 0.5e-6)  # (a, b) in m and m/m
     transverse_std: tuple[float, float] = (7.5e-6, 3e-6)
-    orientation_std: float = 8.7e-5
+    """(c, e) in m and m/m, each of the two directions across the sight."""
+    orientation_std: float = 8.7e-5  # rad, about each axis of the tracker
 
     def covariance(self, position: Floats, m: int) -> Floats:
         """Return the (N, m, m) covariance at (N, 3) positions in station axes, m.
@@ -108,17 +104,11 @@ def _across(sight: Floats) -> tuple[Floats, Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class IdealReading:
-    """What the tracker would read of N states without any noise.
+    """What the tracker would read of N states without any noise."""
 
-    Attributes:
-        position: (N, 3) of the target, sensor axes, m.
-        rotation: (N, 3, 3) of the target, sensor axes.
-        jacobian: (N, 6, n) twist of the target per displacement of a drive, sensor axes.
-    """
-
-    position: Floats
-    rotation: Floats
-    jacobian: Floats
+    position: Floats  # (N, 3) of the target, sensor axes, m
+    rotation: Floats  # (N, 3, 3) of the target, sensor axes
+    jacobian: Floats  # (N, 6, n) twist of the target per displacement of a drive, sensor axes
 
     def value(self, m: int) -> Floats:
         """Return (N, m): the position and, for m = 6, the rotation vector."""
@@ -129,30 +119,20 @@ class IdealReading:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """One simulated cell with everything about it that the program is not told.
+    """One simulated cell with everything about it that the program is not told."""
 
-    Attributes:
-        cell: the cell as configured: what the program believes.
-        physics: the hidden parameters.
-        registration: (4, 4) the true T_sensor_base, before `physics.base_frame`.
-        station: (4, 4) T_station_sensor: where the instrument stands.
-        noise: the tracker's noise.
-        joint_std: (n,) the arm's repeatability at each joint, rad.
-        joint_reference: temperature at which joints do not drift, °C.
-        offsets: (T, 3) where each of several targets truly is beyond its configured place, flange
-            axes, m; None for none. `physics.target_offset` moves all of them.
-        own: an effect of a user's own, on top of what the mechanics do; None for none.
-    """
-
-    cell: Cell
-    physics: Truth
-    registration: Floats
-    station: Floats
-    noise: SimulatedNoise
-    joint_std: Floats
-    joint_reference: float = 22.0
+    cell: Cell  # the cell as configured: what the program believes
+    physics: Truth  # the hidden parameters
+    registration: Floats  # (4, 4) the true T_sensor_base, before `physics.base_frame`
+    station: Floats  # (4, 4) T_station_sensor: where the instrument stands
+    noise: SimulatedNoise  # the tracker's noise
+    joint_std: Floats  # (n,) the arm's repeatability at each joint, rad
+    joint_reference: float = 22.0  # temperature at which joints do not drift, °C
     offsets: Floats | None = None
+    """(T, 3) where each of several targets truly is beyond its configured place, flange axes, m;
+    None for none. `physics.target_offset` moves all of them."""
     own: OwnLaw | None = None
+    """An effect of a user's own, on top of what the mechanics do; None for none."""
     _tree: ElasticTree = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -223,9 +203,7 @@ class World:
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
         """Return the static equilibrium of N states.
 
-        Args:
-            states: commanded joints and wrenches.
-            slip: (N, n) how far each drive missed its command, rad (repeatability).
+        `slip` (N, n) is how far each drive missed its command, rad (repeatability).
 
         Raises:
             InputError: the states lack what a hidden effect depends on, or find no equilibrium.
@@ -244,7 +222,6 @@ class World:
         )
 
     def _elasticity(self, states: States) -> Elasticity:
-        """Return the elastic law in N states."""
         hidden, tree = self.physics, self._tree
         return elasticity(
             tree,
@@ -270,14 +247,9 @@ class World:
         """Return what the tracker would read of N states without noise of its own.
 
         T_sensor_target = exp(t [drift]) T_sensor_base exp([base_frame]) T_base_flange
-        T_flange_target, the target shifted by its offset; the position then 1 + s times as
-        long, about the origin of the sensor's axes. An effect of a user's own displaces the target
-        before drift and scale.
-
-        Args:
-            states: commanded joints and wrenches.
-            slip: as for `rest`.
-            rest: the equilibrium of these states, where it is known.
+        T_flange_target, the target shifted by its offset; the position then 1 + s times as long,
+        about the origin of the sensor's axes. An effect of a user's own displaces the target before
+        drift and scale. `slip` is as for `rest`, which is the equilibrium where that is known.
 
         Raises:
             InputError: the states lack what a hidden effect depends on, e.g. a drifting
@@ -328,14 +300,8 @@ class World:
         """Return the (N, m) readings of N states, with all noise.
 
         The arm's repeatability is drawn in joint space and goes through the equilibrium, so
-        that it is correlated over all elements; then the tracker adds its own.
-
-        Args:
-            states: N states.
-            rng: generator.
-            m: elements per reading, 3 or 6.
-            arrival: (N,) number of the arrival in which each reading is taken: those of one
-                arrival share the arm's scatter. Each reading is one of its own where None.
+        that it is correlated over all elements; then the tracker adds its own. Readings of one
+        `arrival` (N,) share the arm's scatter; each is one of its own where None. m is 3 or 6.
         """
         each = np.arange(len(states)) if arrival is None else arrival
         slip = self.joint_std * rng.standard_normal((int(each.max()) + 1, states.q.shape[1]))[each]
@@ -361,10 +327,7 @@ def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[
     origin lies within the arm's reach (readings in base axes) the instrument itself stands
     `distance` away from it.
 
-    Args:
-        cell: the configured cell.
-        rng: generator.
-        distance: from the base to the station, m.
+    `distance` is from the base to the station, m.
     """
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)

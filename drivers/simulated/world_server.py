@@ -47,11 +47,8 @@ _LATER = ("joint_coupling", "guide_error")
 def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
     """Write the world and the configuration of its cell; floats keep every bit.
 
-    Args:
-        path: the file to make; it appears whole or not at all.
-        world: the simulated world.
-        config: the configuration that `world.cell` was made from.
-        base_dir: directory that a robot's file path in it is relative to.
+    The file appears whole or not at all; `base_dir` is what a robot's path in `config` is relative
+    to.
 
     Raises:
         InputError: the configuration describes another cell than the world's.
@@ -131,7 +128,6 @@ def _listed(array: Floats) -> dict[str, Any]:
 
 
 def _array(data: dict[str, Any]) -> Floats:
-    """Return the array of `_listed`."""
     return np.array(data["values"], dtype=np.float64).reshape(data["shape"])
 
 

@@ -21,15 +21,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulatedMount:
-    """Where the force sensor sits: everything beyond it weighs on it.
+    """Where the force sensor sits: everything beyond it weighs on it."""
 
-    Attributes:
-        origin: (3,) of the sensor, flange axes, m.
-        axes: (3, 3) the sensor's axes in flange axes: maps sensor into flange components.
-    """
-
-    origin: Floats
-    axes: Floats
+    origin: Floats  # (3,) of the sensor, flange axes, m
+    axes: Floats  # (3, 3) the sensor's axes in flange axes: maps sensor into flange components
 
     @classmethod
     def of(cls, config: CellConfig) -> "SimulatedMount":
@@ -45,10 +40,8 @@ class SimulatedMount:
 
         f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
 
-        Args:
-            world: tool, load point (as it truly is) and gravity.
-            turn: (3, 3) true orientation of the flange, base axes.
-            wrench: (6,) of the load at its point, base axes, N and N·m.
+        Orientation `turn` (3, 3) of the flange and wrench (6,) of the load at its point are in
+        base axes.
         """
         cell = world.cell
         weight = cell.tool_mass * cell.gravity
@@ -72,17 +65,11 @@ _STRONGEST = 2000.0  # N and N·m that may push or swing
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Swing:
-    """A load that swings after it was hung, ever less.
+    """A load that swings after it was hung, ever less."""
 
-    Attributes:
-        wrench: (6,) in the beginning, base axes, N and N·m.
-        period: s.
-        decay: time constant, s.
-    """
-
-    wrench: Floats
-    period: float
-    decay: float
+    wrench: Floats  # (6,) in the beginning, base axes, N and N·m
+    period: float  # s
+    decay: float  # time constant, s
 
     def at(self, time: float) -> Floats:
         """Return the (6,) wrench so long after the load was hung, s."""
@@ -211,13 +198,8 @@ class WorldState:
 
         w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change.
 
-        Args:
-            wrench: (6,) at the start, base axes, N and N·m.
-            period: s of world time, over 0.
-            decay: s of world time, over 0.
-
-        Raises:
-            InputError: another number.
+        `wrench` (6,) is that at the start, base axes, N and N·m; period and decay are over 0, s of
+        world time.
         """
         start = _six("swing", wrench)
         if not (period > 0.0 and decay > 0.0):
@@ -326,11 +308,9 @@ class WorldState:
         return names.index(name) + 1
 
     def _name(self, number: int) -> str:
-        """Return the name of a load by number."""
         return self._loads[number - 1].name if number else "none"
 
     def _note(self, event: str) -> None:
-        """Remember an event."""
         self._log.append({"time": self._board.time, "event": event})
 
 

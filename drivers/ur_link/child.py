@@ -15,7 +15,7 @@ import select
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 _NICE = -10
@@ -24,9 +24,7 @@ _NICE = -10
 def end_with_parent(life: int, parent: int) -> None:
     """End this process when the parent ends; Ctrl-C is for the parent alone.
 
-    Args:
-        life: file descriptor of the reading end of the parent's pipe.
-        parent: the parent's process number.
+    `life` is the file descriptor of the reading end of the parent's pipe, `parent` its number.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGIO, signal.SIG_DFL)
@@ -87,6 +85,19 @@ class Line:
             self._socket.sendall(json.dumps({"number": number, **content}).encode() + b"\n")
         except OSError:
             os._exit(0)
+
+
+def answered(
+    line: Line, request: dict[str, Any], do: Callable[[dict[str, Any]], dict[str, Any]]
+) -> bool:
+    """Answer a request by what `do` returns, or by what it raises; whether it was carried out."""
+    try:
+        result = do(request)
+    except Exception as error:
+        line.answer(request["number"], error=words(error))
+        return False
+    line.answer(request["number"], **result)
+    return True
 
 
 def words(error: BaseException) -> str:

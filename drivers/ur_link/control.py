@@ -5,9 +5,9 @@ import time
 from dataclasses import dataclass
 
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.failure import CHECK_LINK, failure
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.reading import Receiver
+from hilcal.drivers.ur_link.states import CHECK_LINK, failure
 from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.types import Floats
@@ -26,15 +26,10 @@ _NO_COG = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Pulse:
-    """State of the control worker.
+    """State of the control worker."""
 
-    Attributes:
-        expired: the motion was stopped because its lease was not renewed.
-        late: the longest pause between two signs of life that was too long, s; 0 for none.
-    """
-
-    expired: bool
-    late: float
+    expired: bool  # the motion was stopped because its lease was not renewed
+    late: float  # the longest pause between two signs of life that was too long, s; 0 for none
 
 
 class Control:
@@ -169,7 +164,6 @@ def _no_program(host: str, receiver: Receiver, generation: Generation) -> None:
 
 
 def _wait_for(receiver: Receiver, wanted: tuple[int, ...], seconds: float) -> None:
-    """Wait until the robot's program is in one of the wanted states."""
     end = time.monotonic() + seconds
     while (runtime := receiver.read().runtime) not in wanted:
         if time.monotonic() > end:

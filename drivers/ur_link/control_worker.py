@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 from hilcal.drivers.ur_link import relay
-from hilcal.drivers.ur_link.child import Line, outliving, start, words
+from hilcal.drivers.ur_link.child import Line, answered, outliving, start, words
 
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0
@@ -88,15 +88,8 @@ def serve(line: Line, control: ControlInterface) -> None:
     """Answer requests and kick the watchdog, until `bye` or the end of the parent."""
     while True:
         request = line.next(control.due)
-        if request is not None:
-            try:
-                result = control.do(request)
-            except Exception as error:
-                line.answer(request["number"], error=words(error))
-            else:
-                line.answer(request["number"], **result)
-                if request["op"] == "bye":
-                    os._exit(0)  # the library's own end takes another 0.5 s
+        if request is not None and answered(line, request, control.do) and request["op"] == "bye":
+            os._exit(0)  # the library's own end takes another 0.5 s
         control.kick()
 
 

@@ -3,7 +3,6 @@
 import contextlib
 import socket
 import time
-from types import TracebackType
 from typing import Self
 
 
@@ -21,16 +20,13 @@ class LinkError(Exception):
 
 
 class Connection:
-    """An open connection; every call ends before the deadline, given at the opening at first."""
+    """An open connection; every call ends before the deadline, given at the opening at first.
+
+    Where the connection broke or the deadline passed a call raises LinkError.
+    """
 
     def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
-        """Connect.
-
-        Args:
-            host: address or name.
-            port: TCP port.
-            what: name of the service, for messages.
-            seconds: from now until everything on this connection has to be done.
+        """Connect to the service `what`; all of it has to be done within so many seconds.
 
         Raises:
             LinkError: nobody answers.
@@ -55,11 +51,7 @@ class Connection:
         self._seconds, self._end = seconds, time.monotonic() + seconds
 
     def send(self, data: bytes) -> None:
-        """Send everything.
-
-        Raises:
-            LinkError: the connection broke or the deadline passed.
-        """
+        """Send everything."""
         try:
             self._socket.settimeout(self._left())
             self._socket.sendall(data)
@@ -69,22 +61,14 @@ class Connection:
             raise LinkError(f"the {self._where}: {error.strerror or error}") from None
 
     def read(self, count: int) -> bytes:
-        """Return exactly so many bytes.
-
-        Raises:
-            LinkError: the connection broke or the deadline passed.
-        """
+        """Return exactly so many bytes."""
         while len(self._buffer) < count:
             self._more()
         out, self._buffer = self._buffer[:count], self._buffer[count:]
         return out
 
     def read_line(self) -> str:
-        """Return the next line without its end.
-
-        Raises:
-            LinkError: the connection broke or the deadline passed.
-        """
+        """Return the next line without its end."""
         while b"\n" not in self._buffer:
             if len(self._buffer) > 65536:
                 raise LinkError(f"the {self._where} sends something else than lines")
@@ -106,12 +90,7 @@ class Connection:
         """Return the open connection."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """End the connection."""
         self.close()
 

@@ -5,6 +5,7 @@ import time
 import numpy as np
 
 from hilcal.drivers.ur_link.reading import Reading
+from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
 STANDS_RAD_S = 0.01
@@ -18,16 +19,6 @@ SLOWEST = 0.02
 _TARGET_RAD = 1e-5
 _BRAKE_S = 0.15
 _BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
-
-
-def duration(distance: float, speed: float, acceleration: float) -> float:
-    """Return the time of a motion from rest to rest with a trapezoid of speed, s.
-
-    d / v + v / a where the full speed is reached, else 2 sqrt(d / a).
-    """
-    if distance * acceleration >= speed * speed:
-        return distance / speed + speed / acceleration
-    return 2.0 * float(np.sqrt(distance / acceleration))
 
 
 def deceleration(speed: float) -> float:
@@ -56,20 +47,14 @@ class MotionInProgress:
         arrival: float,
         clock: float,
     ) -> None:
-        """Begin.
+        """Begin, from `start` to `goal` (6,), rad.
 
-        Args:
-            start: (6,) joint angles at its start, rad.
-            goal: (6,) at its end, rad.
-            speed: of the leading joint, rad/s.
-            acceleration: of the leading joint, rad/s².
-            arrival: the largest joint error at its end, rad.
-            clock: cell seconds per real second.
+        Speed and acceleration are of the leading joint, rad/s and rad/s²; `arrival` is the largest
+        joint error at its end, rad; `clock` cell seconds per real second.
         """
         self.brake = deceleration(speed)
         self._goal, self._arrival = goal, arrival
-        distance = float(np.abs(goal - start).max())
-        self._usual = duration(distance, speed, acceleration) / clock
+        self._usual = duration(start, goal, speed, acceleration) / clock
         self._spent = 0.0
         self._looked = time.monotonic()
         self._paused: float | None = None

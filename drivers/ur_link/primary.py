@@ -43,7 +43,6 @@ def kinematics(host: str, seconds: float) -> FactoryKinematics:
 
 
 def _find(body: bytes) -> bytes | None:
-    """Return the part of the kinematics of a robot state."""
     at = 0
     while at + _HEAD.size <= len(body):
         size, kind = _HEAD.unpack_from(body, at)

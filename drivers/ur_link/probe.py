@@ -2,7 +2,8 @@
 
 The library waits for ever, and with the interpreter locked, for a controller that is mute; and
 an output that the controller does not have shifts all later fields without a word. So both are
-found out here first, with a deadline. Frames: big-endian size (u16, header included), type
+found out here first, with a deadline; each question raises LinkError where nobody answers as a
+controller does. Frames: big-endian size (u16, header included), type
 (u8), body. Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", protocol 2.
 """
 
@@ -21,23 +22,14 @@ _STREAM_HZ = 125.0
 
 @dataclass(frozen=True, slots=True)
 class ControllerFacts:
-    """Version and outputs of a controller.
+    """Version and outputs of a controller."""
 
-    Attributes:
-        version: major, minor, bugfix, build.
-        outputs: those of the wanted outputs that it has.
-    """
-
-    version: tuple[int, ...]
-    outputs: tuple[str, ...]
+    version: tuple[int, ...]  # major, minor, bugfix, build
+    outputs: tuple[str, ...]  # those of the wanted outputs that it has
 
 
 def controller(host: str, outputs: tuple[str, ...], seconds: float) -> ControllerFacts:
-    """Return the controller's version, and which of `outputs` it has.
-
-    Raises:
-        LinkError: nobody answers, or not as a controller does.
-    """
+    """Return the controller's version, and which of `outputs` it has."""
     with Connection(host, PORT, "RTDE server", seconds) as line:
         _hello(line)
         line.send(_frame("v"))
@@ -51,21 +43,13 @@ def controller(host: str, outputs: tuple[str, ...], seconds: float) -> Controlle
 
 
 def check_stream(host: str, seconds: float) -> None:
-    """Ask for one packet of data.
-
-    Raises:
-        LinkError: nobody answers, or no data come.
-    """
+    """Ask for one packet of data."""
     with stream(host, _STREAM_HZ, ("timestamp",), seconds) as line:
         packet(line)
 
 
 def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Connection:
-    """Return a connection on which packets of outputs, which the controller has, come.
-
-    Raises:
-        LinkError: nobody answers, or not as a controller does.
-    """
+    """Return a connection on which packets of outputs, which the controller has, come."""
     line = Connection(host, PORT, "RTDE server", seconds)
     try:
         _hello(line)
@@ -80,20 +64,12 @@ def stream(host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> Co
 
 
 def packet(line: Connection) -> bytes:
-    """Return the next packet of a stream: the number of the recipe (u8) and the outputs.
-
-    Raises:
-        LinkError: none comes before the connection's deadline.
-    """
+    """Return the next packet of a stream: the number of the recipe (u8) and the outputs."""
     return _reply(line, "U", None)
 
 
 def in_use(host: str, inputs: tuple[str, ...], seconds: float) -> bool:
-    """Whether somebody else holds one of the input registers that commands travel in.
-
-    Raises:
-        LinkError: nobody answers, or not as a controller does.
-    """
+    """Whether somebody else holds one of the input registers that commands travel in."""
     with Connection(host, PORT, "RTDE server", seconds) as line:
         _hello(line)
         line.send(_frame("I", ",".join(inputs).encode()))

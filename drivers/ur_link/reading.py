@@ -1,13 +1,16 @@
-"""One packet of the controller's state, checked."""
+"""The state of the arm: packets from the receive worker, each checked."""
 
 import math
+import time
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.ur_link import states
+from hilcal.drivers.ur_link import probe, states
+from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.receive_worker import GETTERS
+from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.devices import ArmSample
 from hilcal.types import Floats
 
@@ -43,6 +46,12 @@ LARGEST = {
 A, °C, m, N, kg); choices, ten times and more beyond the largest of them. A packet that a fault on
 the way has changed is as a rule far outside."""
 
+STALE_S = 0.2
+"""In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
+PATIENCE_S = 0.8
+"""At rest, new data are waited for so long, real s."""
+_ANSWER_S = 0.3
+
 
 class ReadingError(Exception):
     """The packet cannot be what the controller sent."""
@@ -50,19 +59,12 @@ class ReadingError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reading:
-    """The sample for the run, and what the driver itself looks at.
+    """The sample for the run, and what the driver itself looks at."""
 
-    Attributes:
-        sample: the arm's state.
-        mode: robot mode, 7 is running.
-        runtime: state of the robot's program, 2 is playing.
-        safety_bits: the safety state as bits.
-    """
-
-    sample: ArmSample
-    mode: int
-    runtime: int
-    safety_bits: int
+    sample: ArmSample  # the arm's state
+    mode: int  # robot mode, 7 is running
+    runtime: int  # state of the robot's program, 2 is playing
+    safety_bits: int  # the safety state as bits
 
 
 def read(answer: dict[str, Any]) -> Reading:
@@ -108,3 +110,55 @@ def read(answer: dict[str, Any]) -> Reading:
         safety=states.safety_word(bits),
     )
     return Reading(sample, int(fields["robot_mode"]), int(fields["runtime_state"]), bits)
+
+
+class Receiver:
+    """Reads the arm's state; each reading is newer than the call for it."""
+
+    def __init__(self, host: str, hz: float, outputs: tuple[str, ...], seconds: float) -> None:
+        """Connect within a deadline; each call raises LinkError where no new data come."""
+        self._host = host
+        self._arguments = (host, repr(hz), ",".join(outputs))
+        self._worker = self._start(seconds)
+
+    @property
+    def pid(self) -> int:
+        """Number of the worker's process."""
+        return self._worker.pid
+
+    def read(self, stale: float = PATIENCE_S) -> Reading:
+        """Return the next packet, which is newer than the call, within `stale` real s."""
+        try:
+            return read(self._worker.call("sample", stale + _ANSWER_S, stale=stale))
+        except WorkerError as error:
+            how = "the process that receives over RTDE: " if error.lost else ""
+            raise LinkError(f"{how}{error}") from None
+        except ReadingError as error:
+            raise LinkError(f"the RTDE data are damaged: {error}") from None
+
+    def rate(self, seconds: float) -> float:
+        """Return the packets per second over a while."""
+        try:
+            deadline = seconds + PATIENCE_S + _ANSWER_S
+            answer = self._worker.call("rate", deadline, window=seconds, stale=PATIENCE_S)
+            return float(answer["rate"])
+        except WorkerError as error:
+            raise LinkError(str(error)) from None
+
+    def renew(self, seconds: float) -> None:
+        """Connect again, in a new process."""
+        begun = time.monotonic()
+        self._worker.kill()
+        # It shows much earlier than the library does that no data come.
+        probe.check_stream(self._host, min(seconds, 0.25))
+        self._worker = self._start(seconds - (time.monotonic() - begun))
+
+    def close(self) -> None:
+        """End the process; may be called twice."""
+        self._worker.kill()
+
+    def _start(self, seconds: float) -> Worker:
+        try:
+            return Worker("hilcal.drivers.ur_link.receive_worker", self._arguments, seconds)
+        except WorkerError as error:
+            raise LinkError(f"no data over RTDE: {error}") from None

@@ -8,7 +8,7 @@ its getters go on with the last values for ever; that it calls itself disconnect
 import time
 from typing import Any
 
-from hilcal.drivers.ur_link.child import start, words
+from hilcal.drivers.ur_link.child import answered, start, words
 
 GETTERS = {
     "timestamp": "getTimestamp",
@@ -69,7 +69,6 @@ def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
 
 
 def _rate(link: Any, seconds: float, stale: float) -> dict[str, Any]:
-    """Count the packets of a while."""
     count, begun = 0, time.monotonic()
     while time.monotonic() - begun < seconds:
         _next_stamp(link, stale)
@@ -92,19 +91,16 @@ def main() -> None:
         line.answer(0, error=words(error))
         return
     line.answer(0)
+
+    def do(request: dict[str, Any]) -> dict[str, Any]:
+        if request["op"] == "sample":
+            return _sample(link, names, request["stale"])
+        return _rate(link, request["window"], request["stale"])
+
     while True:
         request = line.next(1.0)
-        if request is None:
-            continue
-        try:
-            if request["op"] == "sample":
-                result = _sample(link, names, request["stale"])
-            else:
-                result = _rate(link, request["window"], request["stale"])
-        except Exception as error:
-            line.answer(request["number"], error=words(error))
-        else:
-            line.answer(request["number"], **result)
+        if request is not None:
+            answered(line, request, do)
 
 
 if __name__ == "__main__":

@@ -32,9 +32,6 @@ def start(host: str) -> tuple[subprocess.Popen[str], str]:
     """Start a relay to a controller; return the process and the address to use.
 
     The process ends when its standard input is closed, as when this process ends.
-
-    Raises:
-        LinkError: it did not get ready.
     """
     process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
         [sys.executable, "-P", "-m", "hilcal.drivers.ur_link.relay", host],

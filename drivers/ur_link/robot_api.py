@@ -25,15 +25,11 @@ _ABSENT = 404
 
 @dataclass(frozen=True, slots=True)
 class RobotApi:
-    """The Robot API at an address; every call raises LinkError where it fails, in time.
-
-    Attributes:
-        host: address of the controller.
-        port: of its web server, 80 on a real one.
-    """
+    """The Robot API at an address; every call raises LinkError where it fails, in time."""
 
     host: str
     port: int
+    """Of the controller's web server, 80 on a real one."""
 
     @property
     def name(self) -> str:
@@ -41,60 +37,40 @@ class RobotApi:
         return f"Robot API (port {self.port})"
 
     def check(self, seconds: float) -> None:
-        """Ask whether it is there.
-
-        Raises:
-            LinkError: it is not, or does not answer in time.
-        """
+        """Ask whether it is there."""
         status, _ = self._ask("GET", "/openapi.json", time.monotonic() + seconds)
         if status == _ABSENT:
             raise LinkError(f"the {self.name} is not there; it needs PolyScope X 10.11 or newer")
         self._done(status, {}, "openapi.json")
 
     def describe(self, seconds: float) -> RobotFacts:
-        """Ask for everything worth knowing; what the version does not tell is empty.
-
-        Raises:
-            LinkError: no Robot API, or it does not answer in time.
-        """
+        """Ask for everything worth knowing; what the version does not tell is empty."""
         end = time.monotonic() + seconds
         about = self._get("/system/v1/information", end)
-        remote = self._get("/system/v1/controlmode", end).get("mode")
         return RobotFacts(
             model=_text(about, "robotType"),
             serial=_text(about, "serialNumber"),
             version=_text(self._get("/versions/v1", end), "marketingVersion"),
-            mode=_text(self._get("/robotstate/v1/robotmode", end), "mode"),
-            safety=_text(self._get("/robotstate/v1/safetymode", end), "mode"),
-            remote=None if remote is None else remote == "REMOTE",
+            remote=self._remote(end),
             program=_text(self._get("/program/v1/state", end), "state"),
         )
 
     def in_remote_control(self, seconds: float) -> bool | None:
-        """Whether programs may command the arm; None where the version does not tell (10.11).
-
-        Raises:
-            LinkError: no Robot API, or it does not answer in time.
-        """
-        told = self._get("/system/v1/controlmode", time.monotonic() + seconds).get("mode")
-        return None if told is None else told == "REMOTE"
+        """Whether programs may command the arm; None where the version does not tell (10.11)."""
+        return self._remote(time.monotonic() + seconds)
 
     def stop(self, seconds: float) -> None:
-        """Stop the robot's program, and with it the arm.
-
-        Raises:
-            LinkError: no Robot API, it does not answer in time, or it refuses.
-        """
+        """Stop the robot's program, and with it the arm."""
         self.order("/program/v1/state", "stop", seconds)
 
     def order(self, path: str, action: str, seconds: float) -> None:
-        """Give an order, e.g. `/robotstate/v1/state` the action `POWER_ON`.
-
-        Raises:
-            LinkError: no Robot API, it does not answer in time, or it refuses.
-        """
+        """Give an order, e.g. `/robotstate/v1/state` the action `POWER_ON`."""
         status, told = self._ask("PUT", path, time.monotonic() + seconds, {"action": action})
         self._done(status, told, action)
+
+    def _remote(self, end: float) -> bool | None:
+        mode = self._get("/system/v1/controlmode", end).get("mode")
+        return None if mode is None else bool(mode == "REMOTE")
 
     def _get(self, path: str, end: float) -> dict[str, Any]:
         """Return an answer; nothing where the version does not have the path."""

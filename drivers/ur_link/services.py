@@ -1,15 +1,29 @@
-"""What the driver needs of a UR controller, by TCP port."""
+"""What the driver `ur` needs: keys of [robot.options], and services of the controller."""
+
+from typing import Annotated
+
+from pydantic import Field, Strict
 
 from hilcal.config import CellConfig
-from hilcal.drivers.ur_link import dashboard, probe, script_port
+from hilcal.drivers.ur_link import dashboard, probe
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.options import UrOptions
-from hilcal.drivers.ur_link.supervision import POLYSCOPE_X, PRIMARY_PORT
-from hilcal.toml import check_section
+from hilcal.drivers.ur_link.supervision import POLYSCOPE_X, PRIMARY_PORT, REALTIME_PORT
+from hilcal.toml import Section, check_section
 
 RTDE = {probe.PORT: "real-time interface (RTDE)"}
-SERVICES = {dashboard.PORT: "dashboard server", script_port.PORT: "script port", **RTDE}
+SERVICES = {dashboard.PORT: "dashboard server", REALTIME_PORT: "script port", **RTDE}
 _ASK_S = 2.0
+
+
+class UrOptions(Section):
+    """[robot.options]: keys of the driver "ur"."""
+
+    receive_hz: Annotated[float, Strict(), Field(ge=10, le=500)] = Field(
+        125.0, description="packets of state per second, 10 to 500"
+    )
+    robot_api_port: Annotated[int, Strict(), Field(ge=1, le=65535)] = Field(
+        80, description="number of the TCP port of PolyScope X's Robot API, 1 to 65535"
+    )
 
 
 def services(config: CellConfig) -> dict[int, str]:

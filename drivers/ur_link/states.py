@@ -3,6 +3,13 @@
 Source: Universal Robots, "Real-Time Data Exchange (RTDE) Guide", controller output fields.
 """
 
+from hilcal.errors import DeviceError
+
+RESUME = "then run again with --resume"
+CHECK_LINK = f"check the controller and the network cable, {RESUME}"
+CONTROL = "control has to be taken first"
+HOLD_ON = "NOT SURE THAT THE ARM STANDS: press the emergency stop if it moves"
+
 ROBOT_MODES = {
     -1: "no controller",
     0: "disconnected",
@@ -59,3 +66,8 @@ def runtime_word(state: int) -> str:
 def version_word(version: tuple[int, ...]) -> str:
     """Return a controller version as people write it."""
     return ".".join(map(str, version))
+
+
+def failure(host: str, cause: str, advice: str = "") -> DeviceError:
+    """Return the error of a failure of the arm: which arm, what happened, what to do."""
+    return DeviceError(f"arm at {host}: {cause}" + (f"; {advice}" if advice else ""))

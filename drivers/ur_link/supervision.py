@@ -5,9 +5,8 @@ the same. They differ, too, in where programs go and in the registers that a cli
 """
 
 from dataclasses import dataclass
-from typing import Protocol
 
-from hilcal.drivers.ur_link.dashboard import Dashboard, RobotFacts
+from hilcal.drivers.ur_link.dashboard import Dashboard
 from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.robot_api import RobotApi
 
@@ -16,46 +15,19 @@ POLYSCOPE_X = 10
 REALTIME_PORT, PRIMARY_PORT = 30003, 30001
 
 
-class Supervision(Protocol):
-    """A dashboard server or Robot API; every call raises LinkError where it fails, in time."""
-
-    @property
-    def name(self) -> str:
-        """What it is, for people."""
-        ...
-
-    def check(self, seconds: float) -> None:
-        """Ask for a sign of life."""
-        ...
-
-    def describe(self, seconds: float) -> RobotFacts:
-        """Ask for everything worth knowing."""
-        ...
-
-    def in_remote_control(self, seconds: float) -> bool | None:
-        """Whether programs may command the arm; None where the controller does not say."""
-        ...
-
-    def stop(self, seconds: float) -> None:
-        """Stop the robot's program, and with it the arm."""
-        ...
+Supervision = Dashboard | RobotApi
 
 
 @dataclass(frozen=True, slots=True)
 class Generation:
-    """How a controller of one generation is supervised and commanded.
-
-    Attributes:
-        supervision: its dashboard server or Robot API.
-        script_port: takes programs: the real-time port, of PolyScope X the primary one.
-        upper: whether commands go by the upper half of the registers (24 to 47), which no fieldbus
-            uses. ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any
-            newer one, where the flag for the upper half would leave program and client apart.
-    """
+    """How a controller of one generation is supervised and commanded."""
 
     supervision: Supervision
-    script_port: int
+    script_port: int  # takes programs: the real-time port, of PolyScope X the primary one
     upper: bool
+    """Whether commands go by the upper half of the registers (24 to 47), which no fieldbus uses.
+    ur_rtde 1.6.5 takes them up to PolyScope 5.22 only, and the lower half on any newer one, where
+    the flag for the upper half would leave program and client apart."""
 
     @property
     def registers(self) -> tuple[str, str]:

@@ -8,8 +8,7 @@ from hilcal.drivers.ur_link import primary, states
 from hilcal.drivers.ur_link.dashboard import RobotFacts
 from hilcal.drivers.ur_link.lines import LinkError
 from hilcal.drivers.ur_link.probe import ControllerFacts
-from hilcal.drivers.ur_link.reading import Reading
-from hilcal.drivers.ur_link.receiver import Receiver
+from hilcal.drivers.ur_link.reading import Reading, Receiver
 from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.measuring.devices import Report
 
@@ -32,15 +31,8 @@ def survey(
 ) -> Report:
     """Ask everything that can be asked without moving.
 
-    Args:
-        host: address of the controller.
-        model: [robot] model of the configuration.
-        hz: packets per second that were asked for.
-        controller: what it said at the opening.
-        receiver: its state.
-        supervision: its dashboard server or Robot API.
-        silent: why that does not answer; empty where it does.
-        needs_primary: whether programs go by the primary port.
+    `silent` is why the supervision does not answer, empty where it does; `needs_primary` tells
+    whether programs go by the primary port.
     """
     version = states.version_word(controller.version)
     facts = [("address", host), ("controller version", version)]
@@ -94,13 +86,9 @@ def survey(
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:
-    """Packets per second, counted again for longer where they are few.
+    """Packets per second of the `hz` that were asked for; counted again for longer where few.
 
     A computer that was busy for some tenths of a second is no broken network.
-
-    Args:
-        count: packets per second, from those of the next seconds.
-        hz: how many were asked for.
     """
     rate = count(_RATE_S[0])
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])

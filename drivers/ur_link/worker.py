@@ -16,6 +16,12 @@ from typing import Any
 _ROOT = Path(__file__).resolve().parents[2]
 
 
+def environment() -> dict[str, str]:
+    """Return the environment of a child process that has to import this very program."""
+    path = os.environ.get("PYTHONPATH")
+    return {**os.environ, "PYTHONPATH": f"{_ROOT}{os.pathsep}{path}" if path else str(_ROOT)}
+
+
 class WorkerError(Exception):
     """A worker did not carry out a request; the text gives the reason.
 
@@ -37,12 +43,7 @@ class Worker:
     """
 
     def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
-        """Start the process and wait until it reports that it is ready.
-
-        Args:
-            module: name of the module to run.
-            arguments: for its command line.
-            seconds: deadline.
+        """Start the process and wait until it reports that it is ready, for so many seconds.
 
         Raises:
             WorkerError: it did not get ready; it is gone.
@@ -52,11 +53,6 @@ class Worker:
         self._buffer = b""
         self._socket, theirs = socket.socketpair()
         life, self._life = os.pipe()
-        path = os.environ.get("PYTHONPATH")
-        environment = {
-            **os.environ,
-            "PYTHONPATH": str(_ROOT) if not path else f"{_ROOT}{os.pathsep}{path}",
-        }
         try:
             self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
                 [sys.executable, "-P", "-m", module, str(life), str(os.getpid()), *arguments],
@@ -64,7 +60,7 @@ class Worker:
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
                 pass_fds=(life,),
-                env=environment,
+                env=environment(),
             )
         except OSError as error:
             self._let_go()
@@ -138,7 +134,6 @@ class Worker:
             return answer
 
     def _dead(self) -> WorkerError:
-        """Describe the end of a process whose line is closed."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(0.5)
         self.kill()

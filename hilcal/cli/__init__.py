@@ -47,14 +47,7 @@ def application(
     group: type[CommandGroup] = CommandGroup,
     completion: bool = False,
 ) -> typer.Typer:
-    """Return an empty application.
-
-    Args:
-        help_text: what it is for.
-        alone: whether it does something without a command.
-        group: lists its commands in the help.
-        completion: whether it completes words in a shell.
-    """
+    """Return an empty application; with `alone` it does something without a command."""
     return typer.Typer(
         cls=group,
         add_completion=completion,
@@ -113,7 +106,6 @@ def _loading(name: str) -> Iterator[None]:
 
 
 def _group(command: Command) -> typer.Typer:
-    """Return a command that has commands of its own."""
     app = application(command.summary, alone=bool(command.place))
     for name, place in command.subcommands:
         app.command(name)(load(place))
@@ -161,11 +153,7 @@ def execute(make: Callable[[], typer.Typer], name: str, arguments: Sequence[str]
 
     Wrong input and failures are one line on stderr; HILCAL_DEBUG=1 shows where they came from.
     With --json the error is a JSON document on stdout, too, unless the command has printed one.
-
-    Args:
-        make: returns the application; what it raises is reported like what a command raises.
-        name: of the program.
-        arguments: of the command line.
+    What `make` raises is reported like what a command raises.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

@@ -186,11 +186,6 @@ def _asked(
     poses: int | None,
     validation: int | None,
 ) -> dict[str, Any]:
-    """Return the settings that options give.
-
-    Raises:
-        InputError: no length, no duration, or no number of poses.
-    """
     for name, count in (("--poses", poses), ("--validation", validation)):
         if count is not None and count < 1:
             raise InputError(f"{name} {count}; valid: a whole number from 1")
@@ -206,17 +201,11 @@ def _asked(
 
 @dataclass(frozen=True, slots=True)
 class _Continuation:
-    """How an interrupted calibration is continued, for people.
-
-    Attributes:
-        t: where people are told.
-        on: the command that goes on.
-        again: the command that begins.
-    """
+    """How an interrupted calibration is continued, for people."""
 
     t: Terminal
-    on: str
-    again: str
+    on: str  # the command that goes on
+    again: str  # the command that begins
 
     @contextmanager
     def how_to_go_on(self, p: Procedure) -> Iterator[None]:
@@ -250,11 +239,7 @@ def _procedure(
     asked: dict[str, Any],
     told: _Continuation,
 ) -> Procedure:
-    """Begin a calibration, or take it up from its file.
-
-    Raises:
-        InputError: the file is there and nobody asked to resume, or it is of something else.
-    """
+    """Begin a calibration, or take it up from its file."""
     hide = (config.simulation.hide or NOTHING) if rehearse else None
     base_dir = path.absolute().parent
     if rehearse:
@@ -289,11 +274,7 @@ def _procedure(
 
 
 def _refuse_goal(kind: Mode, asked: dict[str, Any], cell: Path) -> None:
-    """Refuse a goal that the readings do not show.
-
-    Raises:
-        InputError: a goal, and deflections are fitted.
-    """
+    """Refuse a goal that the readings do not show."""
     if kind == "deflection" and "goal_m" in asked:
         raise InputError(
             "--goal is an error of the position, which deflections do not show: a calibration with "
@@ -302,7 +283,6 @@ def _refuse_goal(kind: Mode, asked: dict[str, Any], cell: Path) -> None:
 
 
 def _document(p: Procedure) -> dict[str, object]:
-    """Return what the files hold of a calibration, for JSON."""
     with CampaignFile.open(p.run, read_only=True) as campaign:
         log, run = ProcedureLog(campaign), RunLog(campaign)
         refined, validated = log.last(REFINED) or {}, log.last(VALIDATED) or {}
@@ -356,7 +336,6 @@ class CalibrationOperator:
                 self._computing(step)
 
     def _moving(self, step: ProcedureStep) -> None:
-        """Ask, and measure what is missing of a plan."""
         self._check()
         if not self._yes and somebody_there(self._t):
             what = "The simulated arm will move." if self._rehearse else "The arm will move."
@@ -427,7 +406,6 @@ class CalibrationOperator:
 
 
 def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
-    """Show the revisions and the verdict."""
     with CampaignFile.open(p.run, read_only=True) as campaign:
         refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
     rows = rows_of(refined["revisions"], found.steps)

@@ -10,17 +10,12 @@ from typer.core import TyperGroup
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A command by the place of its function, which is imported when the command is used.
+    """A command by the place of its function, which is imported when the command is used."""
 
-    Attributes:
-        place: "module:function" in `hilcal.cli`; empty for a group that does nothing by itself.
-        summary: first line of the function's docstring, for the list of commands.
-        subcommands: "module:function" by name; with any, the command is a group.
-    """
-
-    place: str
-    summary: str
+    place: str  # "module:function" in `hilcal.cli`; empty for a group that does nothing by itself
+    summary: str  # first line of the function's docstring, for the list of commands
     subcommands: tuple[tuple[str, str], ...] = ()
+    """"module:function" by name; with any, the command is a group."""
 
 
 def load(place: str) -> Callable[..., Any]:

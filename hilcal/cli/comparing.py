@@ -85,7 +85,6 @@ def compare(
 
 
 def _one(t: Terminal, run: Path, revision: int | None, catalogue: Catalogue) -> None:
-    """Show where the model fails on its own readings."""
     with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
         number, found = fit_of(t, o, say, revision)
         o.require_gc(number, found.scaling, "comparing")

@@ -59,21 +59,14 @@ NAMED = 5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Task:
-    """What is to be compensated.
+    """What is to be compensated."""
 
-    Attributes:
-        points: the points.
-        tool: (4, 4) T_flange_tool; the tracked target where None.
-        program: text of the program that the points are of.
-        waypoints: of that program, those that are left too.
-        other: a program of another maker than UR, in place of the two.
-    """
-
-    points: Points
-    tool: Floats | None
-    program: str | None = None
-    waypoints: tuple[Waypoint, ...] = ()
+    points: Points  # the points
+    tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
+    program: str | None = None  # text of the program that the points are of
+    waypoints: tuple[Waypoint, ...] = ()  # of that program, those that are left too
     other: UnderstoodProgram | None = None
+    """A program of another maker than UR, in place of the two."""
 
 
 def compensate(
@@ -212,11 +205,6 @@ def _say_written(t: Terminal, paths: list[Path]) -> None:
 
 
 def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
-    """Return the calibration of a campaign, or of a file.
-
-    Raises:
-        InputError: the campaign has no revision; or the file is none of both.
-    """
     if path.suffix == ".json":
         if revision is not None:
             raise InputError(f"{path}: a calibration has no revisions; leave out --revision")
@@ -234,11 +222,6 @@ def _task(
     leave: bool,
     kind: str,
 ) -> _Task:
-    """Read what is to be compensated.
-
-    Raises:
-        InputError: an unknown kind of file, or one that cannot be used.
-    """
     arm = calibration.model.cell.arm
     given = None
     if tool is not None:
@@ -289,11 +272,7 @@ def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
 def _wrench(
     points: Points, calibration: Calibration, load: str | None, wrench: str | None
 ) -> Floats | None:
-    """(6,) or (N, 6) wrench at the points.
-
-    Raises:
-        InputError: it is given twice, or the load is not known.
-    """
+    """(6,) or (N, 6) wrench at the points."""
     given = [x for x in (load, wrench, points.wrench, points.sensed) if x is not None]
     if len(given) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
@@ -308,11 +287,6 @@ def _wrench(
 
 
 def _numbers(written: str, count: int, option: str) -> Floats:
-    """Return the numbers of an option.
-
-    Raises:
-        InputError: another count, or no numbers.
-    """
     try:
         values = np.array([float(word) for word in written.replace(",", " ").split()])
     except ValueError:
@@ -323,17 +297,11 @@ def _numbers(written: str, count: int, option: str) -> Floats:
 
 
 def _unreachable(found: Compensation) -> Bools:
-    """(N,) points at which the arm cannot be put."""
     return np.asarray(~found.inverse.solved | found.singular | found.limits.any(axis=1))
 
 
 def _refuse(path: Path, names: tuple[str, ...], refused: list[str], wrong: Bools) -> None:
-    """Refuse the whole table where points are refused.
-
-    Raises:
-        CannotAnswerError: points lie outside of what was measured.
-        InputError: points cannot be reached, or on more than one branch.
-    """
+    """Refuse the whole table where points are refused."""
     bad = [k for k, why in enumerate(refused) if why]
     if not bad:
         return
@@ -364,11 +332,7 @@ def _write(
     document: dict[str, object],
     units: Sequence[str],
 ) -> list[Path]:
-    """Write the joint values as the file's name asks; returns the files.
-
-    Raises:
-        InputError: it cannot be written, or the arm is none of UR's.
-    """
+    """Write the joint values as the file's name asks; returns the files."""
     names, n = task.points.names, found.q.shape[1]
     if task.other is not None and path.suffix.lower() in READERS:
         files = {path.with_suffix(k): v for k, v in task.other.corrected(found.q).items()}
@@ -391,7 +355,6 @@ def _write(
 
 
 def _csv(names: tuple[str, ...], found: Compensation, units: Sequence[str]) -> str:
-    """Return the table of points, with what is expected of them."""
     out = io.StringIO()
     rows = csv.writer(out, lineterminator="\n")
     rows.writerow(["pose", *joint_columns(units), "before_m", "std_m", "band_m"])

@@ -73,8 +73,8 @@ from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report
 from hilcal.present.progress import Say, working
 from hilcal.present.verdict import message
+from hilcal.procedure.next_plan import plan_of
 from hilcal.procedure.procedure import Measure, Procedure
-from hilcal.procedure.separate import plan_of
 from hilcal.procedure.state import Files, Settings
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
@@ -107,22 +107,13 @@ SHARE = 0.8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Doubted:
-    """A first diagnosis, and the plan that would settle it.
-
-    Attributes:
-        fit: to the first readings.
-        diagnosis: of it.
-        hashed: hash of these readings.
-        readings: how many they are.
-        plan: the measurements that separate the suspects; None where nothing is in doubt.
-        document: for JSON.
-    """
+    """A first diagnosis, and the plan that would settle it."""
 
     fit: Fit
     diagnosis: Diagnosis
-    hashed: str
+    hashed: str  # hash of these readings
     readings: int
-    plan: Plan | None
+    plan: Plan | None  # the measurements that separate the suspects; None where nothing is in doubt
     document: dict[str, object]
 
 
@@ -131,19 +122,13 @@ def doubtful_case(
 ) -> tuple[RehearsalSettings, Plan, bool]:
     """Draw an effect to hide and a small campaign that leaves it in doubt.
 
-    Both come from the seed. A case counts when for each of `DRAWS` draws of the noise a rival
-    explains the readings about as well as the hidden effect, and when the diagnosis of the first
-    draw names both, and says that more readings would separate them.
+    Both come from the seed; another `number` is another case. The effect is one of those that are
+    hard to separate where None is given. A case counts when for each of `DRAWS` draws of the noise
+    a rival explains the readings about as well as the hidden effect, and when the diagnosis of the
+    first draw names both, and says that more readings would separate them.
 
-    Args:
-        told: what the rehearsal is of.
-        hide: the effect to hide; one of those that are hard to separate where None.
-        say: takes progress, one line each.
-        number: of the case; another number is another case.
-
-    Returns:
-        The settings with the effect and the seed of this case, the plan of its first campaign, and
-        whether that leaves a doubt; it is the last case where none of `TRIES` does.
+    Returned are the settings with the effect and the seed of this case, the plan of its first
+    campaign, and whether that leaves a doubt; it is the last case where none of `TRIES` does.
     """
     loads = told.config.loads[1::2] or told.config.loads
     quick = {"candidates": min(told.config.planning.candidates, CANDIDATES), "against": ()}
@@ -194,13 +179,7 @@ def doubted(
 ) -> Doubted:
     """Diagnose a first campaign, and plan what separates the suspects where that is in doubt.
 
-    Args:
-        t: where it is told.
-        r: the first campaign.
-        seed: of the candidates.
-        first: its plan.
-        poses: as asked for, see `SHARE`.
-        catalogue: the effects that a model can have.
+    `poses` is as asked for, see `SHARE`.
     """
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
@@ -452,7 +431,6 @@ def _law_name(output: Path) -> str:
 
 
 def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:
-    """Whether the invented law was found, and that in words."""
     own = r.world.own
     if own is None:
         return False, "Nothing was hidden."
@@ -471,7 +449,6 @@ def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, 
 
 
 def _judge(r: Rehearsal, found: Refinement) -> tuple[bool, str]:
-    """Whether the hidden effect was found, and that in words."""
     added = [s.added for s in found.steps if s.added]
     if r.hidden == NOTHING:
         if not added and found.verdict == "adequate":

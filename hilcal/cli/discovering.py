@@ -109,11 +109,7 @@ def discover(
 def _effects_against(
     model: str | None, catalogue: Catalogue
 ) -> dict[str, dict[str, object]] | None:
-    """Read `--against`: options of effects by name; none of them for the baseline.
-
-    Raises:
-        InputError: no calibration, or an unknown effect.
-    """
+    """Read `--against`: options of effects by name; none of them for the baseline."""
     if model == "baseline":
         return {}
     if model is None or not model.endswith(".json"):

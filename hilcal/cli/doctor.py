@@ -9,8 +9,7 @@ from hilcal.cell import cell_from_config
 from hilcal.cli.options import Json, argument, option
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.doctor.computer import computer, program
-from hilcal.doctor.finding import Finding
+from hilcal.doctor.computer import Finding, computer, program
 from hilcal.doctor.ports import adapters, reachable, serial_ports
 from hilcal.drivers.ur_link.services import services
 from hilcal.errors import DeviceError, HilcalError, InputError

@@ -202,7 +202,6 @@ def _write_data(
     cell: Path | None,
     force: bool,
 ) -> None:
-    """Write readings and configuration."""
     if readings is not None:
         run.save_table(readings, as_stored=True)
         with_arm = (
@@ -253,7 +252,6 @@ def _write_model(
     calibration: Path | None,
     geometry: Geometry,
 ) -> None:
-    """Write what was identified."""
     record = run.in_use(revision)
     number = 0 if record is None else record.number
     source: dict[str, object] = {"campaign": run.path.name, "revision": number}

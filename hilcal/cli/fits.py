@@ -85,19 +85,12 @@ def mode_of_option(run: Campaign, asked: str | None) -> Mode:
     Raises:
         InputError: an unknown kind.
     """
-    return run.mode() if asked is None else choice(asked, MODES, "--readings")
-
-
-def choice(name: str, valid: tuple[Mode, ...], option: str) -> Mode:
-    """Check a kind of readings.
-
-    Raises:
-        InputError: lists the valid ones.
-    """
-    for known in valid:
-        if name == known:
+    if asked is None:
+        return run.mode()
+    for known in MODES:
+        if asked == known:
             return known
-    raise InputError(f"{option} {name!r} is unknown; valid: {', '.join(valid)}")
+    raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
 
 
 def scalings(name: str) -> tuple[Scaling, ...]:

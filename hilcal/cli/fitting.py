@@ -59,8 +59,8 @@ from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
-from hilcal.stream.document import to_json as stream_json
 from hilcal.stream.fit import fit_stream
+from hilcal.stream.fit import to_json as stream_json
 from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from hilcal.cell import cell_from_config
-from hilcal.cli.options import Json, argument, check_folder, check_new, option
+from hilcal.cli.options import Force, Json, argument, check_folder, check_new, option
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
@@ -45,15 +45,10 @@ LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
 
 @dataclass(slots=True)
 class Draft:
-    """A cell in the making; every answer is checked as it comes.
+    """A cell in the making; every answer is checked as it comes."""
 
-    Attributes:
-        base_dir: to which paths in it refer.
-        data: the sections so far, as TOML has them.
-    """
-
-    base_dir: Path
-    data: dict[str, Any] = field(default_factory=dict)
+    base_dir: Path  # to which paths in it refer
+    data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
 
     def set(self, section: str, **values: object) -> None:
         """Set keys of a section.
@@ -153,11 +148,7 @@ def vector(words: str, unit: str) -> list[float]:
 
 
 def _quantities(words: str, unit: str) -> list[float]:
-    """Read numbers with their units; empty where anything else is among them.
-
-    Raises:
-        InputError: an unknown unit, or a unit behind some of the numbers only.
-    """
+    """Read numbers with their units; empty where anything else is among them."""
     known, found = UNITS[unit], _QUANTITY.findall(words)
     if _QUANTITY.sub("", words).strip("[](),; \t").replace(",", "").replace(";", "").strip():
         return []
@@ -191,23 +182,14 @@ def ports() -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Item:
-    """One thing that is asked for.
+    """One thing that is asked for."""
 
-    Attributes:
-        option: that gives it without a question.
-        question: in words.
-        take: puts the answer into a draft.
-        needs: section that must be there for it to be asked.
-        again: whether there may be several.
-        without: what an empty answer means.
-    """
-
-    option: str
-    question: str
-    take: Callable[[Draft, str], None]
-    needs: str = ""
-    again: bool = False
-    without: str = ""
+    option: str  # that gives it without a question
+    question: str  # in words
+    take: Callable[[Draft, str], None]  # puts the answer into a draft
+    needs: str = ""  # section that must be there for it to be asked
+    again: bool = False  # whether there may be several
+    without: str = ""  # what an empty answer means
 
 
 def _set(section: str, key: str, read: Callable[[str], object]) -> Callable[[Draft, str], None]:
@@ -372,16 +354,12 @@ def init(
     tracker_place: Annotated[
         str | None, option("--tracker-place X,Y,Z", "Of the tracker in base axes, m.")
     ] = None,
-    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
-    given: dict[str, list[str]] = {
-        f"--{name.replace('_', '-')}": value if isinstance(value, list) else [value]
-        for name, value in locals().items()
-        if name in _OPTIONS and value is not None
-    }
+    options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
     there = somebody_there(t) and not as_json
     check_folder(cell, str(cell))
     check_new(cell, force or (there and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
@@ -389,8 +367,9 @@ def init(
     if there:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
     for item in items():
-        if item.option in given:
-            for words in given[item.option]:
+        given = options[item.option]
+        if given is not None:
+            for words in given if isinstance(given, list) else [given]:
                 _from_option(draft, item, words)
         elif there:
             _ask(t, draft, item)
@@ -410,15 +389,6 @@ def init(
         f"and with the devices{_lacking(draft)}:\n  hilcal check {quoted(cell)} --plan plan.json"
     )
     t.document({"cell": str(cell), "config": draft.data})
-
-
-_OPTIONS = frozenset(
-    {
-        *("robot", "host", "repeatability", "tracker", "tracker_port", "tracker_accuracy"),
-        *("force_sensor", "force_port", "target", "load_point", "tool_mass", "tool_com", "load"),
-        *("readings", "floor", "tracker_place"),
-    }
-)
 
 
 def _lacking(draft: Draft) -> str:

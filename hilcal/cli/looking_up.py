@@ -26,7 +26,7 @@ from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
 from hilcal.drivers.geocom import GeoComOptions as GeoComOptions
 from hilcal.drivers.natnet import NatNetOptions as NatNetOptions
 from hilcal.drivers.netft import NetFtOptions as NetFtOptions
-from hilcal.drivers.ur_link.options import UrOptions
+from hilcal.drivers.ur_link.services import UrOptions
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME
@@ -162,11 +162,6 @@ def new(
 
 
 def _check_name(name: str) -> None:
-    """Refuse a name that an effect cannot have.
-
-    Raises:
-        InputError: lists what would be valid.
-    """
     if not NAME.fullmatch(name) or keyword.iskeyword(name):
         raise InputError(
             f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "

@@ -45,7 +45,6 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import plain
 from hilcal.measuring.connect import ConnectionResult, connect
 from hilcal.measuring.dry_run import DryRun, dry_run
@@ -54,12 +53,10 @@ from hilcal.names import quoted
 from hilcal.present.plan import brief_plan, next_report, plan_report, plan_screen, poses_report
 from hilcal.present.progress import Say, working
 from hilcal.present.running import check_report
-from hilcal.procedure.next_plan import doubt_to_settle, next_plan
-from hilcal.procedure.separate import Doubt, without
-from hilcal.procedure.shared import reference_in
+from hilcal.procedure.next_plan import Doubt, doubt_to_settle, next_plan, without
+from hilcal.procedure.state import reference_in
 from hilcal.store.plan import Plan, load_plan
 from hilcal.tables.write import plan_csv
-from hilcal.types import Floats
 from hilcal.whole_file import replace_file
 
 
@@ -133,11 +130,14 @@ def plan(
     carried = PriorOptions(prior, prior_of, drift).load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
-    wanted = Request(poses, readings, _criterion(criterion), unloaded=unloaded)
+    if criterion is not None and canonical(criterion) not in CRITERIA:
+        raise InputError(f"--criterion {criterion!r} is unknown; valid: {', '.join(CRITERIA)}")
+    wanted = Request(poses, readings, criterion, unloaded=unloaded)
     with working(t.progress) as say:
         known, reference = None, None
         if after is not None:
-            known, reference = _known(t, after, revision, catalogue, say)
+            with Campaign.open(after, catalogue, read_only=True) as run:
+                known, reference = fit_of(t, run, say, revision)[1], reference_in(run.file)
         rng = np.random.default_rng(check_seed(seed))
         chosen = make(
             numbers, config, wanted, rng, known, say, catalogue, carried, reference=reference
@@ -150,25 +150,6 @@ def plan(
     t.show(plan_report(made.summary) if details else plan_screen(made.summary))
     t.show(f"The plan is in {output}: a file that you may edit. Every limit was checked.")
     t.document({**made.to_dict(), "plan": str(output)})
-
-
-def _criterion(name: str | None) -> str | None:
-    """Check a criterion.
-
-    Raises:
-        InputError: lists the valid ones.
-    """
-    if name is not None and canonical(name) not in CRITERIA:
-        raise InputError(f"--criterion {name!r} is unknown; valid: {', '.join(CRITERIA)}")
-    return name
-
-
-def _known(
-    t: Terminal, path: Path, revision: int | None, catalogue: Catalogue, say: Say
-) -> tuple[Fit, Floats | None]:
-    """Return the fit of a campaign that is in use, and the joints of its reference pose."""
-    with Campaign.open(path, catalogue, read_only=True) as run:
-        return fit_of(t, run, say, revision)[1], reference_in(run.file)
 
 
 def check(
@@ -401,12 +382,7 @@ def _without_suspects(
     say: Say,
     prior: CarriedPrior | None,
 ) -> Doubt:
-    """Return the effects to separate, and a fit whose model does not hold them.
-
-    Raises:
-        InputError: the revision is not in scaling gc; a prior that is not one of these readings.
-        CannotAnswerError: nothing is in doubt; says what else to do.
-    """
+    """Return the effects to separate, and a fit whose model does not hold them."""
     number, newest = fit_of(t, o, say, revision)
     o.require_gc(number, newest.scaling, "next")
     if prior is not None:
@@ -419,7 +395,6 @@ def _without_suspects(
 
 
 def _named(text: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
-    """Split and check --suspects."""
     if text is None:
         return None
     try:

@@ -62,25 +62,16 @@ BREAK = 600.0
 
 @dataclass(frozen=True, slots=True)
 class RehearsalSettings:
-    """What a rehearsal is of.
-
-    Attributes:
-        config: the cell; its loads are all there.
-        choice: an effect that is hidden, "random" or "nothing".
-        seed: of everything random.
-        output: the campaign file to make.
-        base_dir: directory that paths in the configuration are relative to.
-        catalogue: the effects that a model can have.
-        lacking: the same with what is hidden, where the models cannot have that.
-    """
+    """What a rehearsal is of."""
 
     config: CellConfig
-    choice: str
+    choice: str  # an effect that is hidden, "random" or "nothing"
     seed: int
     output: Path
-    base_dir: Path
+    base_dir: Path  # directory that paths in the configuration are relative to
     catalogue: Catalogue
     lacking: Catalogue | None = None
+    """The same with what is hidden, where the models cannot have that."""
 
     @property
     def world(self) -> Catalogue:
@@ -94,27 +85,18 @@ class RehearsalSettings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RehearsedCampaign:
-    """A first campaign, in a simulated cell that is still there.
+    """A first campaign, in a simulated cell that is still there."""
 
-    Attributes:
-        rehearsal: the cell, and all readings.
-        further: measures one further plan, into the same campaign; returns all readings.
-        measure: measures what is missing of another campaign, in the same cell.
-    """
-
-    rehearsal: Rehearsal
+    rehearsal: Rehearsal  # the cell, and all readings
     further: Callable[[Plan], Rehearsal]
-    measure: Measure
+    """Measures one further plan, into the same campaign; returns all readings."""
+    measure: Measure  # measures what is missing of another campaign, in the same cell
 
 
 def first_plan(told: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
     """Plan a campaign, as the program that is not told what is hidden would.
 
-    Args:
-        told: what the rehearsal is of.
-        config: the cell, perhaps with some of its loads only.
-        poses: number of poses.
-        say: told what is being done.
+    `config` may have some of the loads only.
     """
     config = as_told(config, told.choice, told.world)
     cell = cell_from_config(config, told.base_dir)
@@ -154,7 +136,7 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
             missing(campaign)
             stored = campaign.readings(), campaign.about(COVERS)
             readings = full_readings(*stored, secret.cell, there.config)
-            return _rehearsal(secret, there.config, readings)
+            return secret.measured(readings, there.config)
 
         def further(more: Plan) -> Rehearsal:
             log = RunLog(campaign)
@@ -181,7 +163,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
         def measured(part: Plan, number: int, begun: float) -> Rehearsal:
             r = read_plan(secret, part, [told.seed, number], begun)
             _write(t, campaign, r.readings)
-            return _rehearsal(secret, secret.config, campaign.readings())
+            return secret.measured(campaign.readings())
 
         def further(more: Plan) -> Rehearsal:
             last = last_time(campaign.readings())
@@ -205,15 +187,10 @@ def last_time(readings: Readings) -> float:
 
 
 def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int]) -> None:
-    """Measure, and go on after a failure as `run --resume` does.
+    """Do the work of measuring what is missing, and go on after a failure as `run --resume` does.
 
     A busy computer gives a simulated device no turn for a while, which is the same to the driver
-    as a device that fails.
-
-    Args:
-        t: where failures are told.
-        work: measures what is missing.
-        done: how many readings there are.
+    as a device that fails. `done` tells how many readings there are.
 
     Raises:
         DeviceError: it failed `TRIES` times on end without a further reading.
@@ -240,18 +217,6 @@ def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
         for begin, end in pairwise(starts):
             campaign.append_readings(readings[slice(begin, end)])
             advance(1)
-
-
-def _rehearsal(secret: SimulationCase, config: CellConfig, readings: Readings) -> Rehearsal:
-    return Rehearsal(
-        config=config,
-        cell=secret.cell,
-        mode=secret.mode,
-        world=secret.world,
-        hidden=secret.hidden,
-        strength_sigma=secret.strength_sigma,
-        readings=readings,
-    )
 
 
 NEXT_SEED = 1000

@@ -23,7 +23,7 @@ from hilcal.cli.options import (
 )
 from hilcal.cli.planning import answer_json, dry_checked, make_checked, read_cell, refuse_unready
 from hilcal.cli.showing import followed
-from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
+from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.goal_rule import GoalRule
@@ -154,11 +154,7 @@ def run(
 def _own_plan(
     t: Terminal, path: Path, config: CellConfig, cell: Cell, catalogue: Catalogue, yes: bool
 ) -> Plan:
-    """Make a plan, show it, and ask whether to measure it, where somebody can be asked.
-
-    Raises:
-        StoppedError: the person does not want it; nothing has moved.
-    """
+    """Make a plan, show it, and ask whether to measure it, where somebody can be asked."""
     with working(t.progress) as say:
         made = make_checked(cell, config, POSES, config.simulation.seed, catalogue, say)
     t.show(plan_facts(made.summary))
@@ -218,11 +214,7 @@ def _append(
     cell: Cell,
     base_dir: Path,
 ) -> tuple[CampaignFile, Plan]:
-    """Open a campaign, and return it with a further plan that has been checked.
-
-    Raises:
-        InputError: no plan is given, the campaign is of another cell, or the plan cannot be run.
-    """
+    """Open a campaign, and return it with a further plan that has been checked."""
     if plan is None:
         raise InputError("--append needs the further plan: give it with --plan PLAN")
     campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
@@ -327,10 +319,5 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
             raise KeyboardInterrupt
         t.notice("stopping the arm; wait a moment")
 
-    kinds = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = [signal.signal(kind, stop) for kind in kinds]
-    try:
+    with handled((signal.SIGINT, signal.SIGTERM, signal.SIGHUP), stop):
         yield
-    finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)

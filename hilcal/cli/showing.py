@@ -157,10 +157,7 @@ def _end_of_process() -> threading.Timer:
 def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]:
     """Let a live viewer follow what the block does, where it is asked for.
 
-    Args:
-        t: where it is said how to open it, and what is wrong with it.
-        asked: whether somebody wants it.
-        run: the campaign; the recording goes beside it.
+    The recording goes beside the campaign.
     """
     if not asked:
         yield None
@@ -251,11 +248,7 @@ def workbench(
 def _import(
     t: Terminal, table: Path, config: Path, run: Path, kind: str, second: Path | None
 ) -> None:
-    """Make the campaign file of a table; one that is there stays.
-
-    Raises:
-        InputError: there is one, or anything in table or cell cannot be right.
-    """
+    """Make the campaign file of a table; one that is there stays."""
     if run.exists():
         raise InputError(
             f"{run}: the file exists, and is left as it is; open it with hilcal workbench "

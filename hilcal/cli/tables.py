@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.cli.options import Json, argument, check_new, option
+from hilcal.cli.options import Force, Json, argument, check_new, option
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine, other_arm
@@ -55,7 +55,7 @@ def import_(
     preview: Annotated[
         bool, option("--preview", "Show how the table could be read; make no campaign.")
     ] = False,
-    force: Annotated[bool, option("--force", "Replace an existing file.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Make a campaign file from a table of readings."""

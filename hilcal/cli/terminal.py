@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from types import FrameType
 from typing import TextIO
 
 from rich.console import Console, RenderableType
@@ -23,19 +24,12 @@ WIDTH = 100
 
 @dataclass(frozen=True, slots=True)
 class Terminal:
-    """The two streams.
+    """The two streams."""
 
-    Attributes:
-        json: whether stdout is for one JSON document.
-        people: where tables and words for people go.
-        progress: where progress and notices go.
-        out: where the document goes.
-    """
-
-    json: bool
-    people: Console
-    progress: Console
-    out: TextIO
+    json: bool  # whether stdout is for one JSON document
+    people: Console  # where tables and words for people go
+    progress: Console  # where progress and notices go
+    out: TextIO  # where the document goes
 
     def show(self, parts: Iterable[RenderableType] | RenderableType) -> None:
         """Print for people."""
@@ -56,9 +50,7 @@ class Terminal:
     def document(self, content: Mapping[str, object], failed: HilcalError | None = None) -> None:
         """Print the JSON document, where it is asked for.
 
-        Args:
-            content: of the document.
-            failed: why the command fails nevertheless; it is in the document as "error".
+        With `failed`, why the command fails nevertheless, which is in the document as "error".
 
         Raises:
             HilcalError: `failed`, after printing.
@@ -144,9 +136,18 @@ def told_to_end(*kinds: signal.Signals) -> Iterator[Callable[[], None]]:
         while not asked:
             time.sleep(POLL)
 
-    before = [signal.signal(kind, lambda number, _: asked.append(number)) for kind in kinds]
-    try:
+    with handled(kinds, lambda number, _: asked.append(number)):
         yield wait
+
+
+@contextmanager
+def handled(
+    kinds: Iterable[signal.Signals], handler: Callable[[int, FrameType | None], object]
+) -> Iterator[None]:
+    """Handle signals as long as the block lasts."""
+    before = {kind: signal.signal(kind, handler) for kind in kinds}
+    try:
+        yield
     finally:
-        for kind, handler in zip(kinds, before, strict=True):
-            signal.signal(kind, handler)
+        for kind, earlier in before.items():
+            signal.signal(kind, earlier)

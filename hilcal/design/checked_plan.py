@@ -75,8 +75,4 @@ def refuse(dry: DryRun, what: str) -> None:
 
 def refusal(dry: DryRun, what: str) -> InputError | None:
     """Return the same without raising it; None where the plan has passed."""
-    if not dry.problems:
-        return None
-    more = len(dry.problems) - 1
-    others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-    return InputError(f"{what} cannot be run: {dry.problems[0]}{others}")
+    return InputError(f"{what} cannot be run: {dry.first}") if dry.problems else None

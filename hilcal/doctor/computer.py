@@ -13,11 +13,26 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from datetime import datetime
 from importlib import metadata
 from pathlib import Path
+from typing import Literal
 
-from hilcal.doctor.finding import Finding
+State = Literal["ok", "warning", "problem"]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was looked at."""
+
+    topic: str  # "program", "computer", "serial ports", "network" or "cell"
+    name: str  # of the thing, e.g. "clock"
+    state: State
+    """"ok"; "warning" where a campaign runs but may suffer; "problem" where it does not."""
+    said: str  # how it is, in words
+    mend: str = ""  # what to do about it; empty where nothing is to be done
+
 
 COMPUTER = "computer"
 LEAST_FREE = 1e9
@@ -51,11 +66,7 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
 def computer(folder: Path) -> tuple[Finding, ...]:
-    """Return the findings on this computer.
-
-    Args:
-        folder: where campaigns are stored.
-    """
+    """Return the findings on this computer, and on the folder where campaigns are stored."""
     return (clock(), *disk(folder), memory(), load())
 
 
@@ -173,11 +184,7 @@ def load(measured: Callable[[], tuple[float, float, float]] = os.getloadavg) -> 
 
 
 def program(version: str) -> tuple[Finding, ...]:
-    """Return the findings on what is installed.
-
-    Args:
-        version: of hilcal.
-    """
+    """Return the findings on what is installed, of hilcal in this version."""
     return (
         Finding(PROGRAM, "hilcal", "ok", f"version {version}"),
         _python(),
@@ -196,9 +203,8 @@ def _python() -> Finding:
 def packages(requirements: Iterable[str]) -> tuple[Finding, ...]:
     """Return whether the packages of a distribution are there and load.
 
-    Args:
-        requirements: as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'.
-            One for earlier Pythons alone has no wheel for this one.
+    Requirements are as its metadata list them, e.g. 'pyarrow>=17; extra == "tables"'. One for
+    earlier Pythons alone has no wheel for this one.
     """
     there, out = [], []
     lacking: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Serial adapters and the network: what there is, who may use it, and how late it answers."""
+"""What was found: serial adapters and the network, who may use them, how late they answer."""
 
 import grp
 import os
@@ -12,7 +12,7 @@ from pathlib import Path
 
 from serial.tools import list_ports
 
-from hilcal.doctor.finding import Finding, State
+from hilcal.doctor.computer import Finding, State
 
 PORTS = "serial ports"
 LATE_MS = 1
@@ -32,13 +32,7 @@ SLOW = 0.02
 
 @dataclass(frozen=True, slots=True)
 class System:
-    """Where the kernel shows its devices and processes.
-
-    Attributes:
-        dev: device files.
-        sys: attributes of devices.
-        proc: processes.
-    """
+    """Where the kernel shows its devices and processes."""
 
     dev: Path = Path("/dev")
     sys: Path = Path("/sys")
@@ -55,10 +49,7 @@ def serial_ports(
 ) -> tuple[Finding, ...]:
     """Return the findings on serial ports.
 
-    Args:
-        wanted: path of the port by device of the cell, e.g. "tracker".
-        found: what is plugged in, by port.
-        system: where the kernel shows its devices.
+    `wanted` is the path of the port by device of the cell, `found` what is plugged in, by port.
     """
     at = system or System()
     names, used = _by_id(at.dev), {str(Path(p).resolve()): what for what, p in wanted.items()}
@@ -168,13 +159,7 @@ def _program(proc: Path, number: int) -> str:
 
 
 def reachable(host: str, services: Mapping[int, str], seconds: float = SECONDS) -> list[Finding]:
-    """Return whether each service of a host accepts a connection; nothing is sent.
-
-    Args:
-        host: name or address.
-        services: what is reached there, by TCP port.
-        seconds: how long each may take.
-    """
+    """Return whether each service, by TCP port, accepts a connection in time; nothing is sent."""
     try:
         address = socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0]
     except (OSError, UnicodeError) as error:

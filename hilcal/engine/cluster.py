@@ -28,12 +28,7 @@ WORKERS_S = 10.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cluster:
-    """Workers behind a scheduler.
-
-    Attributes:
-        client: connection to it.
-        address: of the scheduler.
-    """
+    """Workers behind a scheduler."""
 
     client: "Client"
     address: str

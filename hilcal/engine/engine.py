@@ -31,13 +31,9 @@ Advance = Callable[[int], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Engine:
-    """Computes many items; made by `open_engine`.
+    """Computes many items; made by `open_engine`."""
 
-    Attributes:
-        workers: what computes; None where this process does.
-    """
-
-    workers: Processes | Cluster | None
+    workers: Processes | Cluster | None  # what computes; None where this process does
 
     def map(
         self,
@@ -73,7 +69,8 @@ class Engine:
         seed: int | None = None,
     ) -> Iterator[tuple[int, Result]]:
         """Yield (number of the item, result) as they are done, in no order; see `map`."""
-        seeds = _seeds(seed, len(items))
+        count = len(items)
+        seeds = [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
         if self.workers is None:
             for k, item in enumerate(items):
                 yield k, compute(function, item, seeds[k])
@@ -83,10 +80,6 @@ class Engine:
 
 ALONE = Engine(None)
 """Computes in this process; BLAS has as many threads as it had."""
-
-
-def _seeds(seed: int | None, count: int) -> Sequence[np.random.SeedSequence | None]:
-    return [None] * count if seed is None else np.random.SeedSequence(seed).spawn(count)
 
 
 @contextmanager

@@ -47,12 +47,7 @@ class Processes:
     """Workers, begun when there is something for them."""
 
     def __init__(self, count: int, scratch: str) -> None:
-        """Begin none yet.
-
-        Args:
-            count: how many there may be.
-            scratch: folder of their temporary files.
-        """
+        """Begin none yet; `scratch` is the folder of their temporary files."""
         self._count, self._scratch = count, scratch
         self._all: set[_Worker] = set()
         self._idle: list[_Worker] = []

@@ -56,15 +56,10 @@ def one_blas_thread() -> None:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A function as it runs on a worker.
+    """A function as it runs on a worker."""
 
-    Attributes:
-        function: of an item, or of an item and a generator where there are seeds.
-        versions: of the program that asked.
-    """
-
-    function: Callable[..., Any]
-    versions: Versions
+    function: Callable[..., Any]  # of an item, or of an item and a generator where there are seeds
+    versions: Versions  # of the program that asked
 
     def __call__(self, item: Any, seed: np.random.SeedSequence | None = None) -> Any:
         """Compute one item.

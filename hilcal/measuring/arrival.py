@@ -237,17 +237,11 @@ def _far(pose: tuple[Floats, Floats], held: Floats, seen: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetReading:
-    """One reading of an arrival.
+    """One reading of an arrival."""
 
-    Attributes:
-        target: number of the target, by the cell; None where there is one.
-        measured: what was measured.
-        ended: when, cell s.
-    """
-
-    target: int | None
-    measured: MeasuredStop
-    ended: float
+    target: int | None  # number of the target, by the cell; None where there is one
+    measured: MeasuredStop  # what was measured
+    ended: float  # when, cell s
 
 
 class ArrivalReader:
@@ -333,11 +327,6 @@ class ArrivalReader:
         name: str,
         force: WrenchSample | None,
     ) -> MeasuredStop:
-        """Aim at a target and measure it.
-
-        Raises:
-            TargetLostError: it is not there, or another one is measured.
-        """
 
         def aim() -> None:
             tracker.aim(places[k], self._radius)

@@ -23,13 +23,7 @@ _TINY = 1e-18  # m², below which a segment is a point
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Clearance:
-    """The cell's shapes. Base axes, m; `clearance_of` makes it.
-
-    Attributes:
-        cell: the cell.
-        config: its obstacles and loads.
-        scene: the arm with its tool among the obstacles.
-    """
+    """The cell's shapes. Base axes, m; `clearance_of` makes it."""
 
     cell: Cell
     config: CellConfig
@@ -121,15 +115,10 @@ _SHY = 1.5  # the beam ends so many radii of tool and beam before the target
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineOfSight:
-    """The tracker's view of the target.
+    """The tracker's view of the target."""
 
-    Attributes:
-        clearance: the cell's shapes.
-        tracker: (3,) where the tracker stands, base axes, m.
-    """
-
-    clearance: Clearance
-    tracker: Floats
+    clearance: Clearance  # the cell's shapes
+    tracker: Floats  # (3,) where the tracker stands, base axes, m
 
     def free(self, q: Floats, load: str) -> Bools:
         """Return (N,) in which states nothing is closer to a beam than [sight] clearance_m.

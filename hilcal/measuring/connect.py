@@ -21,18 +21,11 @@ from hilcal.toml import suggest
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Rig:
-    """Every device that a campaign uses, connected.
-
-    Attributes:
-        arm: the arm.
-        tracker: the tracker.
-        force: the force sensor; None where the cell has none.
-        operator: the person who hangs the loads.
-    """
+    """Every device that a campaign uses, connected."""
 
     arm: ArmDevice
     tracker: TrackerDevice
-    force: ForceSensorDevice | None
+    force: ForceSensorDevice | None  # the force sensor; None where the cell has none
     operator: OperatorDevice
 
     def close(self) -> None:
@@ -47,19 +40,12 @@ Factory = Callable[[CellConfig], Any]
 
 @dataclass(frozen=True, slots=True)
 class ConnectionResult:
-    """The result of opening one device.
+    """The result of opening one device."""
 
-    Attributes:
-        device: its part in the cell.
-        driver: the driver's name.
-        report: its name, facts and problems; None where it did not answer.
-        failure: why it did not, one line; empty where it did.
-    """
-
-    device: str
-    driver: str
-    report: Report | None
-    failure: str = ""
+    device: str  # its part in the cell
+    driver: str  # the driver's name
+    report: Report | None  # its name, facts and problems; None where it did not answer
+    failure: str = ""  # why it did not, one line; empty where it did
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -168,7 +154,6 @@ def _factory(one: _Wanted) -> Factory:
 
 
 def _open(factory: Factory, config: CellConfig) -> tuple[Any, str | HilcalError]:
-    """Open a device; returns it, or why it failed."""
     try:
         return factory(config), ""
     except Exception as error:  # a driver of somebody else's may fail in any way

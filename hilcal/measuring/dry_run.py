@@ -21,21 +21,20 @@ AIMING_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class DryRun:
-    """What a plan would do.
+    """What a plan would do."""
 
-    Attributes:
-        problems: why it must not be run, one line each; empty where it may.
-        remarks: what people should know of it.
-        duration: how long it takes, roughly, cell seconds.
-        motions: how often the arm moves.
-        load_changes: how often a person is asked for another load.
-    """
+    problems: tuple[str, ...]  # why it must not be run, one line each; empty where it may
+    remarks: tuple[str, ...]  # what people should know of it
+    duration: float  # how long it takes, roughly, cell seconds
+    motions: int  # how often the arm moves
+    load_changes: int  # how often a person is asked for another load
 
-    problems: tuple[str, ...]
-    remarks: tuple[str, ...]
-    duration: float
-    motions: int
-    load_changes: int
+    @property
+    def first(self) -> str:
+        """The first problem, and how many others there are."""
+        more = len(self.problems) - 1
+        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
+        return f"{self.problems[0]}{others}"
 
 
 def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
@@ -44,11 +43,6 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     Checked are all stops of the route and the straight paths in joint space between them by
     `Feasibility`, the tracker's sight of the target at each reading, the speed, and the names of
     the loads.
-
-    Args:
-        cell: the cell.
-        config: its limits, loads and motion.
-        plan: poses and steps.
     """
     limits = Feasibility(cell, config)
     problems = _cell_problems(config) + _load_problems(limits, plan)

@@ -38,38 +38,23 @@ _SIDES = tuple((axis, low) for axis in range(3) for low in (True, False))
 
 @dataclass(frozen=True, slots=True)
 class Margins:
-    """What is kept beyond the limits; negative is slack.
+    """What is kept beyond the limits; negative is slack."""
 
-    Attributes:
-        joint: from `[limits] joint_margin_rad`, rad.
-        inside: from the sides of the workspace and from the floor, m.
-        clear: between arm, obstacles and what hangs, m.
-        itself: between parts of the arm, m.
-        bear: share of the usable torque and of the force sensor's moment.
-    """
-
-    joint: float = 0.0
-    inside: float = 0.0
-    clear: float = 0.005
-    itself: float = 0.005
-    bear: float = 1.0
+    joint: float = 0.0  # from `[limits] joint_margin_rad`, rad
+    inside: float = 0.0  # from the sides of the workspace and from the floor, m
+    clear: float = 0.005  # between arm, obstacles and what hangs, m
+    itself: float = 0.005  # between parts of the arm, m
+    bear: float = 1.0  # share of the usable torque and of the force sensor's moment
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """What a state or a motion does not keep.
+    """What a state or a motion does not keep."""
 
-    Attributes:
-        kind: one of `STATE`.
-        of: which body, side or joint.
-        load: name of the load where the finding is due to its weight or pull.
-        text: which body, how far, and which limit, without the place.
-    """
-
-    kind: str
-    of: str
-    load: str
-    text: str
+    kind: str  # one of `STATE`
+    of: str  # which body, side or joint
+    load: str  # name of the load where the finding is due to its weight or pull
+    text: str  # which body, how far, and which limit, without the place
 
     @property
     def what(self) -> tuple[str, str, str]:
@@ -95,10 +80,6 @@ class Feasibility:
     torques and moments by their own rates likewise.
 
     Attributes:
-        cell: the cell.
-        config: its limits, loads, obstacles and what the tracker sees.
-        margins: what is kept beyond them.
-        shapes: of arm, tool and obstacles.
         sight: the tracker's view; None where its place is not known.
     """
 
@@ -332,7 +313,6 @@ class Feasibility:
         return _Bounds(torque - limit, drive.T @ rates, BETWEEN_SHARE * usable, told)
 
     def _moment(self, chain: Chain, load: str) -> "_Bounds":
-        """The moment that tool and load exert on the force sensor."""
         sensor, cell, pull = self.config.force_sensor, self.cell, self._pull(load)
         if sensor is None:
             raise ValueError("the cell has no force sensor")
@@ -426,19 +406,13 @@ class _Placed:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bounds:
-    """Numbers that must not be over zero in N states.
+    """Numbers that must not be over zero in N states."""
 
-    Attributes:
-        over: (N, K).
-        rates: (K, n) they change by no more than this per radian of a joint of the chain.
-        fine: (K,) by how much they may be over zero between the samples of a motion.
-        told: the finding of column k, with its number, in a state.
-    """
-
-    over: Floats
-    rates: Floats
-    fine: Floats
+    over: Floats  # (N, K)
+    rates: Floats  # (K, n) they change by no more than this per radian of a joint of the chain
+    fine: Floats  # (K,) by how much they may be over zero between the samples of a motion
     told: Callable[[int, float, int], Violation]
+    """The finding of column k, with its number, in a state."""
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether states are over zero, or might be within turns (R, n)."""
@@ -461,23 +435,14 @@ class _Bounds:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Touch:
-    """Shapes that must not be closer than a margin in N states; `_Bounds` of their gaps.
-
-    Attributes:
-        pairs: of shapes.
-        q: (N, n) joint angles, rad.
-        margin: m.
-        rates: (K, n) how fast each pair may near, m/rad.
-        segment: what hangs in the N states, of `Scene.free`.
-        guessed: says that the shapes are; empty where they are known.
-    """
+    """Shapes that must not be closer than a margin in N states; `_Bounds` of their gaps."""
 
     pairs: Pairs
-    q: Floats
-    margin: float
-    rates: Floats
-    segment: Segment | None = None
-    guessed: str = ""
+    q: Floats  # (N, n) joint angles, rad
+    margin: float  # m
+    rates: Floats  # (K, n) how fast each pair may near, m/rad
+    segment: Segment | None = None  # what hangs in the N states, of `Scene.free`
+    guessed: str = ""  # says that the shapes are; empty where they are known
 
     def beyond(self, rows: Ints, turn: Floats | None) -> Bools:
         """(R,) whether shapes are too close, or might come so within turns (R, n)."""

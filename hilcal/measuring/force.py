@@ -110,30 +110,19 @@ _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorFrame:
-    """Where the sensor is at one pose of the arm, base axes.
+    """Where the sensor is at one pose of the arm, base axes."""
 
-    Attributes:
-        rotation: (3, 3) R_base_sensor.
-        arm: (3,) from the sensor's origin to the load point, m.
-    """
-
-    rotation: Floats
-    arm: Floats
+    rotation: Floats  # (3, 3) R_base_sensor
+    arm: Floats  # (3,) from the sensor's origin to the load point, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaredWrench:
-    """One mean wrench against the zero of its session, and the pose where it was felt.
+    """One mean wrench against the zero of its session, and the pose where it was felt."""
 
-    Attributes:
-        wrench: (6,) sensor axes, N and N·m.
-        covariance: (6, 6) of this mean.
-        q: (n,) joint angles, rad.
-    """
-
-    wrench: Floats
-    covariance: Floats
-    q: Floats
+    wrench: Floats  # (6,) sensor axes, N and N·m
+    covariance: Floats  # (6, 6) of this mean
+    q: Floats  # (n,) joint angles, rad
 
 
 class ForceMeter:
@@ -146,21 +135,13 @@ class ForceMeter:
 
     Attributes:
         zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        tool: what it carries.
         identified: whether the tool has been weighed, else it is that of the configuration.
     """
 
     def __init__(
         self, sensor: ForceSensorDevice, settings: Settings, cell: Cell, window: float
     ) -> None:
-        """Use an open sensor.
-
-        Args:
-            sensor: the device.
-            settings: where it sits.
-            cell: the cell.
-            window: over how long it is averaged, real seconds.
-        """
+        """Use an open sensor, averaged over a window in real seconds."""
         self.sensor = sensor
         self.zero = np.zeros(6)
         self._cell, self._seconds = cell, window
@@ -239,14 +220,8 @@ class ForceMeter:
         """Find the real tool from unloaded readings.
 
         A reading whose force the tool does not explain to the tolerance was not unloaded, or
-        somebody leaned on the tool: the worst is left out until all are explained.
-
-        Args:
-            unloaded: the readings.
-            tolerance_N: by how much a force may differ.
-
-        Returns:
-            Numbers of the readings that were left out; None where they are too few.
+        somebody leaned on the tool: the worst is left out until all are explained. Returned are the
+        numbers of those; None where the readings are too few.
 
         Raises:
             HilcalError: their poses do not determine it, or fewer than `ENOUGH_POSES` agree.

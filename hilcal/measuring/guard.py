@@ -24,12 +24,7 @@ checked at samples. Nothing may touch."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guard:
-    """The limits of a cell, checked against samples of its devices.
-
-    Attributes:
-        cell: the cell.
-        config: its limits.
-    """
+    """The limits of a cell, checked against samples of its devices."""
 
     cell: Cell
     config: CellConfig
@@ -44,10 +39,7 @@ class Guard:
     ) -> str | None:
         """Return in one line what is wrong, or None.
 
-        Args:
-            sample: of the arm.
-            felt: (6,) wrench on the force sensor, N and N·m; None where there is none.
-            hanging: name of the load that hangs.
+        `felt` is the wrench (6,) on the force sensor, N and N·m; None where there is none.
         """
         return (
             self.state(sample)
@@ -145,12 +137,7 @@ class LoadWatch:
         self.watching = False
 
     def look(self, sample: ArmSample, felt: Floats, *, moving: bool) -> None:
-        """Compare one frame of the sensor.
-
-        Args:
-            sample: of the arm.
-            felt: (6,) wrench against the zero, sensor axes, N and N·m.
-            moving: whether the arm is commanded to move.
+        """Compare one frame of the sensor: a wrench (6,) against the zero, sensor axes, N and N·m.
 
         Raises:
             LoadChangedError: they have differed for `HOLD_S` and `LOOKS`.

@@ -43,7 +43,11 @@ def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
 
 
 class Hook:
-    """What hangs at the arm."""
+    """What hangs at the arm.
+
+    Every question raises DeviceError where the person gives up; WrongLoadError where what hangs is
+    wrong `TRIES` times.
+    """
 
     def __init__(
         self,
@@ -80,10 +84,6 @@ class Hook:
 
         A heavier payload is set in the controller before it is hung, a lighter one as soon as it is
         said that the heavier has been taken off, before anything moves.
-
-        Raises:
-            DeviceError: the person gives up.
-            WrongLoadError: what hangs is wrong three times.
         """
         new, old = self.load(name), self.load(self.hanging)
         heavier = payload(self._cell, new)[0] > payload(self._cell, old)[0]
@@ -98,10 +98,6 @@ class Hook:
 
         The controller is told at once if nothing hangs any more, and that it hangs again as soon as
         that is answered.
-
-        Raises:
-            DeviceError: the person gives up.
-            WrongLoadError: what hangs is wrong three times.
         """
         name, load = self.hanging, self.load(self.hanging)
         self._suspend(UNLOADED, name)
@@ -111,11 +107,7 @@ class Hook:
         self._hangs(name)
 
     def confirm(self, question: str) -> None:
-        """Ask whether the arm may go on.
-
-        Raises:
-            DeviceError: the person gives up, or the operator's driver cannot ask that.
-        """
+        """Ask whether the arm may go on."""
         operator = self._operator
         if not isinstance(operator, ConfirmingOperator):
             raise DeviceError(f"arm: {question}: look at it, and start again")
@@ -125,7 +117,6 @@ class Hook:
         self._asked(partial(operator.confirm, question))
 
     def _carry(self, load: CellLoad | None) -> None:
-        """Tell the controller what it carries."""
         self._arm.set_payload(*payload(self._cell, load))
 
     def _suspend(self, *hanging: str) -> None:
@@ -159,11 +150,8 @@ class Hook:
     ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
-        Args:
-            load: what to hang.
-            wrong: what is wrong after the answer.
-            why: why it is asked for, empty at the first time.
-            answered: told what hangs after each answer, before anything moves.
+        `why` tells why it is asked for, empty at the first time; `answered` is told what hangs
+        after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
         person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal

@@ -59,23 +59,14 @@ _MEAN_STEPS = 10
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Average:
-    """The mean of K samples.
+    """The mean of K samples."""
 
-    Attributes:
-        value: (m,) position in m and, for m = 6, rotation vector in rad, sensor axes.
-        covariance: (m, m) of `value`; rotations as small rotations about the sensor's axes.
-        scatter: mean square of the scatter over what is stated; 1 is expected.
-        scatter_p: how probable at least as much scatter is under the stated noise.
-        left_out: numbers of the samples (from 0) that were gross outliers.
-        warnings: what a person should know, one line each.
-    """
-
-    value: Floats
-    covariance: Floats
-    scatter: float
-    scatter_p: float
-    left_out: tuple[int, ...]
-    warnings: tuple[str, ...]
+    value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
+    covariance: Floats  # (m, m) of `value`; rotations as small rotations about the sensor's axes
+    scatter: float  # mean square of the scatter over what is stated; 1 is expected
+    scatter_p: float  # how probable at least as much scatter is under the stated noise
+    left_out: tuple[int, ...]  # numbers of the samples (from 0) that were gross outliers
+    warnings: tuple[str, ...]  # what a person should know, one line each
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
@@ -182,19 +173,11 @@ LONGEST = 10
 class SettleWindow:
     """Collects samples after the arm has stopped, and tests whether they are at rest."""
 
-    def __init__(self, count: int, scale: float = 1.0) -> None:
-        """Start empty.
-
-        Args:
-            count: K, the least number of samples to judge, 3 or more.
-            scale: cell seconds per real second (`Clock.scale`).
-
-        Raises:
-            ValueError: fewer than 3.
-        """
+    def __init__(self, count: int) -> None:
+        """Start empty; 3 samples or more are judged."""
         if count < 3:
             raise ValueError(f"count = {count}: a trend takes at least 3 samples")
-        self._count, self._scale = count, scale
+        self._count = count
         self._samples: list[TrackerSample] = []
         self._settled = self._has_drifted = False
 
@@ -204,36 +187,13 @@ class SettleWindow:
         del self._samples[: -2 * LONGEST * self._count]
         self._settled = len(self._samples) >= self._count and self._judge()
 
-    def clear(self) -> None:
-        """Forget everything: the arm has moved, or the load has changed."""
-        self._samples.clear()
-        self._settled = self._has_drifted = False
-
-    def __len__(self) -> int:
-        """Number of samples since the start, as far as they are remembered."""
-        return len(self._samples)
-
-    @property
-    def latest(self) -> tuple[TrackerSample, ...]:
-        """The last K samples, fewer if there are not as many yet."""
-        return tuple(self._samples[-self._count :])
-
-    @property
-    def drift(self) -> Floats:
-        """Slope (m,) over the window, m/s and rad/s of cell time; zeros before 2 samples."""
-        window = self._window()
-        if len(window) < 2:
-            return np.zeros(window[0].value.shape[0] if window else 3)
-        return _trend(window, self._scale).slope
-
     def settled(self) -> bool:
         """Whether the readings are at rest; False before K samples."""
         return self._settled
 
     def _judge(self) -> bool:
-        """Test the window after a new sample."""
         window = self._window()
-        trend = _trend(window, self._scale)
+        trend = _trend(window)
         if trend.moment == 0.0:
             return False  # all at one time: no word on a trend
         noise = 1.0
@@ -245,7 +205,7 @@ class SettleWindow:
         over_window = np.linalg.norm(trend.white_slope) * trend.span
         if over_window < NEGLIGIBLE * np.sqrt(noise / len(window)):
             return True
-        m, drift = len(trend.slope), trend.moment * float(np.sum(trend.white_slope**2))
+        m, drift = len(trend.white_slope), trend.moment * float(np.sum(trend.white_slope**2))
         if noise == 1.0:
             p = float(stats.chi2.sf(drift, m))
         else:
@@ -260,38 +220,26 @@ class SettleWindow:
     def _shrinking(self) -> bool:
         """Whether the second half of all samples scatters less than the first (F test)."""
         half = len(self._samples) // 2
-        first = _trend(self._samples[:half], self._scale)
-        second = _trend(self._samples[-half:], self._scale)
+        first = _trend(self._samples[:half])
+        second = _trend(self._samples[-half:])
         ratio = first.scatter / max(second.scatter, np.finfo(float).tiny)
         return bool(stats.f.sf(ratio, first.dof, second.dof) < SHRINKING_P)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trend:
-    """A line through a window.
+    """A line through a window."""
 
-    Attributes:
-        slope: (m,) per s of cell time.
-        white_slope: (m,) the same, whitened by the mean stated covariance.
-        moment: Σ (t_k - t̄)², s².
-        span: from the first to the last sample, s.
-        scatter: mean square about the line over what is stated.
-        scatter_p: how probable at least as much is.
-        dof: m (K - 2).
-    """
-
-    slope: Floats
-    white_slope: Floats
-    moment: float
-    span: float
-    scatter: float
-    scatter_p: float
-    dof: int
+    white_slope: Floats  # (m,) per s, whitened by the mean stated covariance
+    moment: float  # Σ (t_k - t̄)², s²
+    span: float  # from the first to the last sample, s
+    scatter: float  # mean square about the line over what is stated
+    scatter_p: float  # how probable at least as much is
+    dof: int  # m (K - 2)
 
 
-def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
-    """Least squares of a line."""
-    time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9 * scale
+def _trend(samples: Sequence[TrackerSample]) -> _Trend:
+    time = np.array([s.host_ns - samples[0].host_ns for s in samples]) * 1e-9
     span = float(time[-1])
     time -= time.mean()
     moment = float(time @ time)
@@ -302,7 +250,7 @@ def _trend(samples: Sequence[TrackerSample], scale: float) -> _Trend:
     dof = residuals.shape[1] * (len(samples) - 2)
     total = float(np.sum(about**2))
     scatter, p = (total / dof, float(stats.chi2.sf(total, dof))) if dof else (0.0, 1.0)
-    return _Trend(slope, root @ slope, moment, span, scatter, p, dof)
+    return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
 SEARCHES = 2
@@ -315,30 +263,19 @@ PATIENCE = 4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MeasuredStop:
-    """What was measured at one stop.
+    """What was measured at one stop."""
 
-    Attributes:
-        mean: of the tracker's measurements, with its covariance, sensor axes.
-        q: (n,) mean actual joint angles meanwhile, rad.
-        torque: (n,) mean torques that the drives were measured to exert meanwhile, N·m; None
-            where the arm does not tell them.
-        before: sample of the arm at the start.
-        after: the same at the end.
-        tracker: every measurement of the tracker.
-        force: mean wrench of the force sensor; None without one.
-        settling: how long it took until all was settled, cell seconds.
-        remarks: what was remarkable, one line each.
-    """
-
-    mean: Average
-    q: Floats
+    mean: Average  # of the tracker's measurements, with its covariance, sensor axes
+    q: Floats  # (n,) mean actual joint angles meanwhile, rad
     before: ArmSample
     after: ArmSample
     tracker: tuple[TrackerSample, ...]
-    force: WrenchSample | None
-    settling: float
+    force: WrenchSample | None  # mean wrench of the force sensor; None without one
+    settling: float  # how long it took until all was settled, cell seconds
     remarks: tuple[str, ...]
     torque: Floats | None = None
+    """(n,) mean torques that the drives were measured to exert meanwhile, N·m; None where the arm
+    does not tell them."""
 
 
 class Measurer:
@@ -365,10 +302,8 @@ class Measurer:
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
-        Args:
-            name: of the pose.
-            find: finds a lost target again; the tracker's search where None.
-            force: the wrench where it was averaged at this stop already.
+        `find` finds a lost target again, the tracker's search where None; `force` is the wrench
+        where it was averaged at this stop already.
 
         Raises:
             TargetLostError: the target was not found again.
@@ -398,10 +333,10 @@ class Measurer:
         begun = clock.now()
         rest: float | None = None
         taken = 0
-        window = self._window()
+        window = SettleWindow(acquire.samples)
         while True:
             if not self._mover.at_rest(self._mover.look()):
-                rest, window = None, self._window()
+                rest, window = None, SettleWindow(acquire.samples)
                 clock.sleep(POLL_S * clock.scale)
             else:
                 rest = clock.now() if rest is None else rest
@@ -416,9 +351,6 @@ class Measurer:
                     f"{name}: not settled within {acquire.settle_timeout_s:g} s: {what}. Look for "
                     "a swinging load, a loose target or a warming tracker"
                 )
-
-    def _window(self) -> SettleWindow:
-        return SettleWindow(self._config.acquire.samples, self._clock.scale)
 
     def _averaged(
         self, settling: float, remarks: tuple[str, ...], force: WrenchSample | None
@@ -471,11 +403,7 @@ class Measurer:
     def _search(
         self, error: TargetLostError, name: str, searches: int, find: Callable[[], None]
     ) -> int:
-        """Search the target; returns how often that has been done.
-
-        Raises:
-            TargetLostError: it was lost or not found too often.
-        """
+        """Search the target; returns how often that has been done."""
         while searches < SEARCHES:
             searches += 1
             self._watcher.notify(Remark(f"{name}: {error}; searching the target"))

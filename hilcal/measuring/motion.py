@@ -46,7 +46,6 @@ class Mover:
 
     Attributes:
         goal: (n,) joint angles where the arm has been left, or goes; None while that is unknown.
-        hanging: names of the loads of which one hangs.
         side: (n,) from which each joint arrived, -1 or +1; 0 before its first motion.
         watch: compares what the force sensor feels with what should hang; None without a sensor.
     """
@@ -122,18 +121,10 @@ class Mover:
         return self.goal is not None and np.array_equal(q, self.goal)
 
     def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
-        """Return where the arm stands, once its way to a goal is free and people have agreed.
+        """Return where the arm stands (n,), once its way to a goal is free and people have agreed.
 
-        Where it does not stand where it was left, that is asked first, and checked anew after.
-
-        Args:
-            goal: (n,) where it goes next, rad.
-            name: of the goal.
-            left: (n,) where it was left, rad.
-            ask: asks a person to confirm a sentence; raises DeviceError where that is refused.
-
-        Returns:
-            (n,) joint angles, rad.
+        Where it does not stand where it was `left` (n,), rad, that is asked first, and checked anew
+        after; `ask` raises DeviceError where that is refused.
 
         Raises:
             DeviceError: the way is not free, or the person gave up.
@@ -184,11 +175,9 @@ class Mover:
                 )
 
     def move(self, q: Floats, name: str) -> None:
-        """Move in a straight line in joint space, which is checked from where the arm stands.
+        """Move to `q` (n,), rad, straight in joint space.
 
-        Args:
-            q: (n,) rad.
-            name: of the goal.
+        The way is checked from where the arm stands.
 
         Raises:
             LoadChangedError: the load is not what should hang any more.
@@ -211,7 +200,6 @@ class Mover:
         self.side = np.where(moved == 0.0, self.side, moved)
 
     def _go(self, start: Floats, q: Floats, name: str) -> None:
-        """Command a motion and look at it until it has arrived."""
         motion = self._motion
         self._arm.start_move(q, motion.speed_rad_s, motion.acceleration_rad_s2)
         usual = duration(start, q, motion.speed_rad_s, motion.acceleration_rad_s2)
@@ -244,15 +232,7 @@ class Mover:
     ) -> ArmSample:
         """Check that a motion keeps its straight line and goes on.
 
-        Args:
-            start: (n,) rad.
-            goal: (n,) rad.
-            sample: of now.
-            last: the first sample with the joint angles of now; None at the beginning.
-            name: of the goal.
-
-        Returns:
-            the first sample with the joint angles of now.
+        `last` is the first sample with the joint angles of before; returned is that of now.
         """
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)

@@ -30,27 +30,23 @@ class ArmAt:
 
 @dataclass(frozen=True, slots=True)
 class LiveResidual:
-    """A new reading against the prediction of a model that was fitted to the readings before it.
-
-    Attributes:
-        residual: distance of the reading from the prediction, m; None without a model yet.
-        sigma: the same in standard deviations of a prediction: 1 where the model is right.
-        uncertain: whether the model's own uncertainty is the larger part of them, because it is
-            fitted to few readings.
-        deflection: distance of the reading from the predicted unloaded position, m; None for an
-            unloaded reading, and without a model.
-        deflection_std: standard deviation of that distance, m.
-        vector: the residual as a vector, measured − predicted, base axes, m.
-        covariance: of that vector where the model is right, rows one after the other, m².
-    """
+    """A new reading against the prediction of a model that was fitted to the readings before it."""
 
     residual: float | None = None
+    """Distance of the reading from the prediction, m; None without a model yet."""
     sigma: float | None = None
+    """The same in standard deviations of a prediction: 1 where the model is right."""
     uncertain: bool = False
+    """Whether the model's own uncertainty is the larger part of them, because it is fitted to few
+    readings."""
     deflection: float | None = None
-    deflection_std: float = 0.0
+    """Distance of the reading from the predicted unloaded position, m; None for an unloaded
+    reading, and without a model."""
+    deflection_std: float = 0.0  # standard deviation of that distance, m
     vector: tuple[float, ...] | None = None
+    """The residual as a vector, measured − predicted, base axes, m."""
     covariance: tuple[float, ...] | None = None
+    """Of that vector where the model is right, rows one after the other, m²."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,34 +92,23 @@ class GoalMet:
 
 @dataclass(frozen=True, slots=True)
 class ReadingStored:
-    """A reading has been stored.
+    """A reading has been stored."""
 
-    Attributes:
-        step: its step.
-        done: readings that are stored now, in the whole campaign.
-        total: readings of the plan.
-        left_real: real seconds that the rest will take, from the time taken so far.
-        left_cell: the same in cell seconds; differs in a simulated cell only.
-        deflection: distance from the unloaded reading of the same pose and cycle, m; None for
-            an unloaded reading, and where there is none yet.
-        live: the reading, of the first target that was read, against a model; empty without one.
-        settling: how long the readings took to settle, cell seconds.
-        goal: status of the campaign's goal; None without one.
-        target: index of that target in the cell.
-        others: those that were read in the same arrival, each with its index.
-    """
-
-    step: Step
-    done: int
-    total: int
-    left_real: float
-    left_cell: float
+    step: Step  # its step
+    done: int  # readings that are stored now, in the whole campaign
+    total: int  # readings of the plan
+    left_real: float  # real seconds that the rest will take, from the time taken so far
+    left_cell: float  # the same in cell seconds; differs in a simulated cell only
     deflection: float | None = None
+    """Distance from the unloaded reading of the same pose and cycle, m; None for an unloaded
+    reading, and where there is none yet."""
     live: LiveResidual = LiveResidual()
-    settling: float = 0.0
-    goal: GoalStatus | None = None
-    target: int = 0
+    """The reading, of the first target that was read, against a model; empty without one."""
+    settling: float = 0.0  # how long the readings took to settle, cell seconds
+    goal: GoalStatus | None = None  # status of the campaign's goal; None without one
+    target: int = 0  # index of that target in the cell
     others: tuple[tuple[int, LiveResidual], ...] = ()
+    """Those that were read in the same arrival, each with its index."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
-"""One reading as a row of the campaign, everything raw behind it as JSON, and where both go."""
+"""One reading as a row of the campaign, and everything raw behind it as JSON."""
 
 from dataclasses import fields
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -11,39 +11,6 @@ from hilcal.measuring.measure import MeasuredStop
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import Step
 from hilcal.types import Floats
-
-
-class Store(Protocol):
-    """A campaign file that is being written.
-
-    What `record` and `event` have returned from survives a kill of the process. Both raise
-    InputError or DeviceError, one clear line, where it cannot be written.
-    """
-
-    def record(
-        self, reading: Readings, step: Step, detail: dict[str, Any], *more: dict[str, Any]
-    ) -> None:
-        """Store a step's reading with everything raw behind it, as one transaction.
-
-        Of several targets all that were read in the arrival: a row and a detail for each.
-        """
-        ...
-
-    def event(self, kind: str, content: dict[str, Any]) -> None:
-        """Store something that happened."""
-        ...
-
-    def done(self) -> frozenset[Step]:
-        """Return the steps whose readings are stored."""
-        ...
-
-    def details(self) -> list[dict[str, Any]]:
-        """Return the details of the stored readings, in order."""
-        ...
-
-    def readings(self) -> Readings | None:
-        """Return the stored readings, in order; None where there are none yet."""
-        ...
 
 
 def reading_of(
@@ -108,12 +75,8 @@ def detail(
 ) -> dict[str, Any]:
     """Return everything raw behind a reading.
 
-    Args:
-        step: which one.
-        measured: what was measured.
-        tared: the mean wrench against the session's zero; None without a force sensor.
-        zero: (6,) that zero.
-        session: further keys of the session: times, losses, sides.
+    `tared` is the mean wrench against the session's zero (6,), None without a force sensor;
+    `session` has further keys: times, losses, sides.
     """
     out: dict[str, Any] = {
         "pose": step.pose,

@@ -10,41 +10,26 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnloadedVisit:
-    """One unloaded reading.
-
-    Attributes:
-        pose: name of the pose.
-        position: (3,) m, sensor axes.
-        tracker: (3, 3) covariance of the instrument alone, m².
-        gain: tr(J Jᵀ) of the target's translation, m²/rad².
-    """
+    """One unloaded reading."""
 
     pose: str
-    position: Floats
-    tracker: Floats
-    gain: float
+    position: Floats  # (3,) m, sensor axes
+    tracker: Floats  # (3, 3) covariance of the instrument alone, m²
+    gain: float  # tr(J Jᵀ) of the target's translation, m²/rad²
 
 
 @dataclass(frozen=True, slots=True)
 class RepeatabilityEstimate:
-    """The scatter from one arrival to the next.
+    """The scatter from one arrival to the next."""
 
-    Attributes:
-        poses: poses with several readings.
-        dof: readings less poses.
-        scatter: rms distance of a reading from its pose's mean, m, unbiased.
-        instrument: the same as the instrument alone would make it, m.
-        joint_std: the scatter of every joint that explains the rest, rad; 0 where none is left.
-        iso_9283: the worst pose's RP = mean distance + 3 standard deviations of it, m
-            (ISO 9283, 7.2.2), the instrument's noise included; NaN in campaigns of older versions.
-    """
-
-    poses: int
-    dof: int
-    scatter: float
-    instrument: float
-    joint_std: float
+    poses: int  # poses with several readings
+    dof: int  # readings less poses
+    scatter: float  # rms distance of a reading from its pose's mean, m, unbiased
+    instrument: float  # the same as the instrument alone would make it, m
+    joint_std: float  # the scatter of every joint that explains the rest, rad; 0 where none is left
     iso_9283: float = float("nan")
+    """The worst pose's RP = mean distance + 3 standard deviations of it, m (ISO 9283, 7.2.2), the
+    instrument's noise included; NaN in campaigns of older versions."""
 
     @property
     def shown(self) -> bool:

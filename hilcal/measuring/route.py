@@ -16,21 +16,14 @@ APPROACH_RAD = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stop:
-    """A point of the route where the arm comes to rest.
-
-    Attributes:
-        name: the pose, in words.
-        q: (n,) commanded joint angles, rad.
-        hanging: name of the load under which the arm comes here.
-        change_to: name of the load that is hung here; None where nothing is changed.
-        step: the reading that is taken here; None where none is.
-    """
+    """A point of the route where the arm comes to rest."""
 
     name: str
-    q: Floats
-    hanging: str
+    q: Floats  # (n,) commanded joint angles, rad
+    hanging: str  # name of the load under which the arm comes here
     change_to: str | None = None
-    step: Step | None = None
+    """Name of the load that is hung here; None where nothing is changed."""
+    step: Step | None = None  # the reading that is taken here; None where none is
 
 
 def home(plan: Plan) -> str:
@@ -41,10 +34,7 @@ def home(plan: Plan) -> str:
 def beside(q: Floats, arm: Arm, margin: float) -> Floats:
     """Return (n,) where the arm comes from to a reference pose (n,) at the start, rad.
 
-    Args:
-        q: the reference pose, rad.
-        arm: the arm.
-        margin: distance kept from the joint limits, rad.
+    `margin` is the distance kept from the joint limits, rad.
     """
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
     return np.asarray(q - side * APPROACH_RAD)
@@ -53,14 +43,10 @@ def beside(q: Floats, arm: Arm, margin: float) -> Floats:
 def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """Return every stop for the steps of a plan.
 
-    The first two stops, at a little distance from the reference pose and there, move every
-    joint, so that the approach sides of all readings are known. Loads are changed at the
-    reference pose. A reading that repeats the one before it is approached anew.
-
-    Args:
-        plan: poses and steps.
-        arm: the arm; its limits say from which side the reference pose can be approached.
-        margin: distance kept from the joint limits, rad.
+    The first two stops, at a little distance from the reference pose and there, move every joint,
+    so that the approach sides of all readings are known; limits and margin (rad) say from which
+    side the reference pose can be approached. Loads are changed there. A reading that repeats the
+    one before it is approached anew.
     """
     base = home(plan)
     q_home = plan.joints(base)

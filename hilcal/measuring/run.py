@@ -12,11 +12,11 @@ from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import ArmDevice, Clock
 from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import route
 from hilcal.measuring.session import LiveModel, Session
 from hilcal.measuring.stopping_rule import StoppingRule
 from hilcal.store.plan import Plan
+from hilcal.store.run_log import RunLog
 
 HOW_ON = "The campaign is safe: run again with --resume"
 EMERGENCY = "press the emergency stop"
@@ -28,7 +28,7 @@ def run(
     cell: Cell,
     config: CellConfig,
     plan: Plan,
-    store: Store,
+    store: RunLog,
     clock: Clock,
     watcher: Watcher,
     live: LiveModel | None = None,
@@ -38,23 +38,11 @@ def run(
 ) -> None:
     """Measure what is missing of a plan, or as much of it as a goal needs.
 
-    Every reading is stored before the next motion. Whatever is raised, also an interrupt from
-    the keyboard, the arm is stopped before anything else is done. The rig stays open.
-
-    Args:
-        rig: the open devices.
-        cell: the cell.
-        config: its limits and how to measure.
-        plan: the whole plan; steps that the store has are left out.
-        store: where readings go.
-        clock: the cell's time.
-        watcher: receives the events.
-        live: compares each reading with a model; None for no comparison.
-        wall: the time of day, s; it carries the campaign's time over a pause.
-        goal: decides when the readings are enough; then the arm goes home, the load is taken
-            off, and the rest is not measured.
-        epoch: the time of day, s, that the campaign's time counts from; its first session's
-            beginning unless given.
+    Every reading is stored before the next motion. Whatever is raised, also an interrupt from the
+    keyboard, the arm is stopped before anything else is done. The rig stays open. `live` compares
+    each reading with a model. As soon as the `goal` is met the arm goes home, the load is taken
+    off, and the rest is not measured. `wall` is the time of day, s, which carries the campaign's
+    time over a pause; it counts from `epoch`, the first session's beginning unless given.
 
     Raises:
         InputError: the plan is not safe (names the first problem), or the store fails.
@@ -87,11 +75,7 @@ def refuse(checked: DryRun) -> None:
         InputError: names the first problem, and how many more there are.
     """
     if checked.problems:
-        more = len(checked.problems) - 1
-        others = f" (and {more} more: hilcal check --plan shows all)" if more else ""
-        raise InputError(
-            f"the plan is not safe to run, nothing has moved: {checked.problems[0]}{others}"
-        )
+        raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
 
 
 def _stop(arm: ArmDevice) -> str:
@@ -107,7 +91,7 @@ def _stop(arm: ArmDevice) -> str:
     return "interrupted"
 
 
-def _note(store: Store, error: BaseException, trouble: str) -> None:
+def _note(store: RunLog, error: BaseException, trouble: str) -> None:
     """Store why the session ended, as far as that is possible."""
     content: dict[str, Any] = {"wall_s": time.time(), "reason": _line(error)}
     if trouble:
@@ -122,7 +106,6 @@ def _note(store: Store, error: BaseException, trouble: str) -> None:
 
 
 def _raise(error: BaseException, trouble: str) -> None:
-    """Raise the error with how to go on."""
     if not isinstance(error, Exception) and not trouble:
         raise error
     text = _line(error)
@@ -140,7 +123,6 @@ def _sentence(text: str) -> str:
 
 
 def _line(error: BaseException) -> str:
-    """Return an error as one line."""
     if isinstance(error, KeyboardInterrupt):
         return "interrupted"
     words = " ".join(str(error).split()).rstrip(".;")

@@ -21,12 +21,13 @@ from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.reading_record import Store, detail, reading_of, sample_json, stored_wrench
+from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.measuring.route import Stop
 from hilcal.measuring.session_state import Eta, SessionState, Shift
 from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
 
 Done = TypeVar("Done")
@@ -43,7 +44,7 @@ class Session:
         cell: Cell,
         config: CellConfig,
         plan: Plan,
-        store: Store,
+        store: RunLog,
         clock: Clock,
         watcher: Watcher,
         live: LiveModel | None = None,
@@ -62,7 +63,14 @@ class Session:
         if rig.force is not None and config.force_sensor is not None:
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
         self._guard = Guard(cell, config)
-        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, self._passed)
+        self._mover = Mover(
+            rig.arm,
+            self._meter,
+            self._guard,
+            config,
+            clock,
+            lambda q: watcher.notify(ArmAt(tuple(q.tolist()))),
+        )
         self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
         self._hook = Hook(
             rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
@@ -141,7 +149,6 @@ class Session:
         self._finish()
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
-        """Go to a stop, change the load, tare, measure."""
 
         def visit() -> tuple[Readings, float] | None:
             self._move(stop)
@@ -232,9 +239,6 @@ class Session:
 
         Returns:
             the mean wrench and the joint angles (n,), rad; None without a sensor.
-
-        Raises:
-            LoadChangedError: by the zero so far, something hangs or touches the tool.
         """
         meter, watch = self._meter, self._mover.watch
         if meter is None or watch is None:
@@ -258,7 +262,6 @@ class Session:
         self._tared = name != UNLOADED
 
     def _identify(self) -> None:
-        """Find the tool from all unloaded readings so far."""
         if self._meter is None:
             return
         self._identified = len(self._state.tared_wrenches)
@@ -323,10 +326,6 @@ class Session:
         """Refuse the readings of an arrival of another target or another load.
 
         They are kept as doubted.
-
-        Raises:
-            LoadChangedError: what hangs is not what should hang.
-            DeviceError: one cannot be its target's.
         """
         wrong = next(filter(None, map(self._doubt, found)), None)
         if wrong is not None:
@@ -358,7 +357,6 @@ class Session:
         return LoadChangedError(wrong) if wrong else None
 
     def _row(self, stop: Stop, step: Step, one: TargetReading) -> tuple[Readings, dict[str, Any]]:
-        """One reading, and what is stored with it."""
         measured, tared = one.measured, self._tared_wrench(one.measured)
         elapsed = self._elapsed + one.ended - self._begun
         reading = reading_of(
@@ -435,10 +433,6 @@ class Session:
             self._watcher.notify(Remark(shift.words(limit)))
 
     # people
-
-    def _passed(self, q: Floats) -> None:
-        """Tell where the arm is on its way."""
-        self._watcher.notify(ArmAt(tuple(q.tolist())))
 
     def _tell(
         self, step: Step, reading: Readings, total: int, left: float, settling: float

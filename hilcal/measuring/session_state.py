@@ -17,15 +17,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Shift:
-    """How far a return lies from the first reading at the reference pose.
+    """How far a return lies from the first reading at the reference pose."""
 
-    Attributes:
-        metres: (3,) difference of the positions, sensor axes, m.
-        sigma: its size d in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d).
-    """
-
-    metres: Floats
-    sigma: float
+    metres: Floats  # (3,) difference of the positions, sensor axes, m
+    sigma: float  # its size d in standard deviations, sqrt(dᵀ (C₁ + C)⁻¹ d)
 
     def words(self, limit: float) -> str:
         """Return for people that it is over a limit, sigma."""
@@ -44,12 +39,9 @@ class Drift:
     _first: tuple[Floats, Floats] | None = field(default=None)
 
     def add(self, step: Step, position: Floats, covariance: Floats) -> Shift | None:
-        """Add a position; returns its shift where it is a return, else None.
+        """Add a position (3,), m; returns its shift where it is a return, else None.
 
-        Args:
-            step: which reading.
-            position: (3,) sensor axes, m.
-            covariance: (3, 3) of instrument and arm, m².
+        Sensor axes; `covariance` (3, 3) is that of instrument and arm, m².
         """
         if step.pose != REFERENCE or step.load != UNLOADED:
             return None
@@ -104,7 +96,6 @@ class SessionState:
     """Everything that is carried from reading to reading, and from session to session.
 
     Attributes:
-        registration: where the tracker roughly stands.
         tared_wrenches: the unloaded wrenches, from which the tool is identified.
         last_q: (n,) actual joint angles of the last reading, rad; None before the first.
     """
@@ -130,13 +121,8 @@ class SessionState:
     ) -> Shift | None:
         """Add a reading; returns its shift where it is a return to the reference.
 
-        Args:
-            step: which one.
-            q: (n,) actual joint angles, rad.
-            value: (m,) sensor axes.
-            covariance: (m, m) of the instrument alone.
-            tared: the mean wrench; None without a force sensor.
-            target: its number; drift, scatter and wrench are taken from the first one.
+        Joint angles `q` (n,) are the actual ones, rad; `value` (m,) is in sensor axes, `covariance`
+        (m, m) the instrument's alone. Drift, scatter and wrench are taken from the first target.
         """
         position = value[:3]
         self.last_q = q

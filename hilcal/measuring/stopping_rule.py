@@ -1,7 +1,7 @@
 """Ending a campaign as soon as its goal is met: the status of the goal, and the way home."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -9,38 +9,24 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, Watcher
-from hilcal.measuring.reading_record import Store
 from hilcal.measuring.route import Stop, home
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
+from hilcal.store.run_log import RunLog
 
-
-class StoppingRule(Protocol):
-    """Judges the readings of a campaign by its goal."""
-
-    def __call__(self, readings: Readings, last: bool) -> GoalStatus:
-        """Return how far the goal is.
-
-        Args:
-            readings: all readings so far.
-            last: whether the plan has no others; otherwise the answer may be that of a few
-                readings before, so that judging does not delay the campaign.
-        """
-        ...
+StoppingRule = Callable[[Readings, bool], GoalStatus]
+"""Tells from all readings so far how far the goal is. Unless it is told that the plan has no more,
+the answer may be that of a few readings before, so that judging does not delay the campaign."""
 
 
 class GoalCheck:
-    """Applies a stopping rule after each reading; does nothing where there is none.
-
-    Attributes:
-        status: that of the last check; None before any.
-    """
+    """Applies a stopping rule after each reading; does nothing where there is none."""
 
     def __init__(
         self,
         rule: StoppingRule | None,
         plan: Plan,
-        store: Store,
+        store: RunLog,
         watcher: Watcher,
         event: Callable[[str, dict[str, Any]], None],
     ) -> None:
@@ -73,16 +59,10 @@ def way_home(
 ) -> tuple[Stop, ...]:
     """Return the way to the reference pose, where the load is taken off and the drift is read.
 
-    The arm goes straight where that is clear; else back the way it came, which is clear, until
-    the straight way is. The reading is the next return to the reference pose that the plan holds.
-
-    Args:
-        cell: the cell.
-        config: its limits.
-        plan: the whole plan.
-        behind: where the arm has been in this session, the reference pose among it; it stands
-            at the last of these stops.
-        done: steps that are measured.
+    The arm goes straight where that is clear; else back the way it came, which is clear, until the
+    straight way is. The reading is the next return to the reference pose that the plan holds.
+    `behind` is where the arm has been in this session, the reference pose among it; it stands at
+    the last of these stops. `done` are the steps that are measured.
     """
     base = home(plan)
     q_home, here = plan.joints(base), behind[-1]

@@ -25,27 +25,16 @@ MIN_SPREAD = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolLoad:
-    """A sensor's zero and the tool it carries.
+    """A sensor's zero and the tool it carries."""
 
-    Attributes:
-        bias: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        mass: of the tool beyond the sensor, kg.
-        moment: (3,) mass times centre of mass, kg·m, sensor axes from its origin.
-        covariance: (10, 10) of (bias, mass, moment); zero for what was not estimated.
-        gravity: (3,) base axes, m/s².
-        chi2: sum of squared whitened residuals.
-        dof: its degrees of freedom; 0 after a tare.
-        poses: number of readings used.
-    """
-
-    bias: Floats
-    mass: float
-    moment: Floats
-    covariance: Floats
-    gravity: Floats
-    chi2: float
-    dof: int
-    poses: int
+    bias: Floats  # (6,) what the sensor reads with nothing on it, N and N·m, sensor axes
+    mass: float  # of the tool beyond the sensor, kg
+    moment: Floats  # (3,) mass times centre of mass, kg·m, sensor axes from its origin
+    covariance: Floats  # (10, 10) of (bias, mass, moment); zero for what was not estimated
+    gravity: Floats  # (3,) base axes, m/s²
+    chi2: float  # sum of squared whitened residuals
+    dof: int  # its degrees of freedom; 0 after a tare
+    poses: int  # number of readings used
 
     @property
     def com(self) -> Floats:
@@ -75,20 +64,17 @@ class ToolLoad:
     def load_wrench(self, wrench: Floats, rotation: Floats) -> Floats:
         """Return the load's wrench (..., 6) at the sensor's origin, base axes, N and N·m.
 
-        Args:
-            wrench: (..., 6) readings, sensor axes.
-            rotation: (..., 3, 3) R_base_sensor.
+        Readings (..., 6) are in sensor axes; `rotation` (..., 3, 3) is R_base_sensor.
         """
-        return _turned(np.asarray(wrench) - self.tool_wrench(rotation), np.asarray(rotation))
+        own = np.asarray(wrench) - self.tool_wrench(rotation)
+        parts = own.reshape(*own.shape[:-1], 2, 3)
+        return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(own.shape))
 
     def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
         """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
 
-        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R) and D the design matrix.
-
-        Args:
-            covariance: (6, 6) of the reading (a mean's, if a mean), sensor axes.
-            rotation: (3, 3) R_base_sensor.
+        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R), R = R_base_sensor, and D the
+        design matrix; that of the reading (a mean's, if a mean) is in sensor axes.
         """
         D = design(np.asarray(rotation), self.gravity)
         B = np.kron(np.eye(2), rotation)
@@ -98,9 +84,7 @@ class ToolLoad:
 def design(rotation: Floats, gravity: Floats) -> Floats:
     """Return D (..., 6, 10) with reading = D x for x = (b_f, b_M, m, m c) and no load.
 
-    Args:
-        rotation: (..., 3, 3) R_base_sensor.
-        gravity: (3,) base axes, m/s².
+    `rotation` (..., 3, 3) is R_base_sensor, gravity (3,) in base axes, m/s².
     """
     u = np.swapaxes(rotation, -1, -2) @ np.asarray(gravity, dtype=np.float64)
     out = np.zeros((*u.shape[:-1], 6, PARAMETERS))
@@ -187,27 +171,16 @@ def tare(
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
-    """Return a wrench (..., 6) taken at a point that lies `arm` further, same axes.
+    """Return a wrench (..., 6) taken at a point that lies `arm` (..., 3) further, same axes, SI.
 
     f' = f,  M' = M - arm × f
-
-    Args:
-        wrench: (..., 6) force and moment, N and N·m.
-        arm: (..., 3) from the old point to the new one, m.
     """
     wrench = np.asarray(wrench, dtype=np.float64)
     force, moment = wrench[..., :3], wrench[..., 3:]
     return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
 
 
-def _turned(wrench: Floats, rotation: Floats) -> Floats:
-    """Wrench (..., 6) in the axes that rotation (..., 3, 3) maps into."""
-    parts = wrench.reshape(*wrench.shape[:-1], 2, 3)
-    return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(wrench.shape))
-
-
 def _check(wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats) -> None:
-    """Refuse arrays that cannot be readings."""
     K = len(wrench)
     wanted = {"wrench": (K, 6), "covariance": (K, 6, 6), "rotation": (K, 3, 3), "gravity": (3,)}
     given = {
@@ -248,19 +221,14 @@ def _check_orientations(rotation: Floats, gravity: Floats) -> None:
         values = np.linalg.svd(u - u.mean(axis=0), compute_uv=False) / np.sqrt(K)
         spread[: len(values[:2])] = values[:2]
     if spread[0] < MIN_SPREAD:
-        missing = "mass and centre of mass"
+        along, missing = "one direction", "mass and centre of mass"
     elif spread[1] < MIN_SPREAD:
-        missing = "centre of mass in one direction"
+        along, missing = "two directions", "centre of mass in one direction"
     else:
         return
     raise CannotAnswerError(
         f"force sensor: {K} unloaded reading{'s' * (K != 1)} with gravity along "
-        f"{_directions(spread)} of the sensor do not determine the tool's {missing}; measure "
+        f"{along} of the sensor do not determine the tool's {missing}; measure "
         "unloaded at 3 or more poses that turn the flange about two different horizontal axes, "
         "30° or more"
     )
-
-
-def _directions(spread: Floats) -> str:
-    """How many directions of gravity there are, in words."""
-    return "one direction" if spread[0] < MIN_SPREAD else "two directions"

@@ -4,7 +4,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, KeyTable
-from hilcal.doctor.finding import Finding
+from hilcal.doctor.computer import Finding
 from hilcal.present.document import Block, Words, heading, pairs, table
 from hilcal.tables.guessing.proposal import Proposal
 

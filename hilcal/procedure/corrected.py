@@ -1,6 +1,6 @@
 """The run at corrected joint targets: its plan, and its readings beside those of validation."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -20,6 +20,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.route import approach_sides, duration, route
 from hilcal.present.calibration import refusals
+from hilcal.present.progress import Say
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import se3
@@ -27,27 +28,18 @@ from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan
 from hilcal.types import Bools, Floats, Ints
 
-Say = Callable[[str], None]
-
 POINTS, LEFT_OUT = "points", "left_out"
 """Keys of a plan's file: what was expected of each point, and which are missing."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPoints:
-    """K readings of a validation campaign whose poses are to be corrected.
+    """K readings of a validation campaign whose poses are to be corrected."""
 
-    Attributes:
-        rows: (K,) of the readings.
-        unloaded: (K,) rows of their unloaded readings, for a fit to deflections; -1 otherwise.
-        names: of the corrected poses.
-        loads: name of each one's load.
-    """
-
-    rows: Ints
-    unloaded: Ints
+    rows: Ints  # (K,) of the readings
+    unloaded: Ints  # (K,) rows of their unloaded readings, for a fit to deflections; -1 otherwise
     names: tuple[str, ...]
-    loads: tuple[str, ...]
+    loads: tuple[str, ...]  # name of each one's load
 
 
 def points_of(readings: Readings, mode: str) -> CorrectedPoints:
@@ -95,18 +87,10 @@ def corrected_plan(
 
     A point's joint values are found for the state in which its reading will be taken: the wrench
     that was measured in the validation, sides of approach and times as the route gives them,
-    temperatures as they were last. Points that cannot be corrected, or that the cell does not
-    allow at their corrected values, are left out; the plan says which.
-
-    Args:
-        cell: the cell as configured.
-        config: its limits and loads.
-        calibration: by which the points are corrected.
-        validation: the readings of the validation campaign.
-        reference: (n,) joints of its reference pose, rad.
-        begun: when the plan begins, in the time of the campaign, s.
-        rng: generator.
-        say: takes progress, one line each.
+    temperatures as they were last. Points that cannot be corrected, or that the cell does not allow
+    at their corrected values, are left out; the plan says which. `reference` (n,) are the joints of
+    the validation's reference pose, rad; the plan begins at `begun`, in the time of the campaign,
+    s.
 
     Raises:
         CannotAnswerError: no point is left.
@@ -191,7 +175,6 @@ def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -
 
 
 def _told(of: CorrectedPoints, order: Ints, found: Compensation) -> list[dict[str, Any]]:
-    """Return what is expected of each point, for the plan's file."""
     before, band = found.before.error_m, found.after.band_m
     return [
         {
@@ -259,18 +242,12 @@ def expected_of(plan: Plan) -> tuple[list[dict[str, Any]], list[tuple[str, str]]
 def expected_states(
     plan: Plan, arm: Arm, config: CellConfig, wrench: Floats, last: States, begun: float
 ) -> States:
-    """Return the state of each step of a plan.
+    """Return the state of each of the S steps of a plan.
 
-    Sides of approach and times under load follow from the route, as a session takes it. Joints
-    and air are as warm as in the last reading.
-
-    Args:
-        plan: S steps.
-        arm: the arm.
-        config: its motion, and how long a reading and a change of the load take.
-        wrench: (S, 6) of each step's load at the load point, base axes, N and N·m.
-        last: one state, of the last reading before; its columns are those that are returned.
-        begun: when the plan begins, in the time of the campaign, s.
+    Sides of approach and times under load follow from the route, as a session takes it. Joints and
+    air are as warm as in the last reading, the one state `last`, whose columns are returned.
+    `wrench` (S, 6) is that of each step's load at the load point, base axes, N and N·m; the plan
+    begins at `begun`, in the time of the campaign, s.
     """
     at = pace(config)
     stops = route(plan, arm, config.limits.joint_margin_rad)

@@ -1,6 +1,5 @@
 """Whether more is to be measured: what is in doubt, and what a further plan would tell."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,15 +14,14 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import about
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.procedure.separate import doubt_of, plan_of, separating
+from hilcal.present.progress import Say
+from hilcal.procedure.next_plan import doubt_of, plan_of, separating
 from hilcal.procedure.state import Settings, duration_of
 from hilcal.procedure.validation_plan import RECORDED
 from hilcal.readings.readings import States
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
 from hilcal.types import Floats
-
-Say = Callable[[str], None]
 
 WORTH = 0.05
 """Share by which a further plan must lower the predicted error to be worth its time; a choice."""
@@ -38,42 +36,29 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True)
 class PredictedError:
-    """Distances within which 95 % of points are after compensation, as the fit states them.
+    """Distances within which 95 % of points are after compensation, as the fit states them."""
 
-    Attributes:
-        now_m: all of it.
-        floor_m: what no further reading lowers: the arm's repeatability, and what the model leaves.
-    """
-
-    now_m: float
+    now_m: float  # all of it
     floor_m: float
+    """What no further reading lowers: the arm's repeatability, and what the model leaves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Decision:
-    """What to do after a refinement.
-
-    Attributes:
-        reason: "adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured;
-            "floor", "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs
-            too much; the verdict where no measurement would help.
-        verdict: of the refinement.
-        error: predicted after compensation.
-        then_m: the same after the further plan; None where it is about a doubt.
-        suspects: effects in doubt.
-        power: least chance of separating two of them after the further plan.
-        plan: the further plan, that is measured unless the reason is "time"; None without one.
-        seconds: how long it takes, cell s.
-    """
+    """What to do after a refinement."""
 
     reason: str
+    """"adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured; "floor",
+    "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs too much; the
+    verdict where no measurement would help."""
     verdict: str
     error: PredictedError
-    then_m: float | None = None
-    suspects: tuple[str, ...] = ()
-    power: float | None = None
+    then_m: float | None = None  # the same after the further plan; None where it is about a doubt
+    suspects: tuple[str, ...] = ()  # effects in doubt
+    power: float | None = None  # least chance of separating two of them after the further plan
     plan: Plan | None = None
-    seconds: float = 0.0
+    """The further plan, that is measured unless the reason is "time"; None without one."""
+    seconds: float = 0.0  # how long it takes, cell s
 
     @property
     def measures(self) -> bool:
@@ -108,17 +93,8 @@ def decide(
     """Decide whether to measure more, and what.
 
     A doubt between effects comes first; then a predicted error above the goal. A further plan is
-    measured where it would tell more and the time allows it.
-
-    Args:
-        cell: the cell as configured.
-        config: its limits and loads.
-        settings: the goal, and how long measuring may last.
-        d: the diagnosis of the last fit.
-        plans: of the campaign so far.
-        reference: (n,) joints of its reference pose, rad.
-        rng: generator.
-        say: takes progress, one line each.
+    measured where it would tell more and the time allows it. `d` is the diagnosis of the last fit,
+    `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
     """
     error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
     verdict: str = d.verdict
@@ -145,11 +121,6 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
 
     At `[planning] work_q_rad` where it is given, else half-way between measured poses, under the
     loads of the readings: the distance that 95 % of all these points are within.
-
-    Args:
-        calibration: the fit.
-        fitted: states that it was fitted to.
-        config: `[planning]`.
     """
     states = _work(fitted, config)
     columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
@@ -165,7 +136,6 @@ def predicted_error(calibration: Calibration, fitted: States, config: CellConfig
 
 
 def _work(fitted: States, config: CellConfig) -> States:
-    """Return states where the error is predicted."""
     loaded = np.flatnonzero(np.any(fitted.wrench != 0, axis=1))
     rows = loaded if len(loaded) else np.arange(len(fitted))
     rows = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(np.int64)]

@@ -1,6 +1,6 @@
-"""The plan of the next measurements, made from what a diagnosis leaves open; why there is none."""
+"""What a diagnosis leaves open, the measurements that would settle it, and why there are none."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -8,33 +8,101 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import CheckedPlan, checked
-from hilcal.design.next import Next
-from hilcal.design.summary import summarise
+from hilcal.design.many_poses import measure_poses
+from hilcal.design.next import Next, PairPower, measure_next
+from hilcal.design.planner import Request
+from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.effect_ranking import Suspect
+from hilcal.diagnosis.more_poses import pose_powers
+from hilcal.diagnosis.pose_alone import PoseAlone
+from hilcal.diagnosis.stepwise import remove
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.fit import Fit
 from hilcal.names import quoted
-from hilcal.procedure.separate import Doubt, Say, plan_of, separating, without
-from hilcal.procedure.shared import reference_in
+from hilcal.present.progress import Say
+from hilcal.procedure.state import reference_in
+from hilcal.store.plan import Plan
+from hilcal.types import Floats
 
 POSES = 20
 """Poses where the doubt does not say how many it needs; a choice."""
 
 
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What is to be separated."""
+
+    fit: Fit  # of a model without the suspects
+    suspects: tuple[str, ...]  # the effects
+    alone: PoseAlone | None = None
+    """The misfit where more poses, unloaded, are what tells of it; None else."""
+
+
+def doubt_of(d: Diagnosis, say: Say = lambda words: None) -> Doubt | None:
+    """Return what a diagnosis leaves open; None where nothing is, or an option settles it."""
+    suspects = in_doubt(d)
+    if not suspects or any(s.coarse for s in d.suspects if s.effect in suspects):
+        return None
+    a = d.pose_alone
+    alone = a if a is not None and a.chance is not None and d.fit.mode == "absolute" else None
+    return Doubt(without(d.fit, suspects, say), suspects, alone)
+
+
+def without(found: Fit, suspects: tuple[str, ...], say: Say = lambda words: None) -> Fit:
+    """Return the fit of a model without some effects."""
+    for name in suspects:
+        if name in found.model.names:
+            say(f"fitting without {name}")
+            found = remove(found, name)
+    return found
+
+
+def separating(
+    cell: Cell,
+    config: CellConfig,
+    doubt: Doubt,
+    poses: int | None,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+    reference: Floats | None = None,
+    usual: int = 20,
+) -> Next:
+    """Plan the measurements that separate the suspects of a doubt.
+
+    As many readings as so many poses take, as many as the doubt needs, or `usual` where neither is
+    known. `reference` (n,) are the joints of the campaign's reference pose, rad.
+
+    Raises:
+        InputError: suspects that cannot be.
+        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    """
+    before, effects = doubt.fit, doubt.suspects
+    if doubt.alone is None:
+        asked = Request(usual if poses is None else poses)
+        return measure_next(cell, config, before, effects, asked, rng, say, reference)
+    count = doubt.alone.more if poses is None else poses
+    planned = measure_poses(cell, config, before, count, rng, say, reference)
+    say("predicting the powers")
+    powers = tuple(PairPower(*row, False) for row in pose_powers(before, effects, count))
+    return Next(planned, powers, {}, 1.0, ())
+
+
+def plan_of(found: Next, suspects: tuple[str, ...]) -> Plan:
+    """Return the plan with what its file says of it."""
+    told = [[t.effect, t.rival, round(t.then, 4)] for t in found.powers]
+    more = {**about(found.planned), "suspects": list(suspects), "separates": told}
+    return replace(found.planned.ordered.plan, about=more)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class NextPlan:
-    """The next measurements.
+    """The next measurements."""
 
-    Attributes:
-        doubt: what they separate.
-        found: how well, pair by pair.
-        made: the plan, which may be run.
-    """
-
-    doubt: Doubt
-    found: Next
-    made: CheckedPlan
+    doubt: Doubt  # what they separate
+    found: Next  # how well, pair by pair
+    made: CheckedPlan  # the plan, which may be run
 
 
 def next_plan(
@@ -49,14 +117,8 @@ def next_plan(
 ) -> NextPlan:
     """Plan the measurements that settle a doubt, and check every motion in a dry run.
 
-    Args:
-        o: the campaign.
-        doubt: what is to be separated.
-        poses: as many readings as so many poses take; what the doubt needs where None.
-        rng: generator.
-        say: takes progress, one line each.
-        cell: configuration and cell, where they are not the campaign's any more.
-        compare: whether to compare criteria and numbers of poses as well, which takes longer.
+    As many readings as so many poses take; what the doubt needs where None. `cell` is given where
+    it is not the campaign's any more. To `compare` criteria and numbers of poses takes longer.
 
     Raises:
         InputError: suspects that cannot be, or a plan that may not be run.
@@ -77,15 +139,13 @@ def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
     Raises:
         CannotAnswerError: nothing is in doubt; says what else to do.
     """
-    suspects = in_doubt(d)
-    if not suspects:
-        raise CannotAnswerError(_settled(o, d))
-    finer = [s for s in d.suspects if s.coarse and s.effect in suspects]
+    found = doubt_of(d, say)
+    if found is not None:
+        return found
+    finer = [s for s in d.suspects if s.coarse and s.effect in in_doubt(d)]
     if finer:
         raise CannotAnswerError(f"not two effects, but one in doubt: {_differ(o, finer[0])}")
-    a = d.pose_alone
-    alone = a if a is not None and a.chance is not None and d.fit.mode == "absolute" else None
-    return Doubt(without(d.fit, suspects, say), suspects, alone)
+    raise CannotAnswerError(_settled(o, d))
 
 
 def _settled(o: Campaign, d: Diagnosis) -> str:

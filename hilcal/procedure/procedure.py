@@ -7,6 +7,9 @@
 A step that was cut short has either appended all of its result or nothing; readings are stored one
 by one. So the next step follows from the files (`state.next_step`), whatever has stopped the one
 before, and nothing is measured twice.
+
+The validation campaign is a file of its own. Before anything is predicted of it, its hash enters
+the calibration's log; from then on it has to be just this.
 """
 
 import itertools
@@ -15,6 +18,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.improvement import Improvement, improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
@@ -24,49 +31,84 @@ from hilcal.design.summary import about, remarks, summarise
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
+from hilcal.identification import validation
+from hilcal.identification.acceptance import Acceptance, acceptance
+from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
+from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.extrapolation import extrapolation
+from hilcal.identification.full_covariance import full_readings
+from hilcal.present.progress import Say
+from hilcal.procedure.corrected import corrected_plan, expected_of, paired
 from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
-from hilcal.procedure.shared import reference_of
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,
+    FROZEN,
+    IMPROVED,
     MEASURE,
     REFINED,
     STOP,
+    VALIDATED,
+    Files,
     ProcedureStep,
     Settings,
+    identity,
     next_step,
+    opened,
+    reference_in,
+    reference_of,
     settings_of,
 )
-from hilcal.procedure.validation_steps import ValidationSteps
+from hilcal.procedure.validation_plan import validation_plan
+from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.readings.readings import Readings
+from hilcal.readings.same_readings import already
+from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan
+from hilcal.store.plan import Plan, read_plan
 from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
+from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.store.records import content_hash
+from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
-Say = Callable[[str], None]
 Measure = Callable[[CampaignFile, float | None], None]
 """Measures what is missing of a campaign's plan and stores it there; the time of day, s, that its
 time counts from is given where it is not its own."""
 
-_FIRST, _FURTHER = 0, 1
-"""Streams of random numbers; those of the steps that test follow."""
+_FIRST, _FURTHER, _VALIDATING, _CORRECTING = range(4)
+"""Streams of random numbers."""
 
 
 @dataclass(frozen=True, eq=False)
-class Procedure(ValidationSteps):
+class Procedure:
     """A calibration in a cell.
 
     >>> p = hc.Procedure.at("new.hilcal", hc.Cell.load(CELL), poses=6)
     >>> p.next().kind
     'plan'
 
-    Its attributes are those of `Shared`.
+    Attributes:
+        run: the campaign file that is fitted; the others stand beside it.
+        cell: the cell as configured.
+        config: its configuration.
+        base_dir: directory that paths in the configuration are relative to.
+        catalogue: the effects that a model can have.
+        settings: what is asked for.
+        known: the prior of every fit, of `settings.prior`; None without one.
     """
 
+    run: Path
+    cell: Cell
+    config: CellConfig
+    base_dir: Path
+    catalogue: Catalogue
+    settings: Settings
+    known: CarriedPrior | None = None
     _found: list[Refinement] = field(default_factory=list, repr=False)
 
     @classmethod
@@ -91,6 +133,20 @@ class Procedure(ValidationSteps):
         readings = config.planning.readings if config.loads else "absolute"
         usual = Settings(seed=config.simulation.seed, readings=readings)
         return cls(path, cell, config, cell.base_dir.absolute(), known, replace(usual, **asked))
+
+    @property
+    def files(self) -> Files:
+        """Its files."""
+        return Files(self.run)
+
+    def record(self) -> RevisionRecord:
+        """Return the revision that the last refinement ended with.
+
+        Raises:
+            InputError: there is none.
+        """
+        with Campaign.open(self.run, self.catalogue, read_only=True) as o:
+            return self._record(o)
 
     def next(self) -> ProcedureStep:
         """Return the next step."""
@@ -119,10 +175,8 @@ class Procedure(ValidationSteps):
     def begin(self, plan: Plan, config: CellConfig, *, covers: str = INSTRUMENT) -> None:
         """Make the campaign file with its first plan.
 
-        Args:
-            plan: the plan.
-            config: the configuration that the file holds, with the devices that are used.
-            covers: what the covariance of the readings will cover.
+        `config` is what the file holds, with the devices that are used; `covers` what the
+        covariance of the readings will cover.
 
         Raises:
             InputError: it cannot be written, or is there already.
@@ -263,6 +317,195 @@ class Procedure(ValidationSteps):
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             calibration, record = self._calibration(o)
             return predicted_error(calibration, o.fitted_readings(record).states, self.config)
+
+    # testing what is never fitted
+
+    def plan_validation(self, say: Say = lambda words: None) -> Plan:
+        """Choose poses and loads of the validation campaign, and make its file.
+
+        Raises:
+            CannotAnswerError: no pose is left.
+        """
+        with Campaign.open(self.run, self.catalogue, read_only=True) as o:
+            say("restoring the model")
+            calibration, record = self._calibration(o)
+            plan = validation_plan(
+                self.cell,
+                self.config,
+                calibration,
+                o.fitted_readings(record),
+                reference_in(o.file),
+                self.settings.validation,
+                self._rng(_VALIDATING),
+                say,
+                under_load=self.settings.under_load,
+            )
+            self._create(self.files.validation, VALIDATION, plan, o)
+        return plan
+
+    def validate(self, say: Say = lambda words: None) -> Acceptance:
+        """Freeze the validation campaign, and predict its readings.
+
+        Raises:
+            InputError: readings of it were fitted, or it has changed since it was frozen.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+        ):
+            log = ProcedureLog(o.file)
+            self._freeze(log, unseen)
+            record = self._record(o)
+            fitted = o.fitted_readings(record)
+            readings = self._readings(o, record, unseen)
+            if already(readings, fitted).any():
+                raise InputError(
+                    f"{unseen.path}: some of its readings were fitted by revision "
+                    f"{record.number} of {self.run}; they test nothing"
+                )
+            say(f"predicting {len(readings)} readings")
+            model, theta = o.restore_model(record)
+            mode = self._mode(fitted)
+            found = validation.validate(model, theta, fitted, readings, mode)
+            beyond = extrapolation(o.predictive(record, model, theta), fitted, found)
+            shares = acceptance(found, beyond)
+            every = shares.everything
+            log.append(
+                VALIDATED,
+                {
+                    "revision": record.number,
+                    "error": found.error.to_json(),
+                    "noise_floor_m": found.noise_floor,
+                    "stated_m": every.stated_m,
+                    "within": every.within,
+                },
+            )
+        return shares
+
+    def _freeze(self, log: ProcedureLog, unseen: CampaignFile) -> None:
+        """Record the hash of the validation campaign; later it has to be the same."""
+        frozen, readings = log.last(FROZEN), unseen.readings()
+        hashed = content_hash(readings)
+        if frozen is None:
+            content = {"file": unseen.path.name, "readings_sha256": hashed}
+            log.append(FROZEN, {**content, "readings": len(readings)})
+        elif frozen["readings_sha256"] != hashed:
+            raise InputError(
+                f"{unseen.path}: other readings than when it was frozen "
+                f"(SHA-256 {frozen['readings_sha256'][:12]}…, now {hashed[:12]}…)"
+            )
+
+    def correct(self, say: Say = lambda words: None) -> Plan:
+        """Correct the joint targets of the validation poses, and make the file of their run.
+
+        Raises:
+            CannotAnswerError: no point can be corrected.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+        ):
+            self._freeze(ProcedureLog(o.file), unseen)
+            say("restoring the model")
+            calibration, record = self._calibration(o)
+            readings = self._readings(o, record, unseen)
+            made = read_plan(unseen.about(PLAN) or "", f"{unseen.path}, its plan")
+            reference = reference_of(made)
+            time = readings.states.time
+            plan = corrected_plan(
+                self.cell,
+                self.config,
+                calibration,
+                readings,
+                readings.states.q[0] if reference is None else reference,
+                0.0 if time is None else float(time[-1]),
+                self._rng(_CORRECTING),
+                say,
+            )
+            self._create(self.files.corrected, CORRECTED, plan, o)
+        return plan
+
+    def compare(self, say: Say = lambda words: None) -> Improvement:
+        """Compare the errors at uncorrected and at corrected joint targets, as measured.
+
+        Raises:
+            InputError: the validation campaign has changed since it was frozen.
+        """
+        with (
+            Campaign.open(self.run, self.catalogue) as o,
+            opened(self.files.validation, VALIDATION, self.run) as unseen,
+            opened(self.files.corrected, CORRECTED, self.run) as moved,
+        ):
+            log = ProcedureLog(o.file)
+            self._freeze(log, unseen)
+            say("comparing errors before and after")
+            calibration, record = self._calibration(o)
+            first, last = (self._readings(o, record, file) for file in (unseen, moved))
+            before, after = paired(first, last, calibration.mode)
+            _, left_out = expected_of(read_plan(moved.about(PLAN) or "", f"{moved.path}, its plan"))
+            model, theta = o.restore_model(record)
+            found = improvement(
+                calibration,
+                o.predictive(record, model, theta),
+                before,
+                after,
+                before.states,
+                left_out,
+            )
+            if log.last(IMPROVED) is None:
+                content = {"revision": record.number, "readings_sha256": moved.data_hash()}
+                log.append(IMPROVED, {**content, **found.to_dict()})
+        return found
+
+    # what the steps share
+
+    def _rng(self, *stream: int) -> np.random.Generator:
+        return np.random.default_rng([self.settings.seed, *stream])
+
+    def _planned(self) -> CellConfig:
+        """Return the configuration for planning: of the kind of readings that is fitted."""
+        planning = self.config.planning.model_copy(update={"readings": self.settings.readings})
+        return self.config.model_copy(update={"planning": planning})
+
+    def _mode(self, readings: Readings) -> Mode:
+        """Return the kind of readings that is fitted; deflections where the readings allow."""
+        return usual_mode(readings, self.settings.readings)
+
+    def _record(self, o: Campaign) -> RevisionRecord:
+        refined = ProcedureLog(o.file).last(REFINED)
+        if refined is None:
+            raise InputError(f"{self.run}: not refined yet")
+        return o.file.revision(int(refined["revisions"][-1]))
+
+    def _calibration(self, o: Campaign) -> tuple[Calibration, RevisionRecord]:
+        record = self._record(o)
+        return o.calibration(record.number), record
+
+    def _readings(self, o: Campaign, record: RevisionRecord, file: CampaignFile) -> Readings:
+        """Return the readings of another file with the covariance that the fit takes them for."""
+        model, _ = o.restore_model(record)
+        known = (True,) * len(model.cell.known_targets)
+        cell = replace(model.cell, registration_known=True)
+        cell = cell.with_targets(cell.all_targets, known)
+        found = full_readings(file.readings(), file.about(COVERS), cell, o.config)
+        scatter = record.parameters_json.get("arm_scatter")
+        if scatter is None:
+            return found
+        return with_arm_scatter(cell, found, ArmScatter.from_json(scatter))
+
+    def _create(self, path: Path, purpose: str, plan: Plan, o: Campaign) -> None:
+        more = {
+            PURPOSE: purpose,
+            CALIBRATION: identity(self.run),
+            COVERS: o.file.about(COVERS) or INSTRUMENT,
+        }
+        config = CellConfig.from_json(o.file.config_json)
+        source = self._source(f"{purpose} campaign of {self.run.name}, ")
+        create_run(path, config, self.base_dir, plan, source=source, more=more).close()
+
+    def _source(self, what: str = "") -> str:
+        how = "measured" if self.settings.hide is None else "rehearsed in a simulated cell"
+        return f"{what}{how} by hilcal calibrate"
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:

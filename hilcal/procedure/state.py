@@ -8,10 +8,11 @@ from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan
+from hilcal.store.plan import REFERENCE, Plan, read_plan
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.store.run_log import RunLog
+from hilcal.store.run_log import PLAN, RunLog
+from hilcal.types import Floats
 
 Kind = Literal[
     "plan",
@@ -45,32 +46,23 @@ SUFFIX = ".hilcal"
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What a calibration was asked for; kept in its campaign.
+    """What a calibration was asked for; kept in its campaign."""
 
-    Attributes:
-        poses: size of the first plan, and of further ones.
-        validation: poses of the validation campaign.
-        max_time_s: how long measuring may last in all plans together, as they state it, cell s.
-        goal_m: the error that is wanted after compensation: 95 % of the points within it; None for
-            no goal beside an adequate model.
-        limit_m: the largest error that is allowed at corrected targets; None for none.
-        seed: of everything random.
-        readings: kind of readings that is fitted.
-        hide: what a rehearsal hides in its simulated cell; None on real devices.
-        prior: file of the campaign or the posterior that is the prior of every fit; None without.
-        under_load: whether the model is tested under loads alone, where there are any.
-    """
-
-    poses: int = 20
-    validation: int = 20
+    poses: int = 20  # size of the first plan, and of further ones
+    validation: int = 20  # poses of the validation campaign
     max_time_s: float = 7200.0
+    """How long measuring may last in all plans together, as they state it, cell s."""
     goal_m: float | None = None
+    """The error that is wanted after compensation: 95 % of the points within it; None for no goal
+    beside an adequate model."""
     limit_m: float | None = None
-    seed: int = 0
-    readings: Mode = "deflection"
-    hide: str | None = None
-    under_load: bool = False
+    """The largest error that is allowed at corrected targets; None for none."""
+    seed: int = 0  # of everything random
+    readings: Mode = "deflection"  # kind of readings that is fitted
+    hide: str | None = None  # what a rehearsal hides in its simulated cell; None on real devices
+    under_load: bool = False  # whether the model is tested under loads alone, where there are any
     prior: str | None = None
+    """File of the campaign or the posterior that is the prior of every fit; None without."""
 
     def to_json(self) -> dict[str, Any]:
         """Return it as JSON."""
@@ -84,13 +76,9 @@ class Settings:
 
 @dataclass(frozen=True, slots=True)
 class Files:
-    """The files of a calibration.
+    """The files of a calibration."""
 
-    Attributes:
-        run: the campaign that is fitted.
-    """
-
-    run: Path
+    run: Path  # the campaign that is fitted
 
     @property
     def validation(self) -> Path:
@@ -108,23 +96,14 @@ class Files:
 
 @dataclass(frozen=True, slots=True)
 class ProcedureStep:
-    """What a calibration does next.
+    """What a calibration does next."""
 
-    Attributes:
-        kind: what.
-        path: the campaign that it is about.
-        missing: readings that are missing, where the arm moves.
-        planned: readings of the plan, where the arm moves.
-        load_changes: how often a person has to change the load, where the arm moves.
-        seconds: how long the arm takes for what is missing, roughly, cell s.
-    """
-
-    kind: Kind
-    path: Path
-    missing: int = 0
-    planned: int = 0
-    load_changes: int = 0
-    seconds: float = 0.0
+    kind: Kind  # what
+    path: Path  # the campaign that it is about
+    missing: int = 0  # readings that are missing, where the arm moves
+    planned: int = 0  # readings of the plan, where the arm moves
+    load_changes: int = 0  # how often a person has to change the load, where the arm moves
+    seconds: float = 0.0  # how long the arm takes for what is missing, roughly, cell s
 
     @property
     def moves(self) -> bool:
@@ -238,3 +217,14 @@ def _missing(kind: Kind, campaign: CampaignFile) -> ProcedureStep | None:
     share = len(left) / len(last.steps)
     seconds = share * duration_of(last)
     return ProcedureStep(kind, campaign.path, len(left), len(last.steps), changes, seconds)
+
+
+def reference_in(file: CampaignFile) -> Floats | None:
+    """Return the joints (n,) of a campaign's reference pose; None where it has no plan."""
+    text = file.about(PLAN)
+    return None if text is None else reference_of(read_plan(text, f"{file.path}, its plan"))
+
+
+def reference_of(plan: Plan) -> Floats | None:
+    """Return the joints (n,) of a plan's reference pose."""
+    return plan.joints(REFERENCE) if REFERENCE in plan.pose_names else None

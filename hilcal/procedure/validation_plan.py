@@ -1,6 +1,5 @@
 """Poses and loads of a validation campaign: within what was measured, and none of its poses."""
 
-from collections.abc import Callable
 from dataclasses import replace
 from itertools import compress
 
@@ -16,11 +15,10 @@ from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
+from hilcal.present.progress import Say
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
-
-Say = Callable[[str], None]
 
 DRAWN = 4
 """Poses that are drawn for each one that is wanted; a choice: few of them cannot be reached or lie
@@ -49,20 +47,10 @@ def validation_plan(
 
     The poses are drawn evenly over the joint angles that were measured; those that the cell does
     not allow, that are not reached, or that lie far from all measured ones (see
-    `identification.extrapolation`) are left out. Each is measured under one load, for deflections
-    unloaded as well; of a fit to positions the unloaded arm is one of the loads.
-
-    Args:
-        cell: the cell as configured.
-        config: its limits and loads.
-        calibration: that will be tested.
-        fitted: the readings that it was fitted to.
-        reference: (n,) joints of the campaign's reference pose, where loads are changed, rad; that
-            of the first reading where None.
-        count: poses that are wanted; fewer where the cell leaves fewer.
-        rng: generator.
-        say: takes progress, one line each.
-        under_load: leave out the unloaded arm, where there are loads.
+    `identification.extrapolation`) are left out, so that they may be fewer than `count`. Each is
+    measured under one load, for deflections unloaded as well; of a fit to positions the unloaded
+    arm is one of the loads, unless `under_load` leaves it out. `reference` (n,) are the joints of
+    the pose where loads are changed, rad; that of the first reading where None.
 
     Raises:
         CannotAnswerError: no pose is left.

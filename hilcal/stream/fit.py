@@ -29,6 +29,7 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.coordinates import coordinates_of
 from hilcal.identification.estimates import Estimates
 from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit_document import finite
 from hilcal.identification.folds import FOLDS
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.gauss_newton import over_all_parameters, prior_coordinates
@@ -81,7 +82,6 @@ Counting = Callable[[str, int], AbstractContextManager[Advance]]
 
 
 def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
-    """Show no progress."""
     return nullcontext(lambda step: None)
 
 
@@ -353,11 +353,7 @@ class _StreamMinimum:
 
 
 def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
-    """Return the minimum from parameters (P,) on.
-
-    Raises:
-        CannotAnswerError: fewer measured elements than parameters.
-    """
+    """Return the minimum from parameters (P,) on."""
     space = problem.coordinates
     found = minimum(problem, space.of_theta(theta), None)
     point, by, converged = found.point, found.by, found.converged
@@ -381,3 +377,31 @@ def _solved(problem: _Stream, theta: Floats) -> _StreamMinimum:
         rest = combined((r for k, r in point.folds.items() if k != fold), size)
         change[fold] = transform @ (equations_of(rest).solve(by.beta) - now)
     return _StreamMinimum(problem, point, by, converged, equations, change)
+
+
+def to_json(fit: StreamFit) -> dict[str, object]:
+    """Keys of the contract, and what a stream has beside them.
+
+    `error.holdout`: each tenth of the stream, predicted without it.
+    """
+    low, high = fit.variance_factor_interval
+    return {
+        "model": list(fit.model.names),
+        "readings": "absolute",
+        "scaling": "gc",
+        "n_readings": fit.readings,
+        "dof": fit.dof,
+        "rank": fit.rank,
+        "converged": fit.converged,
+        "passes": fit.passes,
+        "condition": {"unscaled": finite(fit.condition[0]), "scaled": finite(fit.condition[1])},
+        "parameters": fit.parameters.to_dicts(),
+        "unidentifiable": list(fit.null),
+        "inflated": fit.inflated,
+        "variance_factor": fit.variance_factor,
+        "variance_factor_interval": [low, high],
+        "error": {"fit": fit.error.to_json(), "holdout": fit.holdout.to_json()},
+        "noise_floor_m": fit.noise_floor,
+        "n_outliers": fit.outliers,
+        "outliers": [{"row": row, "sigma": sigma} for row, sigma in fit.named],
+    }

@@ -25,55 +25,35 @@ from hilcal.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassTask:
-    """What a worker needs to know.
-
-    Attributes:
-        stream: the file.
-        model: that is fitted; its cell is registered.
-        joint_std: (n,) scatter that is added to the covariances, rad; zero for none.
-        outliers: rows that are set aside, counted from 0 in the stream, ascending, by row group.
-    """
+    """What a worker needs to know."""
 
     stream: ReadingStream
-    model: Model
-    joint_std: Floats
+    model: Model  # that is fitted; its cell is registered
+    joint_std: Floats  # (n,) scatter that is added to the covariances, rad; zero for none
     outliers: Mapping[int, Ints]
+    """Rows that are set aside, counted from 0 in the stream, ascending, by row group."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reduced:
-    """What a row group gives to a step.
-
-    Attributes:
-        triangles: (P + 1, P + 1) of the columns of all parameters and of the residual, by fold.
-        readings: number of readings that they are of.
-        rank: number of whitened rows that carry information.
-    """
+    """What a row group gives to a step."""
 
     triangles: dict[int, Floats]
-    readings: int
-    rank: int
+    """(P + 1, P + 1) of the columns of all parameters and of the residual, by fold."""
+    readings: int  # number of readings that they are of
+    rank: int  # number of whitened rows that carry information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Errors:
-    """What a row group gives to the errors; of the fit, and predicted without its fold.
+    """What a row group gives to the errors; of the fit, and predicted without its fold."""
 
-    Attributes:
-        sums: (2, 3) sums of the distance, of its square, of the whitened squares.
-        most: (2,) largest distance, m.
-        floor: sum of the traces of the covariances, m².
-        rank: number of whitened rows that carry information.
-        far: rows beyond the limit, counted from 0 in the stream, ascending.
-        distance2: their squared Mahalanobis distances.
-    """
-
-    sums: Floats
-    most: Floats
-    floor: float
-    rank: int
-    far: Ints
-    distance2: Floats
+    sums: Floats  # (2, 3) sums of the distance, of its square, of the whitened squares
+    most: Floats  # (2,) largest distance, m
+    floor: float  # sum of the traces of the covariances, m²
+    rank: int  # number of whitened rows that carry information
+    far: Ints  # rows beyond the limit, counted from 0 in the stream, ascending
+    distance2: Floats  # their squared Mahalanobis distances
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,12 +90,8 @@ def errors_of_group(
 ) -> Errors:
     """Return the errors of a row group at parameters (P,).
 
-    Args:
-        group: number of the row group.
-        work: what a worker needs to know.
-        theta: (P,) the parameters.
-        change: (F, P) what leaving out each fold does to them.
-        far: squared Mahalanobis distance from which on a reading is named.
+    `change` (F, P) is what leaving out each fold does to them; readings beyond the squared
+    Mahalanobis distance `far` are named.
     """
     moved = np.flatnonzero(np.any(change != 0, axis=0))
     sums, most, floor, rank = np.zeros((2, 3)), np.zeros(2), 0.0, 0

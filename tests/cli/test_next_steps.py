@@ -291,7 +291,6 @@ TAKEN: dict[str, dict[str, str]] = {
         "check CELL.toml --save-calibration": KINEMATICS,
     },
     "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
-    "design/checked_plan": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
     "identification/earlier_fit": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
@@ -299,7 +298,7 @@ TAKEN: dict[str, dict[str, str]] = {
     "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
     "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
     "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
-    "measuring/run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {
         "hilcal accept RUN N": f"{HERE}what_a_report_names",
         "None yet: hilcal identify": f"{HERE}without_a_revision",
@@ -386,7 +385,7 @@ NO_STEP = {
     "discovery/write_effect",
     "present/viewer/fleet",
     "present/viewer/plan",
-    "procedure/shared",
+    "procedure/procedure",
     "store/run_log",
     "tables/guessing/proposal",
     "workbench/server",

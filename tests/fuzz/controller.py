@@ -73,9 +73,9 @@ def dashboard_server() -> Parser:
     corpus = [b"".join(said), said[0] + b"Stopped\n", said[0] + b"true\n",
               said[0] + b"could not understand: 'is in remote control'\n"]  # fmt: skip
     asked: list[Callable[[], object]] = [
-        lambda: dashboard.describe("fuzz", 1.0),
-        lambda: dashboard.stop("fuzz", 1.0),
-        lambda: dashboard.in_remote_control("fuzz", 1.0),
+        lambda: dashboard.Dashboard("fuzz").describe(1.0),
+        lambda: dashboard.Dashboard("fuzz").stop(1.0),
+        lambda: dashboard.Dashboard("fuzz").in_remote_control(1.0),
     ]
 
     def make(by: Random) -> bytes:

@@ -18,7 +18,7 @@ from geocompy import geo
 from geocompy.geo import GeoCom
 
 from hilcal.config.cell import Tracker
-from hilcal.drivers import bota, ft300, geocom_line, modbus_rtu, onrobot_hex
+from hilcal.drivers import bota, ft300, geocom_line, onrobot_hex
 from hilcal.drivers.force_stream import RING, ForceStream, SensorFormat
 from hilcal.drivers.geocom import GeoComOptions, GeoComTracker
 from hilcal.drivers.geocom_line import Link
@@ -72,7 +72,7 @@ def _force(name: str) -> Parser:
     measured = {wrench_of(body) for body in sound}
     port = Port()
     stream = ForceStream(port, sensor)  # type: ignore[arg-type]
-    stream.stop()
+    stream.close()
     fresh = type(stream._deframer)
 
     def make(by: Random) -> bytes:
@@ -213,7 +213,7 @@ def _modbus() -> Parser:
 
     def answer(words: bytes, slave: int = 9, function: int = 3) -> bytes:
         bare = bytes([slave, function, len(words) % 256]) + words
-        return bare + modbus_rtu_crc(bare)
+        return bare + modbus_crc(bare)
 
     corpus = [answer(words) for words in registers]
     sound = {struct.unpack(">4H", words) for words in registers}
@@ -228,10 +228,10 @@ def _modbus() -> Parser:
     def parse(data: bytes) -> bool:
         port.held = data[1:]
         with (
-            instead(modbus_rtu, {"drain": lambda *_: True}),
+            instead(ft300, {"drain": lambda *_: True}),
             instead(minimalmodbus, minimalmodbus_quiet),
         ):
-            got = modbus_rtu.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
+            got = ft300.read_registers(port, 9, 500, 4)  # type: ignore[arg-type]
         if len(got) != 4 or not all(0 <= word < 65536 for word in got):
             raise Accepted("modbus: registers that cannot be")
         if not data[0] and got not in sound:
@@ -241,7 +241,7 @@ def _modbus() -> Parser:
     return Parser("modbus", make, parse)
 
 
-def modbus_rtu_crc(data: bytes) -> bytes:
+def modbus_crc(data: bytes) -> bytes:
     """Modbus over Serial Line V1.02, 6.2.2, bit by bit."""
     crc = 0xFFFF
     for byte in data:

@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from hilcal.drivers.simulated.ur.state import line
 from hilcal.drivers.ur_link import states
-from hilcal.drivers.ur_link.cause import program_ended
-from hilcal.drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration, duration
+from hilcal.drivers.ur_link.brakes import program_ended
+from hilcal.drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration
 from hilcal.drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
 from hilcal.drivers.ur_link.survey import settled_rate
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
+from hilcal.measuring.route import duration
 
 FIELDS = {
     **{name: [0.1 * k for k in range(6)] for name in OUTPUTS},
@@ -30,7 +31,9 @@ def test_time_of_a_motion_is_that_of_the_simulated_controller(distance, speed, a
     goal = np.zeros(N)
     goal[3] = -distance
     segment = line(np.zeros(N), goal, speed, acceleration)
-    assert duration(distance, speed, acceleration) == pytest.approx(segment.duration, rel=1e-9)
+    assert duration(np.zeros(N), goal, speed, acceleration) == pytest.approx(
+        segment.duration, rel=1e-9
+    )
 
 
 @given(speed=st.floats(0.01, 2.0))

@@ -6,6 +6,7 @@ Universal_Robots_ROS_Driver issue 125.
 """
 
 import asyncio
+import contextlib
 import time
 from collections.abc import Callable
 from enum import Enum
@@ -17,6 +18,7 @@ from hilcal.drivers.simulated.ur.programs import (
     PROGRAM_STOP,
     ControlScript,
     ProtectiveStop,
+    ScriptStream,
     WaypointProgram,
 )
 from hilcal.drivers.simulated.ur.rtde import Faults
@@ -36,6 +38,7 @@ a computer of its own; this one takes turns with its client, which would not hav
 
 _COMPILE = 0.05  # s of real time from the upload of a program to its start
 _POWER_UP = 0.3  # s of real time for each step of powering up; real arms take some seconds
+_READ = 1 << 16  # bytes
 _MOST_OFTEN = 0.004  # s of real time between two writes to the blackboard
 
 
@@ -51,8 +54,6 @@ class Controller:
     """Runs one program at a time, and stops it for every reason there is.
 
     Attributes:
-        arm: the shared state.
-        scripts: programs received.
         unlock_after: real time before a protective stop can be unlocked, s.
         hears: whether the client that writes an integer register has an open link.
     """
@@ -117,6 +118,15 @@ class Controller:
             return
         self.stop_program("replaced by a new script")
         self._compiling = time.monotonic() + _COMPILE, text
+
+    async def take_programs(self, reader: asyncio.StreamReader) -> None:
+        """Run every program that a client sends, until it goes."""
+        stream = ScriptStream()
+        with contextlib.suppress(OSError):
+            while data := await reader.read(_READ):
+                for text in stream.feed(data):
+                    self.run(text)
+                self.step()
 
     def stop_program(self, why: str) -> None:
         """End the program; the arm decelerates by itself."""
@@ -219,17 +229,7 @@ class Controller:
         if same and (not motion.moving or time.monotonic() - self._published_at < _MOST_OFTEN):
             return
         self._published, self._published_at = state, time.monotonic()
-        self._board.write(
-            "arm",
-            alive=1.0,
-            q=motion.q,
-            qd=motion.qd,
-            side=motion.side,
-            arrivals=motion.arrivals,
-            moving=float(motion.moving),
-            payload=arm.payload,
-            payload_com=arm.payload_com,
-        )
+        motion.publish(self._board, arm.payload, arm.payload_com)
 
     def _start_program(self, text: str) -> None:
         self._compiling = None
@@ -321,9 +321,7 @@ class DashboardServer(ClientServer):
     def answer(self, words: str, local: bool) -> str:
         """Return the answer to a line.
 
-        Args:
-            words: the line.
-            local: the connection was made in local mode; it never gets more rights.
+        A connection that was made in `local` mode never gets more rights.
         """
         command = words.lower()
         asked = self._questions().get(command)
@@ -342,7 +340,6 @@ class DashboardServer(ClientServer):
     def _questions(self) -> dict[str, str]:
         arm = self._controller.arm
         plays = arm.runtime is Runtime.PLAYING
-        state = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
         return {
             "polyscopeversion": "URSoftware {}.{}.{}.{} (Jan 01 2023)".format(*arm.version),
             "get serial number": SERIAL_NUMBER,
@@ -352,7 +349,7 @@ class DashboardServer(ClientServer):
             "safetystatus": f"Safetystatus: {arm.safety_mode.name}",
             "safetymode": f"Safetymode: {arm.safety_mode.name}",
             "running": f"Program running: {str(plays).lower()}",
-            "programstate": f"{state.get(arm.runtime, 'STOPPED')} <unnamed>",
+            "programstate": f"{arm.program_state} <unnamed>",
             "get loaded program": "No program loaded",
             "get operational mode": "NONE",
             "close popup": "closing popup",
@@ -362,15 +359,17 @@ class DashboardServer(ClientServer):
 
     def _orders(self) -> dict[str, Callable[[], str]]:
         controller = self._controller
+
+        def power(mode: RobotMode, done: str, command: str) -> str:
+            return _said(controller.power(mode), done, command)
+
         return {
             "play": lambda: _said(controller.play(), "Starting program", "play"),
             "stop": self._stop,
             "unlock protective stop": self._unlock,
-            "power on": lambda: self._power(RobotMode.IDLE, "Powering on", "power on"),
-            "brake release": lambda: self._power(
-                RobotMode.RUNNING, "Brake releasing", "brake release"
-            ),
-            "power off": lambda: self._power(RobotMode.POWER_OFF, "Powering off", "power off"),
+            "power on": lambda: power(RobotMode.IDLE, "Powering on", "power on"),
+            "brake release": lambda: power(RobotMode.RUNNING, "Brake releasing", "brake release"),
+            "power off": lambda: power(RobotMode.POWER_OFF, "Powering off", "power off"),
         }
 
     def _stop(self) -> str:
@@ -382,9 +381,6 @@ class DashboardServer(ClientServer):
         if answer is OrderResult.TOO_EARLY:
             return EARLY
         return _said(answer, "Protective stop releasing", "unlock protective stop")
-
-    def _power(self, mode: RobotMode, done: str, command: str) -> str:
-        return _said(self._controller.power(mode), done, command)
 
 
 def _said(answer: OrderResult, done: str, command: str) -> str:

@@ -8,11 +8,11 @@ Universal Robots Client Library for the layouts.
 """
 
 import asyncio
+import contextlib
 import struct
 import time
 
 from hilcal.drivers.simulated.ur.controller import Controller
-from hilcal.drivers.simulated.ur.programs import ScriptStream
 from hilcal.drivers.simulated.ur.state import Runtime
 from hilcal.types import Floats
 
@@ -21,39 +21,29 @@ MODE, KINEMATICS = 0, 5
 LINEARISED, NOT_INITIALISED = 2, 0
 _VERSION_MESSAGE = 3
 _PERIOD = 0.1  # s between states
-_READ = 1 << 16
 
 
 class PrimaryPort:
     """Sends states to every client, and takes programs from them."""
 
     def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
-        """Serve a controller.
+        """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m.
 
-        Args:
-            controller: the controller.
-            rows: (4, 6) theta, a, d, alpha of its kinematics, rad and m.
-            status: of its calibration, `LINEARISED` or `NOT_INITIALISED`.
+        `status` is that of its calibration, `LINEARISED` or `NOT_INITIALISED`.
         """
         self._controller, self._rows, self._status = controller, rows, status
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a client until it goes."""
         telling = asyncio.create_task(self._tell(writer))
-        stream = ScriptStream()
         try:
-            while data := await reader.read(_READ):
-                for text in stream.feed(data):
-                    self._controller.run(text)
-                self._controller.step()
-        except OSError:
-            pass
+            await self._controller.take_programs(reader)
         finally:
             telling.cancel()
             writer.close()
 
     async def _tell(self, writer: asyncio.StreamWriter) -> None:
-        try:
+        with contextlib.suppress(OSError):
             writer.write(self._version())
             parts = self._kinematics()
             while not writer.is_closing():
@@ -61,8 +51,6 @@ class PrimaryPort:
                 await writer.drain()
                 parts = b""
                 await asyncio.sleep(_PERIOD)
-        except OSError:
-            pass
 
     def _version(self) -> bytes:
         major, minor, bugfix, build = self._controller.arm.version

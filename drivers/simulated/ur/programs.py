@@ -331,11 +331,7 @@ class WaypointProgram:
 
 
 def _steps(text: str) -> Iterator[Move | float]:
-    """Yield the moves, and the waits in s.
-
-    Raises:
-        ValueError: a statement that is not emulated.
-    """
+    """Yield the moves, and the waits in s."""
     for line in text.splitlines():
         statement = line.split("#")[0].strip()
         if not statement or re.match(r"def\s+\w+\(\s*\)\s*:", statement):
@@ -350,11 +346,6 @@ def _steps(text: str) -> Iterator[Move | float]:
 
 
 def _move(function: str, numbers: str, options: str) -> Move:
-    """Return a move.
-
-    Raises:
-        ValueError: no six joint values within the limits, or a speed that is none.
-    """
     goal = np.array([float(x) for x in numbers.split(",")])
     if goal.shape != (6,) or not np.all(np.abs(goal) <= _JOINT_LIMIT):
         raise ValueError(f"no joint values: {numbers}")

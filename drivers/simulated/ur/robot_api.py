@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from hilcal.drivers.simulated.ur.controller import SERIAL_NUMBER, ClientServer, OrderResult
-from hilcal.drivers.simulated.ur.state import RobotMode, Runtime
+from hilcal.drivers.simulated.ur.state import RobotMode
 
 BASE = "/universal-robots/robot-api"
 _API_VERSIONS = (((10, 14), "5.0.107"), ((10, 12), "3.1.4"), ((10, 11), "2.0.0"))
@@ -78,8 +78,7 @@ class RobotApiServer(ClientServer):
             return {}
         mode, safety = arm.robot_mode.name, arm.safety_mode.name.replace("ROBOT_", "")
         control = "REMOTE" if arm.remote else "LOCAL"
-        state = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
-        runs = state.get(arm.runtime, "STOPPED")
+        runs = arm.program_state
         paths: dict[str, Any] = {
             "/openapi.json": (lambda: {"info": {"title": "Robot API", "version": api}}, None),
             "/robotstate/v1/state": (None, self._state),

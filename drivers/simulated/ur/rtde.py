@@ -110,16 +110,9 @@ def outputs_since(version: tuple[int, int, int, int]) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """Variables that travel together in one data frame.
+    """Variables that travel together in one data frame."""
 
-    Attributes:
-        number: its id on the connection, 1 or more.
-        names: the variables in order.
-        kinds: their types.
-        layout: of id and variables.
-    """
-
-    number: int
+    number: int  # its id on the connection, 1 or more
     names: tuple[str, ...]
     kinds: tuple[str, ...]
     layout: struct.Struct
@@ -223,14 +216,20 @@ class Sensors:
             "timestamp": lambda: (self._now,),
             "actual_q": self._q,
             "target_q": lambda: motion.q,
-            "actual_qd": self._qd,
+            "actual_qd": lambda: (
+                motion.qd + self._noise(_SPEED_STD) if motion.moving else motion.qd
+            ),
             "target_qd": lambda: motion.qd,
             "target_moment": self._torque,
             "target_current": self._target_current,
-            "actual_current": self._current,
+            "actual_current": lambda: (
+                np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
+            ),
             "actual_current_as_torque": self._measured_torque,
             "joint_control_output": self._target_current,
-            "joint_temperatures": self._temperatures,
+            "joint_temperatures": lambda: (
+                self._truth["joint_temperature"] if self._is_told else _TEMPERATURES
+            ),
             "joint_mode": lambda: powered[arm.robot_mode is not RobotMode.RUNNING],
             "actual_joint_voltage": lambda: (47.5,) * 6,
             "actual_main_voltage": lambda: (48.0,),
@@ -241,7 +240,7 @@ class Sensors:
             "actual_TCP_speed": lambda: self._tool_speed(np.array(self.value("actual_qd"))),
             "target_TCP_speed": lambda: self._tool_speed(motion.qd),
             "actual_TCP_force": self._tool_force,
-            "ft_raw_wrench": self._raw_wrench,
+            "ft_raw_wrench": self._wrench,
             "tcp_offset": lambda: arm.tcp,
             "payload": lambda: (arm.payload,),
             "payload_cog": lambda: arm.payload_com,
@@ -283,10 +282,6 @@ class Sensors:
         off = np.abs(np.array(self.value("actual_q")) - np.array(self.value("target_q")))
         return (float(off.max() / _DEVIATION_STOP),)
 
-    def _qd(self) -> Floats:
-        motion = self._arm.trajectory
-        return motion.qd + self._noise(_SPEED_STD) if motion.moving else motion.qd
-
     def _torque(self) -> Floats:
         if self._is_told:
             return np.asarray(self._truth["drive_torque"])
@@ -298,9 +293,6 @@ class Sensors:
             return np.zeros(6)
         return np.asarray(np.array(self.value("target_moment")) / _TORQUE_PER_AMPERE)
 
-    def _current(self) -> Floats:
-        return np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
-
     def _measured_torque(self) -> Floats:
         """What the drives exert: against load and weight, and against the friction of the arrival.
 
@@ -308,9 +300,6 @@ class Sensors:
         """
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
-
-    def _temperatures(self) -> Floats:
-        return np.asarray(self._truth["joint_temperature"]) if self._is_told else _TEMPERATURES
 
     def _tool_pose(self, q: Floats) -> Floats:
         return pose(self._flange(q) @ transform(self._arm.tcp))
@@ -334,9 +323,6 @@ class Sensors:
         """What the sensor in the flange feels, flange axes, with its offset and noise."""
         felt = self._truth["sensor_wrench"] if self._is_told else self._weight()
         return np.asarray(felt + _FORCE_OFFSET + _FORCE_STD * self._rng.standard_normal(6))
-
-    def _raw_wrench(self) -> Floats:
-        return self._wrench()
 
     def _tool_force(self) -> Floats:
         """Remainder after the compensation of the payload, at the tool point, base axes."""
@@ -376,23 +362,15 @@ class Faults:
 
 @dataclass(slots=True, eq=False)
 class RtdeLinks:
-    """All RTDE clients of one controller.
-
-    Attributes:
-        arm: the shared state.
-        sensors: what is told.
-        faults: what goes wrong.
-        taken: called after each input package.
-        links: the open connections.
-        owners: which connection may write an input variable.
-    """
+    """All RTDE clients of one controller."""
 
     arm: ArmState
     sensors: Sensors
     faults: Faults
-    taken: Callable[[], None]
+    taken: Callable[[], None]  # called after each input package
     links: set["RtdeLink"] = field(default_factory=set)
     owners: dict[str, "RtdeLink"] = field(default_factory=dict)
+    """Which connection may write an input variable."""
 
     def due(self, now: float) -> float:
         """Return when the next package is due, real time in s; infinite where none is."""

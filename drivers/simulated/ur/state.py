@@ -78,16 +78,12 @@ class LinearMotion:
     """A motion along a line; s is the way of the leading joint.
 
     q(s) = origin + direction * s, s' piecewise linear.
-
-    Attributes:
-        origin: (n,) rad.
-        direction: (n,) the leading joint's element is -1 or +1.
-        pieces: (duration in s, speed at its start in rad/s, acceleration in rad/s²) in order.
     """
 
-    origin: Floats
-    direction: Floats
+    origin: Floats  # (n,) rad
+    direction: Floats  # (n,) the leading joint's element is -1 or +1
     pieces: tuple[tuple[float, float, float], ...]
+    """(duration in s, speed at its start in rad/s, acceleration in rad/s²) in order."""
 
     @property
     def duration(self) -> float:
@@ -238,6 +234,20 @@ class Trajectory:
             self._end(self._now)
         self._now = max(self._now, now)
 
+    def publish(self, board: Blackboard, payload: float, com: Floats) -> None:
+        """Write what the arm does, and the payload (kg, m) that its controller was told."""
+        board.write(
+            "arm",
+            alive=1.0,
+            q=self.q,
+            qd=self.qd,
+            side=self.side,
+            arrivals=self.arrivals,
+            moving=float(self.moving),
+            payload=payload,
+            payload_com=com,
+        )
+
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
         self._time, self._stopping, self._stands = 0.0, False, None
@@ -331,51 +341,31 @@ class Registers:
 
 @dataclass(slots=True, eq=False)
 class ArmState:
-    """State of controller and arm.
-
-    Attributes:
-        clock: world time.
-        kinematics: of the nominal arm.
-        trajectory: where the commanded arm is.
-        version: of PolyScope.
-        registers: the general-purpose ones.
-        payload: what the controller has been told, kg.
-        payload_com: (3,) flange axes, m.
-        tcp: (6,) of the tool point on the flange, m and rad.
-        robot_mode: power.
-        runtime: of the program.
-        safety_mode: what the safety system says.
-        remote: whether it takes orders from the network.
-        scaling: further factor on the speed, as the controller applies it by itself.
-        slider: the speed slider.
-        digital_outputs: RTDE `actual_digital_output_bits`.
-        refuses_motion: whether a motion that is commanded ends the program instead.
-        frozen_q: (n,) what the encoders tell in spite of any motion, rad; None is the truth.
-        fault_ns: `time.monotonic_ns` of the last fault that was switched on.
-        input_ns: the same of the last input package.
-        log: (monotonic_ns, what happened).
-    """
+    """State of controller and arm."""
 
     clock: WorldClock
     kinematics: Kinematics
     trajectory: Trajectory
     version: tuple[int, int, int, int]
     registers: Registers = field(default_factory=Registers)
-    payload: float = 0.0
-    payload_com: Floats = field(default_factory=lambda: np.zeros(3))
+    payload: float = 0.0  # what the controller has been told, kg
+    payload_com: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) flange axes, m
     tcp: Floats = field(default_factory=lambda: np.zeros(6))
+    """(6,) of the tool point on the flange, m and rad."""
     robot_mode: RobotMode = RobotMode.RUNNING
     runtime: Runtime = Runtime.STOPPED
     safety_mode: SafetyMode = SafetyMode.NORMAL
-    remote: bool = True
-    scaling: float = 1.0
+    remote: bool = True  # whether it takes orders from the network
+    scaling: float = 1.0  # further factor on the speed, as the controller applies it by itself
     slider: float = 1.0
-    digital_outputs: int = 0
-    refuses_motion: bool = False
+    digital_outputs: int = 0  # RTDE `actual_digital_output_bits`
+    refuses_motion: bool = False  # whether a motion that is commanded ends the program instead
     frozen_q: Floats | None = None
-    fault_ns: int = 0
-    input_ns: int = 0
+    """(n,) what the encoders tell in spite of any motion, rad; None is the truth."""
+    fault_ns: int = 0  # `time.monotonic_ns` of the last fault that was switched on
+    input_ns: int = 0  # the same of the last input package
     log: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=2000))
+    """(monotonic_ns, what happened)."""
 
     @property
     def safety_bits(self) -> Safety:
@@ -387,6 +377,12 @@ class ArmState:
                 return Safety.ROBOT_EMERGENCY_STOP | Safety.EMERGENCY_STOP | Safety.STOPPED
             case _:
                 return Safety.NORMAL
+
+    @property
+    def program_state(self) -> str:
+        """State of the program in the words of dashboard and Robot API."""
+        known = {Runtime.PLAYING: "PLAYING", Runtime.PAUSED: "PAUSED", Runtime.PAUSING: "PAUSED"}
+        return known.get(self.runtime, "STOPPED")
 
     @property
     def able(self) -> bool:

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.doctor import computer as machine
-from hilcal.doctor.computer import NATIVE, clock, disk, load, packages
-from hilcal.doctor.finding import Finding
+from hilcal.doctor.computer import NATIVE, Finding, clock, disk, load, packages
 from hilcal.doctor.ports import System, reachable, serial_ports
 
 

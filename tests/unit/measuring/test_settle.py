@@ -83,17 +83,6 @@ def test_drift_that_does_not_matter_is_let_through():
     assert window.settled()
 
 
-def test_drift_is_told_in_metres_per_cell_second():
-    slow, fast = SettleWindow(5), SettleWindow(5, scale=20.0)
-    assert np.array_equal(slow.drift, np.zeros(3))
-    for k in range(6):
-        for window in (slow, fast):
-            window.add(sample(k * DT, 1e-4 * ALONG * k * DT))
-    assert slow.drift == pytest.approx(1e-4 * ALONG)
-    assert fast.drift == pytest.approx(1e-4 / 20 * ALONG)
-    assert not slow.settled()
-
-
 def test_poses_are_judged_by_their_turning_too():
     covariance = np.diag([1e-10] * 3 + [6.4e-9] * 3)
     rng = np.random.default_rng(3)
@@ -104,20 +93,14 @@ def test_poses_are_judged_by_their_turning_too():
         turning.add(sample(k * DT, noise + 1e-3 * k * DT * np.eye(6)[5], covariance))
     assert still.settled()
     assert not turning.settled()
-    assert turning.drift[5] == pytest.approx(1e-3, rel=0.3)
 
 
-def test_nothing_is_settled_before_the_window_is_full_or_after_a_new_start():
+def test_nothing_is_settled_before_the_window_is_full():
     window = SettleWindow(5)
     for k in range(5):
         assert not window.settled()
         window.add(sample(k * DT, STD * (-1) ** k))
     assert window.settled()
-    assert [s.host_ns for s in window.latest] == [round(1e9 * k * DT) for k in range(5)]
-    window.clear()
-    assert not window.settled()
-    assert len(window) == 0
-    assert window.latest == ()
 
 
 def test_samples_without_time_between_them_tell_nothing():
