@@ -69,6 +69,7 @@ def test_errors_of_centimetres_are_named_at_import(tmp_path: Path, capsys: Capsy
     assert len(d["outliers"]) == len(wrong)
 
 
+@pytest.mark.long
 def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path: Path, capsys: Capsys) -> None:
     readings = rehearsal("nothing").readings
     value = readings.value.copy()

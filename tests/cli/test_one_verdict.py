@@ -137,12 +137,12 @@ def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_pat
         assert "no suspects to separate" in result.err
 
 
-FAST = ("missing", "unknown although tried")
+FAST = {"missing": (), "unknown although tried": pytest.mark.long}
 """The doors of an ambiguous one are those of these, but for `next`: see test_next_cli."""
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=() if c in FAST else pytest.mark.slow) for c in CASES]
+    "case", [pytest.param(c, marks=FAST.get(c, pytest.mark.slow)) for c in CASES]
 )
 def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
     mode, make = CASES[case]

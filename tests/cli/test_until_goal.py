@@ -261,6 +261,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
     return made
 
 
+@pytest.mark.long
 def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     """It stops early, `identify` says the same, and resuming measures the rest."""
     total, path = len(site.plan.steps), site.directory / "run.hilcal"

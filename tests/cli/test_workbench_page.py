@@ -420,6 +420,7 @@ def test_the_page_fits_desktop_and_phone(
     assert told == []
 
 
+@pytest.mark.long
 @needs_chromium
 def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: Served) -> None:
     told: list[str] = []
@@ -498,6 +499,7 @@ def came(page: Page, place: str, how: str, words: str) -> None:
     expect(answer).to_be_in_viewport()
 
 
+@pytest.mark.long
 @needs_chromium
 def test_a_table_becomes_a_calibration_at_one_page(
     browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -76,7 +76,7 @@ MOTION = (
         arm("protective_stop"),
         unlock,
         ("protective stop", "unlock"),
-        fast=True,
+        quick=True,
     ),
     Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),

@@ -130,6 +130,7 @@ def test_a_body_that_is_hidden_is_a_lost_target(there: There) -> None:
         right(device.measure())
 
 
+@pytest.mark.long
 def test_frames_that_repeat_or_do_not_come_are_no_readings(there: There) -> None:
     with opened(there[1]) as device:
         there[0].admin("pause", on=True)

@@ -290,6 +290,7 @@ open_arm(cases.config(sys.argv[1])).take_control(cases.MASS, cases.COM)
 """
 
 
+@pytest.mark.long
 def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
     scripts = sim.admin()["scripts"]
     parent = subprocess.Popen(
@@ -330,6 +331,7 @@ thread.join()
 """
 
 
+@pytest.mark.long
 def test_child_that_hangs_in_the_client_library_ends_with_the_program():
     host = sim_ur_cases.free_host()
     with socket.socket() as server:

@@ -137,6 +137,7 @@ def test_what_is_known_very_well_does_not_hide_what_a_reading_tells() -> None:
     assert best[1] == pytest.approx(best[0], rel=1e-4)
 
 
+@pytest.mark.long
 def test_a_plan_for_predictions_is_better_than_random_poses_and_certified() -> None:
     known = config("absolute").model_copy(update={"loads": []})
     nominal = nominal_model(cell_of(registration_known=False), known)

@@ -64,6 +64,7 @@ def test_the_power_is_the_share_of_rejections_in_linear_problems(size: float) ->
     assert promised == pytest.approx(LEVEL) if size == 0 else promised > 0.05
 
 
+@pytest.mark.long
 def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     """Tilting joints are there and bending links are fitted; 100 campaigns of the same poses."""
     c = campaign(TILT, "deflection", 3, poses=8, strength=1.3, plan_seed=21)

@@ -53,6 +53,7 @@ def everything(world: World) -> list[Chosen]:
     return [Chosen(name, (UNLOADED, *LOADS)) for name in world.names]
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(
     st.integers(1, 12),

@@ -102,6 +102,7 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyP
     assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
 
 
+@pytest.mark.long
 def test_more_readings_promise_more() -> None:
     some, more = planned(small(), 10), planned(small(), 20)
     before = predicted(some.problem, some.counts, work=some.work)
@@ -129,6 +130,7 @@ def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
     assert made.ordered.plan.steps
 
 
+@pytest.mark.long
 def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
     of, work = usual.problem, usual.work
     designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
@@ -151,6 +153,7 @@ def test_absolute_readings_are_planned_one_by_one() -> None:
     assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()
 
 
+@pytest.mark.long
 def test_a_load_that_is_there_twice_is_said_to_cost_more_than_it_tells() -> None:
     config = small(load_change_s=600.0)
     twin = config.loads[1].model_copy(update={"name": "10kg again"})
@@ -210,6 +213,7 @@ def test_the_command(tmp_path: Path, capsys: Capsys) -> None:
     assert max(map(len, words.splitlines())) <= 100
 
 
+@pytest.mark.long
 def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys) -> None:
     cell = cell_file(tmp_path, quickly_planned(load_config(CELL)))
     result = run(capsys, "run", cell, "-o", tmp_path / "run.hilcal", "--yes")
@@ -240,6 +244,7 @@ def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     assert any("planned on from" in words for words in on["remarks"])
 
 
+@pytest.mark.long
 def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(
     tmp_path: Path, capsys: Capsys
 ) -> None:

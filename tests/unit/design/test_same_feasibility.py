@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -170,6 +171,7 @@ def test_all_checks_together_find_what_each_finds_alone(
     assert list(fresh.findings(q[-1:], load)) == alone[-1]
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells(), SEED, LOAD)
 def test_a_motion_that_is_planned_passes_and_touches_nothing(

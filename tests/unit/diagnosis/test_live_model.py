@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from hilcal.config import CellConfig
 from hilcal.diagnosis.live_model import LiveModel
@@ -41,6 +42,7 @@ def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
     return out
 
 
+@pytest.mark.long
 def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right():
     early, late, first_loads, unsure = [], [], [], 0
     for seed in SEEDS:

@@ -100,7 +100,7 @@ def test_intervals_of_a_frame_are_wider_and_of_differences_narrower() -> None:
     assert after > 1.5 * before
 
 
-@pytest.mark.parametrize("rho", [0.0, 0.5])
+@pytest.mark.parametrize("rho", [0.0, pytest.param(0.5, marks=pytest.mark.long)])
 def test_a_drift_is_named_as_one(rho: float) -> None:
     cell, readings = campaign(rho, hidden="tracker_drift", seed=1, poses=20)
     found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
@@ -108,6 +108,7 @@ def test_a_drift_is_named_as_one(rho: float) -> None:
     assert (found.fit.readings.serial is None) == (rho == 0.0)
 
 
+@pytest.mark.long
 def test_an_effect_is_named_beside_it() -> None:
     cell, readings = campaign(0.9, hidden="link_geometry", seed=2, poses=12)
     found = refine(baseline(cell, readings, "absolute"), readings, "absolute")

@@ -289,6 +289,7 @@ def test_a_number_that_the_model_absorbs_is_dropped() -> None:
     check_effect(kind)
 
 
+@pytest.mark.long
 def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
         raise CannotAnswerError("it finds no equilibrium")

@@ -74,6 +74,7 @@ def run_file(case: Case, tmp_path: Path, capsys: Capsys) -> Path:
 # --- it takes part --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     case: Case, run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

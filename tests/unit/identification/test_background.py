@@ -122,6 +122,7 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found: Refinement) ->
     assert family_sizes(found.steps[0].fit) == ()
 
 
+@pytest.mark.long
 def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series: Readings) -> None:
     """Of a table that states the arm's scatter, too: its factor is estimated and in the band."""
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")

@@ -209,6 +209,7 @@ def test_what_was_run_is_not_run_again(tmp_path: Path, fakes: Path) -> None:
     assert told.read_text() == page(date, rows, fakes)
 
 
+@pytest.mark.long
 def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
     (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
     folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]

@@ -16,6 +16,7 @@ from studies.records import resumed
 BY_TEXT = {f.text: f for f in FORMULAS}
 
 
+@pytest.mark.long
 def test_a_product_is_found_without_its_dummies_and_a_quotient_only_with_reciprocals() -> None:
     found = run_case(BY_TEXT["r F sin θ"], 0.01, 0, None)["hilcal"]
     assert found.equivalent

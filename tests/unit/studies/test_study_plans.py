@@ -193,6 +193,7 @@ def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None
         )
 
 
+@pytest.mark.long
 def test_the_command_gives_one_document(capsys: Capsys) -> None:
     done = run(
         capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",
