@@ -206,6 +206,7 @@ def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     assert ok(capsys, "identify", campaign, "--json").document["readings"] == "absolute"
 
 
+@pytest.mark.long
 def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Capsys) -> None:
     def numbers() -> list[int]:
         with CampaignFile.open(campaign, read_only=True) as stored:

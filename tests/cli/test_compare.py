@@ -89,6 +89,7 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     assert words.rstrip().endswith(f"hilcal refine {repaired} --prior {site.earlier}")
 
 
+@pytest.mark.long
 def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
     site: Site, capsys: Capsys
 ) -> None:

@@ -76,7 +76,7 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("size", [0, 200])
+@pytest.mark.parametrize("size", [0, pytest.param(200, marks=pytest.mark.long)])
 def test_a_full_disk_leaves_no_half_file(
     capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:

@@ -124,6 +124,7 @@ def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Ca
     ok(capsys, "export", run, "--urdf", tmp_path / "arm.urdf")
 
 
+@pytest.mark.long
 def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     table(csv := tmp_path / "later.csv", "hysteresis", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
@@ -145,6 +146,7 @@ def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     assert "hilcal remove" not in ok(capsys, "diagnose", run).out
 
 
+@pytest.mark.long
 def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
     cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
@@ -159,6 +161,7 @@ def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
     follow(capsys, said, f"hilcal add {run} hysteresis")
 
 
+@pytest.mark.long
 def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     table(csv := tmp_path / "later.csv", "creep", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
@@ -194,6 +197,7 @@ def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys)
     follow(capsys, "hilcal config", "hilcal config")
 
 
+@pytest.mark.long
 def test_what_a_report_names(
     run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,6 +221,7 @@ def test_a_campaign_that_calibrate_did_not_make(run: Path, capsys: Capsys) -> No
     follow(capsys, said, f"hilcal info '{run}'")
 
 
+@pytest.mark.long
 def test_another_arm_is_calibrated_by_itself(
     run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -268,7 +268,13 @@ def take(said: str, run: Path, capsys: Capsys) -> None:
 
 @pytest.mark.parametrize("made", [outdated, of_another_scaling])
 @pytest.mark.parametrize(
-    "asked", [("compare",), ("diagnose",), ("next", "-o", "{out}/p.json")], ids=lambda x: x[0]
+    "asked",
+    [
+        ("compare",),
+        ("diagnose",),
+        pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
+    ],
+    ids=lambda x: x[0],
 )
 def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
     run: Path, tmp_path: Path, capsys: Capsys, made: Made, asked: tuple[str, ...]
@@ -298,7 +304,7 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         ("export", "{run}", "--urdf", "{out}/arm.urdf"),
         ("report", "{run}", "-o", "{out}/r.html"),
         ("compensate", "{run}", "{out}/points.csv"),
-        ("next", "{run}", "-o", "{out}/p.json"),
+        pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
         ("view", "{run}", "--record", "{out}/v.rrd"),
     ],
     ids=lambda x: x[0],

@@ -391,7 +391,7 @@ def number(page: Page, what: str) -> float:
 
 
 @needs_chromium
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_the_page_fits_desktop_and_phone(
     browser: Browser, served: Served, scheme: str, tmp_path: Path
 ) -> None:

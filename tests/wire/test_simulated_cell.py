@@ -234,6 +234,7 @@ def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeyp
     assert children() == before
 
 
+@pytest.mark.long
 def test_a_device_that_never_gets_ready_is_named_at_the_deadline(tmp_path, monkeypatch):
     before = children()
     (tmp_path / "asleep.py").write_text("import time\ntime.sleep(600)\n")

@@ -122,7 +122,10 @@ def by_criterion(name: str) -> Planned:
     return planned(two if name == "separate" else small(), readings=30, criterion=name)
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize(
+    "criterion",
+    [pytest.param(c, marks=() if c in {"D", "I"} else pytest.mark.long) for c in CRITERIA],
+)
 def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
     made = by_criterion(criterion)
     assert made.criterion == criterion

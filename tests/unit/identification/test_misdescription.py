@@ -118,6 +118,7 @@ def test_a_gauge_is_not_proposed():
         assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7), 3))[0] is None
 
 
+@pytest.mark.long
 def test_nonsense_is_refused_with_what_was_tried():
     good = readings_of(None, 3)
     mixed = replace(good, value=good.value[np.random.default_rng(0).permutation(len(good))])

@@ -227,7 +227,10 @@ def campaign(folder: Path, hidden: str, seed: int, poses: int = 36) -> tuple[Reh
     return read_plan(case, plan, [seed, 1]), cell_from_config(config, folder)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+SEEDS = [1, *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3, 4))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path: Path, seed: int) -> None:
     r, cell = campaign(tmp_path, "guide_error", seed)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
@@ -245,7 +248,7 @@ def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path: Path, seed: 
     assert path.fit.holdout.rms_sigma < 1.3
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(
     tmp_path: Path, seed: int
 ) -> None:
@@ -270,7 +273,7 @@ def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(
     assert path.fit.holdout.rms_sigma < 1.3
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_of_a_good_rail_nothing_is_named(tmp_path: Path, seed: int) -> None:
     r, cell = campaign(tmp_path, "nothing", seed)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
