@@ -189,6 +189,7 @@ def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: C
     assert records[-1].result_json["diagnose"]["verdict"] == "adequate"
 
 
+@pytest.mark.long
 def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     refused(capsys, 2, "refine", campaign, "--from-latest")
     ok(capsys, "add", campaign, "hysteresis")

@@ -93,6 +93,7 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     assert share_is(rejected, 100, promised)
 
 
+@pytest.mark.long
 def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)

@@ -192,6 +192,7 @@ def test_time_is_far_less_confounded_than_in_the_shortest_order() -> None:
         assert abs(ordered.confounding.bias_m) < 0.2 * ordered.confounding_shortest.bias_m
 
 
+@pytest.mark.long
 def test_orders_under_different_loads_are_independent() -> None:
     """A covariate that no regressor knows is confounded under each load in another way.
 

@@ -198,6 +198,7 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(
             assert space.shapes.scene.itself.distance(between) > 0.0
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(st.sampled_from(["ur3e", "ur10e", URDF]), SEED, st.floats(0.05, 0.95), LOAD)
 def test_nothing_small_is_passed_between_two_samples(

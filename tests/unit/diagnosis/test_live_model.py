@@ -60,6 +60,7 @@ def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right()
         assert 0.6 < np.mean(np.square(sigmas)) < 1.5
 
 
+@pytest.mark.long
 def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
     off = []
     for seed in SEEDS:

@@ -187,6 +187,7 @@ def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path) 
     assert 0 < found["floor_m"] < found["predicted_m"] < 1e-3
 
 
+@pytest.mark.long
 def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
     d = drawn(tmp_path / "run.hilcal", poses=4)
     for _ in range(3):
