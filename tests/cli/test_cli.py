@@ -153,6 +153,7 @@ def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) ->
     assert "does not fall" in words  # the model is adequate without
 
 
+@pytest.mark.long
 def test_remove_takes_out_what_is_needless_and_says_what_is_not(
     campaign: Path, capsys: Capsys
 ) -> None:

@@ -70,6 +70,7 @@ def test_usual_options_are_not_shown(campaign: Path, capsys: Capsys) -> None:
     assert "joints=" not in ok(capsys, "compare", campaign).out
 
 
+@pytest.mark.long
 def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", campaign)
     result = ok(capsys, "add", campaign, "hysteresis(joints=2/3+4)", "--json")

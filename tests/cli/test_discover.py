@@ -230,6 +230,7 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(
     assert added["revisions"][-1]["variance_factor"] < 0.4 * before["variance_factor"]
 
 
+@pytest.mark.long
 def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

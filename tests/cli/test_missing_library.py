@@ -80,11 +80,11 @@ def also(package: str, words: tuple[object, ...]) -> object:
     [
         also("jinja2", ("report", "run.hilcal")),
         ("plotly", ("report", "run.hilcal")),
-        ("rerun", ("view", "run.hilcal")),
+        also("rerun", ("view", "run.hilcal")),
         also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
         ("nicegui", ("workbench", "run.hilcal")),
         also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
-        ("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
+        also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
         also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
         also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
         also("geocompy", ("config", "tracker")),
@@ -104,6 +104,7 @@ def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.long
 def test_the_library_names_what_it_lacks(folder: Path) -> None:
     code = (
         "import hilcal as hc\n"

@@ -53,6 +53,7 @@ def run(tmp_path: Path, capsys: Capsys) -> Path:
     return imported(capsys, tmp_path / "a run.hilcal")
 
 
+@pytest.mark.long
 def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     out, later = tmp_path / "p.json", imported(capsys, tmp_path / "later.hilcal", seed=2)
     for arguments in (

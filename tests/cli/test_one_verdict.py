@@ -166,6 +166,7 @@ def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsy
     assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
 
 
+@pytest.mark.long
 def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
     tmp_path: Path, capsys: Capsys
 ) -> None:

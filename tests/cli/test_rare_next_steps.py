@@ -104,6 +104,7 @@ def test_masses_that_a_description_lacks(tmp_path: Path, capsys: Capsys) -> None
     assert "hilcal add" not in ok(capsys, "info", path).out
 
 
+@pytest.mark.long
 def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     later = imported(capsys, tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)

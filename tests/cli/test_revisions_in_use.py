@@ -211,6 +211,7 @@ def test_refining_from_a_revision_follows_it(run: Path, capsys: Capsys) -> None:
         assert [r.number for r in chain(o.file.revisions())] == [1, 4]
 
 
+@pytest.mark.long
 def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
     run: Path, capsys: Capsys
 ) -> None:

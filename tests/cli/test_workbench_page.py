@@ -189,6 +189,7 @@ def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not used.abandoned
 
 
+@pytest.mark.long
 def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path: Path) -> None:
     run = stored(tmp_path / "run.hilcal")
     code = f"""

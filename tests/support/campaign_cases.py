@@ -74,8 +74,7 @@ class Fault:
         undo: puts it right, as the operator would.
         says: patterns that the one line has to contain.
         stops: whether the arm has to be stopped for it (else it stands already).
-        fast: whether it is one of the few that are not slow.
-        quick: whether it is tested every time.
+        fast: whether it is one of the few that are long, not slow.
     """
 
     name: str
@@ -84,7 +83,6 @@ class Fault:
     says: tuple[str, ...]
     stops: bool = True
     fast: bool = False
-    quick: bool = False
 
 
 def act(device: str, op: str, **arguments: object) -> Act:
@@ -98,13 +96,8 @@ def nothing(cell: Site) -> None:
 
 def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
     """Run a test with every fault, under its name."""
-
-    def marks(one: Fault) -> tuple[pytest.MarkDecorator, ...]:
-        if one.quick:
-            return ()
-        return (pytest.mark.long if one.fast else pytest.mark.slow,)
-
-    rows = [pytest.param(one, id=one.name, marks=marks(one)) for one in faults]
+    mark = {True: pytest.mark.long, False: pytest.mark.slow}
+    rows = [pytest.param(one, id=one.name, marks=mark[one.fast]) for one in faults]
     return pytest.mark.parametrize("fault", rows)
 
 

@@ -29,6 +29,8 @@ from tests.support.campaign_cases import (
 from tests.support.campaign_run import Run
 from tests.support.campaign_site import Site
 
+pytestmark = pytest.mark.long
+
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
 
@@ -76,7 +78,7 @@ MOTION = (
         arm("protective_stop"),
         unlock,
         ("protective stop", "unlock"),
-        quick=True,
+        fast=True,
     ),
     Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),

@@ -185,6 +185,7 @@ def _large() -> tuple[World, list[Ordered]]:
     return world, [world.ordered(everything(world), seed) for seed in range(5)]
 
 
+@pytest.mark.long
 def test_time_is_far_less_confounded_than_in_the_shortest_order() -> None:
     _, made = _large()
     for ordered in made:

@@ -228,6 +228,7 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys
     assert "More would give, predicted for the deflection: 30 poses ±" in words
 
 
+@pytest.mark.long
 def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     r = rehearsal("nothing")
     table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"

@@ -131,6 +131,7 @@ def stopped(guard: Guard, q: Floats, load: str) -> str | None:
     return guard.check(here, None, load)
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells(), SEED, LOAD)
 def test_a_state_is_refused_by_all_or_by_none(

@@ -122,6 +122,7 @@ def test_a_discovery_says_how_likely_its_laws_are() -> None:
     assert {"formula", "probability", "complexity", "holdout_share"} <= {*rows[0]}  # type: ignore[index]
 
 
+@pytest.mark.long
 def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
     d = found()
     assert d.after is not None

@@ -214,6 +214,7 @@ def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -
 # --- a campaign remembers it ----------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file: Path, file: Path, capsys: Capsys) -> None:
     mine = ("--effects-from", file)
     ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)

@@ -117,15 +117,9 @@ def fitted(cell: Cell, readings: Readings, effect: str = "") -> Fit:
 CASES = {"one": ["granite"], "three": list(PLATES)}
 
 
-@pytest.mark.parametrize(
-    ("plates", "effect"),
-    [
-        ("one", ""),
-        pytest.param("three", "", marks=pytest.mark.long),
-        pytest.param("one", "encoder_offset", marks=pytest.mark.long),
-        pytest.param("three", "encoder_offset", marks=pytest.mark.long),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("plates", CASES)
+@pytest.mark.parametrize("effect", ["", "encoder_offset"])
 def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(
     plates: str, effect: str
 ) -> None:

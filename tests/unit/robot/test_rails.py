@@ -305,6 +305,7 @@ def test_a_table_of_a_rail_comes_back_and_is_checked(tmp_path: Path) -> None:
         read_table(tmp_path / "mm.csv", cell.arm, None)
 
 
+@pytest.mark.long
 def test_a_foreign_table_with_a_rail_goes_through_the_commands(
     tmp_path: Path, capsys: Capsys
 ) -> None:

@@ -58,6 +58,7 @@ def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path
         assert found.moved_m > 3.0 * found.moved_std_m
 
 
+@pytest.mark.long
 def test_too_few_readings_cannot_answer(tmp_path: Path) -> None:
     config, measured = readings(tmp_path, "nothing", 3)
     cell = cell_from_config(config, tmp_path)
