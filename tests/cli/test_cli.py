@@ -90,6 +90,7 @@ def test_identify_names_directions_that_cannot_be_seen(campaign: Path, capsys: C
     assert all(p["value"] is None and p["std"] is None for p in unseen)
 
 
+@pytest.mark.long
 def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None:
     d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document
     assert d["scaling"] == "gc"
@@ -326,6 +327,7 @@ def test_a_scheduler_that_anybody_can_reach_is_said(capsys: Capsys) -> None:
     assert error.startswith("error: ")
 
 
+@pytest.mark.long
 def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:
     for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
         result = ok(capsys, *command, campaign, "--json")

@@ -63,6 +63,7 @@ def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_a_law_is_written_as_an_effect_and_told(
     campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

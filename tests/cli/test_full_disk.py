@@ -156,6 +156,7 @@ def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> 
     assert link.is_symlink()
 
 
+@pytest.mark.long
 def test_output_that_finds_no_room_is_one_line(fitted: Path) -> None:
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(

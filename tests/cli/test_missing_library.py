@@ -82,7 +82,7 @@ def also(package: str, words: tuple[object, ...]) -> object:
         ("plotly", ("report", "run.hilcal")),
         also("rerun", ("view", "run.hilcal")),
         also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
-        ("nicegui", ("workbench", "run.hilcal")),
+        also("nicegui", ("workbench", "run.hilcal")),
         also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
         also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
         also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),

@@ -202,6 +202,7 @@ def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> No
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
+@pytest.mark.long
 def test_wrong_ways_to_append(site: Site, capsys: Capsys) -> None:
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))

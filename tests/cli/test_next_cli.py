@@ -157,6 +157,7 @@ def test_four_suspects_fit_one_screen(
         assert heading not in brief
 
 
+@pytest.mark.long
 def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")

@@ -87,6 +87,7 @@ def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
     ok(capsys, "diagnose", run)
 
 
+@pytest.mark.long
 def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run, "--scaling", "gu")
     said = refused(capsys, 2, "diagnose", run)
@@ -102,6 +103,7 @@ def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Cap
     ok(capsys, "diagnose", run)
 
 
+@pytest.mark.long
 def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     empty, path = tmp_path / "empty.py", tmp_path / "my effect.py"
     empty.write_text("")

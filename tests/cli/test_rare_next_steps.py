@@ -55,6 +55,7 @@ def test_what_accept_says(run: Path, capsys: Capsys) -> None:
     assert ok(capsys, "info", run, "--json").document["accepted"] is None
 
 
+@pytest.mark.long
 def test_a_revision_of_other_targets(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run)
     with CampaignFile.open(run) as file:
@@ -113,6 +114,7 @@ def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys
     assert "for this comparison alone" not in ok(capsys, "compare", run, later).out
 
 
+@pytest.mark.long
 def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
     ok(capsys, "add", run, "hysteresis")
     with Campaign.open(run) as o:
@@ -171,6 +173,7 @@ def test_what_next_says_of_each_verdict(
     follow(capsys, str(said.value), step.format(run=f"'{run}'"), **places)
 
 
+@pytest.mark.long
 def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:

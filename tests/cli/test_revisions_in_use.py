@@ -153,6 +153,7 @@ def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: 
     assert [p.name for p in run.parent.iterdir()] == ["run.hilcal"]
 
 
+@pytest.mark.long
 def test_every_command_that_reads_a_model_takes_a_revision(
     run: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -186,6 +187,7 @@ def test_planning_on_takes_a_revision(
     assert "--after" in refused(capsys, 2, *plan, "--revision", "2")
 
 
+@pytest.mark.long
 def test_a_change_of_an_earlier_revision_follows_that_one(
     run: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

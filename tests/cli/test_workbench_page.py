@@ -603,6 +603,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(
     assert told == []
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it_and_leaves_nothing(served: Served) -> None:
     """The last one: whatever the others have done there."""
     served.process.send_signal(signal.SIGINT)

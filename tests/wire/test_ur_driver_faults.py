@@ -140,6 +140,7 @@ def test_stop_says_so_when_it_cannot_be_seen_that_the_arm_stands(arm, sim):
     cases.check_resting(sim, since)
 
 
+@pytest.mark.long
 def test_controller_dies_in_motion(tmp_path):
     running = cases.start(tmp_path)
     arm = cases.controlled(running)

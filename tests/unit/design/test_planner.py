@@ -73,6 +73,7 @@ def test_the_plan_may_be_run_and_is_the_same_every_time(usual: Planned) -> None:
     assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
 
 
+@pytest.mark.long
 def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual: Planned) -> None:
     config = small()
     cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
@@ -283,6 +284,7 @@ def test_numbers_and_names_that_cannot_be(
     assert words in refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *arguments)
 
 
+@pytest.mark.long
 def test_too_few_readings_say_so(tmp_path: Path, capsys: Capsys) -> None:
     cell = cell_file(tmp_path, small(against=()))
     line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "2")

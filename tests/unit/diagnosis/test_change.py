@@ -94,6 +94,7 @@ def test_a_zero_of_joint_1_is_the_trackers_new_place_unless_that_is_the_old_one(
     assert same.candidate.name == "encoder_offset.j1"
 
 
+@pytest.mark.long
 def test_a_target_that_was_mounted_anew_is_no_change_of_the_arm(arm: StudiedArm) -> None:
     shift = np.array([4e-3, -2e-3, 1e-3])
     found = later(arm, lambda p: p.with_effect("target_offset", p.target_offset + shift), 13)

@@ -15,7 +15,6 @@ from hilcal.model.model import Model
 from hilcal.model.observe import motion
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign, noiseless, plan, with_noise
-from tests.support.rows import first
 
 MODES = ("absolute", "deflection")
 
@@ -60,7 +59,8 @@ def null_p_values(mode, m, seeds):
     return pure, lack
 
 
-@pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
+@pytest.mark.long
+@pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("m", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m):
     for p in null_p_values(mode, m, 40):

@@ -138,6 +138,7 @@ def test_what_effects_explain_as_well_is_in_doubt() -> None:
     assert "tracker_drift would explain the readings as well" in message(d)
 
 
+@pytest.mark.long
 def test_times_tell_a_pause() -> None:
     """Of readings in pairs, far apart in time, the order alone would miss the correlation."""
     cell, readings = campaign(0.0, poses=12)

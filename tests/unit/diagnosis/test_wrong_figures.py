@@ -85,6 +85,7 @@ def test_a_figure_without_an_equilibrium_explains_nothing(monkeypatch: pytest.Mo
     assert tried
 
 
+@pytest.mark.long
 def test_a_tool_at_twice_its_mass_is_named_and_refine_adds_nothing() -> None:
     c = campaign(NOTHING, "absolute", 1, poses=20)
     cell = replace(c.cell, tool_mass=2 * c.cell.tool_mass)

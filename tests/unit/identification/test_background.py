@@ -63,6 +63,7 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(
     }
 
 
+@pytest.mark.long
 def test_it_is_stored_and_found_again(found: Refinement, series: Readings) -> None:
     fit, some = found.fit, series[:30]
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")

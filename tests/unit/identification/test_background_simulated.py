@@ -21,6 +21,7 @@ HIDDEN = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses() -> None:
     config = load_config(CELL)
     case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)

@@ -73,7 +73,8 @@ def test_refine_finds_them_beside_an_effect_and_in_few_poses(
     assert found.outcome != "refused"
 
 
-@pytest.mark.parametrize("mode", ["deflection", pytest.param("absolute", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("mode", MODES)
 def test_more_than_can_be_told_is_said(mode: Mode) -> None:
     c = campaign(mode=mode, plan_seed=0, poses=12)
     readings, _ = spoil(c.readings, 0.6, 5e-3, np.random.default_rng(0))

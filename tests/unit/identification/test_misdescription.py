@@ -99,6 +99,7 @@ def test_positions_of_other_rows_are_named(shift):
     assert "each position stands 1 row after" in finding.words(cell, off)
 
 
+@pytest.mark.long
 def test_exchanged_columns_of_joints_are_named():
     good = readings_of(None, 3)
     for order, said in (

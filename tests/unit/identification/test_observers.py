@@ -182,6 +182,7 @@ def test_a_direction_that_is_known() -> None:
     assert 0.8 < f.variance_factor < 1.25
 
 
+@pytest.mark.long
 def test_what_distances_do_not_tell_is_named() -> None:
     c = observed(["A", "B"], 1, cell=base_cell(stated("AB")))
     found = register(c.cell, c.readings)

@@ -14,7 +14,6 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from tests.support.campaigns import campaign, with_noise
 from tests.support.effect_cases import make
-from tests.support.rows import first
 
 MODES = ("absolute", "deflection")
 
@@ -90,7 +89,8 @@ def check(s: Sampling) -> None:
     assert size == 15
 
 
-@pytest.mark.parametrize("mode", first(1, MODES))
+@pytest.mark.long
+@pytest.mark.parametrize("mode", MODES)
 def test_stated_uncertainties_are_the_sampling_spread(mode):
     check(sample(mode, 60))
 

@@ -72,6 +72,7 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     assert met_words(event) == "goal met after 7 of 15 readings: j2 std 7.0 %"
 
 
+@pytest.mark.long
 def test_progress_tells_the_goal_and_what_is_left_of_the_way() -> None:
     b = Bench()
     measure(b, goal=Enough(7))

@@ -114,6 +114,7 @@ def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
     assert np.all(np.diff(r.states.time) > 0)
 
 
+@pytest.mark.long
 def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> None:
     b, tracker = bench()
     angle = float(usual_plan().joints("p4")[0])

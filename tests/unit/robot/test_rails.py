@@ -373,6 +373,7 @@ joint_std_rad = 1e-5
     assert "column 'q3_rad' is missing beside its group" in said
 
 
+@pytest.mark.long
 def test_the_jacobian_of_a_fitted_rail_is_the_difference_of_predictions(tmp_path: Path) -> None:
     r, cell = campaign(tmp_path, "guide_error", 1, 6)
     states = r.readings.states
