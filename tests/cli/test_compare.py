@@ -61,6 +61,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     return made
 
 
+@pytest.mark.long
 def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     site: Site, capsys: Capsys
 ) -> None:

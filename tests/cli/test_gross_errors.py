@@ -23,6 +23,7 @@ def imported(readings: Readings, folder: Path, capsys: Capsys) -> tuple[Path, st
     return run, " ".join(said.split())
 
 
+@pytest.mark.long
 def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys: Capsys) -> None:
     readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
     run, _ = imported(readings, tmp_path, capsys)
@@ -39,7 +40,6 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys:
         assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in command)
 
 
-@pytest.mark.long
 def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path: Path, capsys: Capsys) -> None:
     """One reading off by 5 mm: errors and bands are those of the readings that were fitted."""
     readings = rehearsal("nothing").readings

@@ -177,6 +177,7 @@ def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys
     assert again["readings"] == len(readings)
 
 
+@pytest.mark.long
 def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
     """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
     ok(capsys, *site.command(*site.fresh))
@@ -202,7 +203,6 @@ def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> No
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
-@pytest.mark.long
 def test_wrong_ways_to_append(site: Site, capsys: Capsys) -> None:
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))

@@ -137,12 +137,13 @@ def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_pat
         assert "no suspects to separate" in result.err
 
 
-FAST = {"missing": (), "unknown although tried": pytest.mark.long}
+FAST = ("missing", "unknown although tried")
 """The doors of an ambiguous one are those of these, but for `next`: see test_next_cli."""
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=FAST.get(c, pytest.mark.slow)) for c in CASES]
+    "case",
+    [pytest.param(c, marks=pytest.mark.long if c in FAST else pytest.mark.slow) for c in CASES],
 )
 def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
     mode, make = CASES[case]
@@ -166,7 +167,6 @@ def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsy
     assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
 
 
-@pytest.mark.long
 def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
     tmp_path: Path, capsys: Capsys
 ) -> None:

@@ -68,6 +68,7 @@ def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
     assert any("can be used" in line for line in bootstrap_remarks(independent))
 
 
+@pytest.mark.long
 def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
     found = fitted(poses=12)
     one = drawn(found, 23)

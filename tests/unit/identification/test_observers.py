@@ -234,6 +234,7 @@ def test_tables_files_and_calibrations_keep_observers(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.predict(q).position, made.predict(q).position, atol=1e-12)
 
 
+@pytest.mark.long
 def test_commands(tmp_path: Path, capsys: Capsys) -> None:
     c = observed(["S1", "S2", "A", "G"], 5, effect="joint_tilt_compliance", strength=5.0)
     write_table(c.readings, tmp_path / "t.csv")

@@ -144,6 +144,7 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
     b, _ = bench()
     force = b.rig.force
