@@ -104,6 +104,7 @@ def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None
     assert "The same readings with every scaling" in words
 
 
+@pytest.mark.long
 def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_changes_it(
     campaign: Path, capsys: Capsys
 ) -> None:
@@ -234,6 +235,7 @@ def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Caps
     assert numbers() == [1, 2, 3, 4, 5, 6, 7]
 
 
+@pytest.mark.long
 def test_validate_predicts_what_was_never_fitted(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

@@ -166,6 +166,7 @@ def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> Non
     assert all(p > 0.5 for _, _, p in d["separates"])
 
 
+@pytest.mark.long
 def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
     plan = tmp_path / "next.json"
     path = stored(tmp_path / "run.hilcal", "nothing", 1)

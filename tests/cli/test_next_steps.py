@@ -141,6 +141,7 @@ def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     ok(capsys, "identify", later, "--prior", run, "--drift", "joint_compliance=1")
 
 
+@pytest.mark.long
 def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     ok(capsys, "add", run, "hysteresis")
     ok(capsys, "add", run, "tool_compliance")

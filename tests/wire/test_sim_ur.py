@@ -387,6 +387,7 @@ def test_an_address_in_use_is_refused(tmp_path, port):
     assert not (tmp_path / "arm.sock").exists()
 
 
+@pytest.mark.long
 def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
     sim = start(tmp_path)
     q = sim.admin()["q"]

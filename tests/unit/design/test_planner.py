@@ -83,6 +83,7 @@ def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual: Plann
     assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
 
+@pytest.mark.long
 def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of what each round chooses is not reached: a plan was refused for that."""
     module = sys.modules["hilcal.design.planner"]

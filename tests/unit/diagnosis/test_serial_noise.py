@@ -101,7 +101,8 @@ def test_intervals_of_a_frame_are_wider_and_of_differences_narrower() -> None:
     assert after > 1.5 * before
 
 
-@pytest.mark.parametrize("rho", [0.0, pytest.param(0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("rho", [0.0, 0.5])
 def test_a_drift_is_named_as_one(rho: float) -> None:
     cell, readings = campaign(rho, hidden="tracker_drift", seed=1, poses=20)
     found = refine(baseline(cell, readings, "absolute"), readings, "absolute")

@@ -137,6 +137,7 @@ def test_the_way_home_is_clear() -> None:
 # going on
 
 
+@pytest.mark.long
 def test_what_was_left_out_is_measured_on_resuming() -> None:
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(7))

@@ -522,6 +522,7 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
     assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
 
 
+@pytest.mark.long
 def test_a_load_that_stays_wrong_ends_the_run() -> None:
     b = Bench()
     moving, fell = b.rig.arm.moving, []
