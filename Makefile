@@ -13,11 +13,12 @@ export OMP_NUM_THREADS ?= 1
 # else every program that a test starts compiles all of hilcal again
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo test check format slow bench peers docs versions dist sbom release lock clean
+.PHONY: help setup demo test test-all check format slow bench peers docs versions dist sbom release lock clean
 
 help:
 	@echo "make demo    the whole story on a simulated cell with a hidden effect"
-	@echo "make test    the tests"
+	@echo "make test    the quick tests"
+	@echo "make test-all these and the long ones: whole stories and many repetitions"
 	@echo "make check   ruff, mypy, import-linter"
 	@echo "make slow    the tests that take minutes"
 	@echo "make bench   the benchmarks"
@@ -49,8 +50,13 @@ demo: $(STAMP)
 	$(BIN)/hilcal demo
 
 # Tests of tests/wire mostly wait: one process more than the two cores that the suite is made for.
+TEST = $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 test: $(STAMP)
-	$(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+	$(TEST)
+	@echo "Left out: tests marked long (make test-all runs them, too) and slow (make slow)."
+
+test-all: $(STAMP)
+	$(TEST) -m "not slow"
 
 check: $(STAMP)
 	$(BIN)/ruff check .

@@ -54,11 +54,15 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
-LONG = (
+FIRST = (
     "test_stops",
     "test_run_watched",
     "test_fault_matrix_serial",
     "test_fault_matrix_arm",
+    "test_fault_matrix_person",
+    "test_polyscope_x_cell",
+    "test_measured_torques",
+    "test_effect_jacobian",
     "test_force_drivers",
     "test_one_verdict",
     "test_next_cli",
@@ -82,7 +86,9 @@ LONG = (
     "test_p_values",
     "test_study_plans",
     "test_docs",
-    "test_effect_jacobian",
+    "test_missing_library",
+    "test_run_until",
+    "test_plane_contact",
 )
 """Files that take longest: they begin first, so that none of them is left over at the end."""
 
@@ -93,9 +99,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     Files of tests/wire wait for devices most of their time: they are spread evenly among the
     others, which compute, so that two processes seldom wait at once.
     """
-    place = {name: k for k, name in enumerate(LONG)}
+    place = {name: k for k, name in enumerate(FIRST)}
     files = list(dict.fromkeys(item.path for item in items))
-    files.sort(key=lambda path: place.get(path.stem, len(LONG)))
+    files.sort(key=lambda path: place.get(path.stem, len(FIRST)))
     rank: dict[Path, float] = {}
     for wire in (True, False):
         group = [path for path in files if (path.parent.name == "wire") is wire]

@@ -82,9 +82,9 @@ def evaluate(
         twist = np.swapaxes(along_states(twist), 0, 1)
     count, n = cos.shape
     cos, sin = cos[..., None], sin[..., None]
-    rotation = np.moveaxis(empty(count, 3, 3, n + 1), -1, 0)
-    position = np.moveaxis(empty(count, 3, n + 1), -1, 0)
-    com = np.moveaxis(empty(count, 3, n), -1, 0)
+    rotation = empty(count, 3, 3, n + 1).transpose(3, 0, 1, 2)
+    position = empty(count, 3, n + 1).transpose(2, 0, 1)
+    com = empty(count, 3, n).transpose(2, 0, 1)
     body, linked = empty(count, 3, 3), empty(count, 3, 3)
     body[...] = np.eye(3)  # the frame that link k starts from
     p: Floats = np.zeros(3)

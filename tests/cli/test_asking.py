@@ -46,7 +46,10 @@ def toml(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize(
     "columns",
-    [80, *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120))],
+    [
+        pytest.param(80, marks=pytest.mark.long),
+        *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120)),
+    ],
 )
 def test_a_person_is_shown_the_plan_and_asked(columns: int, toml: Path) -> None:
     home = toml.parent

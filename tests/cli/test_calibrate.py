@@ -59,6 +59,7 @@ def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: 
     assert said in line
 
 
+@pytest.mark.long
 def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Capsys) -> None:
     """Deflections know nothing of the unloaded arm, however well the model predicts them."""
     p = there.procedure

@@ -90,6 +90,7 @@ def test_identify_names_directions_that_cannot_be_seen(campaign: Path, capsys: C
     assert all(p["value"] is None and p["std"] is None for p in unseen)
 
 
+@pytest.mark.long
 def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None:
     d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document
     assert d["scaling"] == "gc"
@@ -103,6 +104,7 @@ def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None
     assert "The same readings with every scaling" in words
 
 
+@pytest.mark.long
 def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_changes_it(
     campaign: Path, capsys: Capsys
 ) -> None:
@@ -153,6 +155,7 @@ def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) ->
     assert "does not fall" in words  # the model is adequate without
 
 
+@pytest.mark.long
 def test_remove_takes_out_what_is_needless_and_says_what_is_not(
     campaign: Path, capsys: Capsys
 ) -> None:
@@ -189,6 +192,7 @@ def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: C
     assert records[-1].result_json["diagnose"]["verdict"] == "adequate"
 
 
+@pytest.mark.long
 def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     refused(capsys, 2, "refine", campaign, "--from-latest")
     ok(capsys, "add", campaign, "hysteresis")
@@ -206,6 +210,7 @@ def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
     assert ok(capsys, "identify", campaign, "--json").document["readings"] == "absolute"
 
 
+@pytest.mark.long
 def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Capsys) -> None:
     def numbers() -> list[int]:
         with CampaignFile.open(campaign, read_only=True) as stored:
@@ -230,6 +235,7 @@ def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Caps
     assert numbers() == [1, 2, 3, 4, 5, 6, 7]
 
 
+@pytest.mark.long
 def test_validate_predicts_what_was_never_fitted(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -323,6 +329,7 @@ def test_a_scheduler_that_anybody_can_reach_is_said(capsys: Capsys) -> None:
     assert error.startswith("error: ")
 
 
+@pytest.mark.long
 def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:
     for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
         result = ok(capsys, *command, campaign, "--json")

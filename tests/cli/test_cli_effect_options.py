@@ -70,6 +70,7 @@ def test_usual_options_are_not_shown(campaign: Path, capsys: Capsys) -> None:
     assert "joints=" not in ok(capsys, "compare", campaign).out
 
 
+@pytest.mark.long
 def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", campaign)
     result = ok(capsys, "add", campaign, "hysteresis(joints=2/3+4)", "--json")
@@ -88,6 +89,7 @@ def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
     assert "hysteresis" not in revisions(campaign)[-1][2]
 
 
+@pytest.mark.long
 def test_refine_starts_from_options(campaign: Path, capsys: Capsys) -> None:
     chosen = "joint_compliance(joints=1/2/3/4-6)"
     d = ok(capsys, "refine", campaign, "--effects", chosen, "--json").document
@@ -150,6 +152,7 @@ def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
         assert part in words
 
 
+@pytest.mark.long
 def test_joints_that_differ_are_let_differ(campaign: Path, tmp_path: Path, capsys: Capsys) -> None:
     finer = "joint_compliance(joints=each)"
     ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=common)")

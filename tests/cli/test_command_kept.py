@@ -27,6 +27,7 @@ def run(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_revision_keeps_its_command_and_the_page_shows_it(
     run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,6 +61,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     return made
 
 
+@pytest.mark.long
 def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     site: Site, capsys: Capsys
 ) -> None:
@@ -89,6 +90,7 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
     assert words.rstrip().endswith(f"hilcal refine {repaired} --prior {site.earlier}")
 
 
+@pytest.mark.long
 def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
     site: Site, capsys: Capsys
 ) -> None:

@@ -61,6 +61,7 @@ def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None
     assert [r["added"] for r in d["revisions"]] == [None]
 
 
+@pytest.mark.long
 def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[tuple[int, int]] = []
     made: list[Plan] = []

@@ -63,6 +63,7 @@ def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
     assert not out.exists()
 
 
+@pytest.mark.long
 def test_a_law_is_written_as_an_effect_and_told(
     campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -230,6 +231,7 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(
     assert added["revisions"][-1]["variance_factor"] < 0.4 * before["variance_factor"]
 
 
+@pytest.mark.long
 def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
     campaign: Path, tmp_path: Path, capsys: Capsys
 ) -> None:

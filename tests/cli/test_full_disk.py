@@ -17,6 +17,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, rehearsal, run
 from tests.support.paths import ROOT
+from tests.support.rows import first
 
 OLD = "what was there"
 POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
@@ -76,7 +77,7 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize("size", [0, 200])
+@pytest.mark.parametrize("size", first(1, [0, 200]))
 def test_a_full_disk_leaves_no_half_file(
     capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch, size: int
 ) -> None:
@@ -133,7 +134,7 @@ def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted: Path, monkeypatch
     assert Path("none.csv").read_text().startswith("pose,")
 
 
-@pytest.mark.parametrize("redirected", [False, True])
+@pytest.mark.parametrize("redirected", first(1, [False, True]))
 def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> None:
     """`--preview -o /dev/stdout` would be no .toml: a link gives the name."""
     link, out = fitted / f"out-{redirected}.toml", fitted / "redirected"
@@ -155,6 +156,7 @@ def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> 
     assert link.is_symlink()
 
 
+@pytest.mark.long
 def test_output_that_finds_no_room_is_one_line(fitted: Path) -> None:
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(

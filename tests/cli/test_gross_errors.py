@@ -23,6 +23,7 @@ def imported(readings: Readings, folder: Path, capsys: Capsys) -> tuple[Path, st
     return run, " ".join(said.split())
 
 
+@pytest.mark.long
 def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys: Capsys) -> None:
     readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
     run, _ = imported(readings, tmp_path, capsys)
@@ -69,6 +70,7 @@ def test_errors_of_centimetres_are_named_at_import(tmp_path: Path, capsys: Capsy
     assert len(d["outliers"]) == len(wrong)
 
 
+@pytest.mark.long
 def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path: Path, capsys: Capsys) -> None:
     readings = rehearsal("nothing").readings
     value = readings.value.copy()

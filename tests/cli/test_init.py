@@ -223,6 +223,7 @@ def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> No
     assert c.planning.readings == "absolute"
 
 
+@pytest.mark.long
 def test_a_person_decides_whether_a_file_is_replaced(tmp_path: Path) -> None:
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")

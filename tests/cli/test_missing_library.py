@@ -70,20 +70,25 @@ def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folde
     assert library.stdout.strip() == "adequate", library.stderr
 
 
+def also(package: str, words: tuple[object, ...]) -> object:
+    """Another package, found missing in the same way."""
+    return pytest.param(package, words, marks=pytest.mark.long)
+
+
 @pytest.mark.parametrize(
     ("package", "words"),
     [
-        ("jinja2", ("report", "run.hilcal")),
+        also("jinja2", ("report", "run.hilcal")),
         ("plotly", ("report", "run.hilcal")),
-        ("rerun", ("view", "run.hilcal")),
-        ("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
-        ("nicegui", ("workbench", "run.hilcal")),
-        ("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
-        ("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
-        ("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
-        ("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
-        ("geocompy", ("config", "tracker")),
-        ("serial", ("doctor",)),
+        also("rerun", ("view", "run.hilcal")),
+        also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
+        also("nicegui", ("workbench", "run.hilcal")),
+        also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
+        also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
+        also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
+        also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
+        also("geocompy", ("config", "tracker")),
+        also("serial", ("doctor",)),
     ],
 )
 def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
@@ -99,6 +104,7 @@ def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
     assert "Traceback" not in ended.stderr
 
 
+@pytest.mark.long
 def test_the_library_names_what_it_lacks(folder: Path) -> None:
     code = (
         "import hilcal as hc\n"

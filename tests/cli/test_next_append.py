@@ -118,6 +118,7 @@ with CampaignFile.open(Path(sys.argv[1])) as campaign:
 """
 
 
+@pytest.mark.long
 def test_an_appended_plan_survives_a_kill(tmp_path: Path) -> None:
     path = tmp_path / "run.hilcal"
     _campaign(path).close()
@@ -147,6 +148,7 @@ def further_plan(site: Site) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys) -> None:
     path, first = site.directory / "run.hilcal", len(site.plan.steps)
     ok(capsys, *site.command(*site.fresh))
@@ -175,6 +177,7 @@ def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys
     assert again["readings"] == len(readings)
 
 
+@pytest.mark.long
 def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
     """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
     ok(capsys, *site.command(*site.fresh))
@@ -186,6 +189,7 @@ def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
     assert ok(capsys, *shlex.split(named)[1:]).code == 0
 
 
+@pytest.mark.long
 def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> None:
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.again()

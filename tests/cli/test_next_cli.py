@@ -105,6 +105,7 @@ def test_a_revision_with_a_prior_takes_no_other(
     assert "has a prior already, old.hilcal" in said
 
 
+@pytest.mark.long
 def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
     ambiguous: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -118,6 +119,7 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
     assert len(d["suspects"]) > 1
 
 
+@pytest.mark.long
 def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
@@ -134,6 +136,7 @@ def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: C
     assert "unloaded readings at 10 poses" in " ".join(result.err.split())
 
 
+@pytest.mark.long
 def test_four_suspects_fit_one_screen(
     tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -154,6 +157,7 @@ def test_four_suspects_fit_one_screen(
         assert heading not in brief
 
 
+@pytest.mark.long
 def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")
@@ -162,6 +166,7 @@ def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> Non
     assert all(p > 0.5 for _, _, p in d["separates"])
 
 
+@pytest.mark.long
 def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
     plan = tmp_path / "next.json"
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
@@ -259,6 +264,7 @@ def in_doubt_at_first(seed: int, path: Path) -> bool:
     return d.verdict == "ambiguous" and case.choice in in_doubt(d)
 
 
+@pytest.mark.long
 def test_an_ambiguous_demo_is_in_doubt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "DRAWS", 2)
     assert in_doubt_at_first(2, tmp_path / "x")
@@ -269,6 +275,7 @@ def test_every_ambiguous_demo_is_in_doubt(tmp_path: Path) -> None:
     assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
 
 
+@pytest.mark.long
 def test_a_case_without_a_doubt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An effect that everything separates is hidden all the same, if that is asked for."""
     monkeypatch.setattr(demo, "TRIES", 2)

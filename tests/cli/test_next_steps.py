@@ -53,6 +53,7 @@ def run(tmp_path: Path, capsys: Capsys) -> Path:
     return imported(capsys, tmp_path / "a run.hilcal")
 
 
+@pytest.mark.long
 def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     out, later = tmp_path / "p.json", imported(capsys, tmp_path / "later.hilcal", seed=2)
     for arguments in (
@@ -86,6 +87,7 @@ def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
     ok(capsys, "diagnose", run)
 
 
+@pytest.mark.long
 def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run, "--scaling", "gu")
     said = refused(capsys, 2, "diagnose", run)
@@ -101,6 +103,7 @@ def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Cap
     ok(capsys, "diagnose", run)
 
 
+@pytest.mark.long
 def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     empty, path = tmp_path / "empty.py", tmp_path / "my effect.py"
     empty.write_text("")
@@ -124,6 +127,7 @@ def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Ca
     ok(capsys, "export", run, "--urdf", tmp_path / "arm.urdf")
 
 
+@pytest.mark.long
 def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     table(csv := tmp_path / "later.csv", "hysteresis", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
@@ -137,6 +141,7 @@ def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     ok(capsys, "identify", later, "--prior", run, "--drift", "joint_compliance=1")
 
 
+@pytest.mark.long
 def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     ok(capsys, "add", run, "hysteresis")
     ok(capsys, "add", run, "tool_compliance")
@@ -145,6 +150,7 @@ def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     assert "hilcal remove" not in ok(capsys, "diagnose", run).out
 
 
+@pytest.mark.long
 def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
     cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
@@ -159,6 +165,7 @@ def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
     follow(capsys, said, f"hilcal add {run} hysteresis")
 
 
+@pytest.mark.long
 def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     table(csv := tmp_path / "later.csv", "creep", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
@@ -194,6 +201,7 @@ def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys)
     follow(capsys, "hilcal config", "hilcal config")
 
 
+@pytest.mark.long
 def test_what_a_report_names(
     run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,6 +225,7 @@ def test_a_campaign_that_calibrate_did_not_make(run: Path, capsys: Capsys) -> No
     follow(capsys, said, f"hilcal info '{run}'")
 
 
+@pytest.mark.long
 def test_another_arm_is_calibrated_by_itself(
     run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -142,7 +142,8 @@ FAST = ("missing", "unknown although tried")
 
 
 @pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=() if c in FAST else pytest.mark.slow) for c in CASES]
+    "case",
+    [pytest.param(c, marks=pytest.mark.long if c in FAST else pytest.mark.slow) for c in CASES],
 )
 def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
     mode, make = CASES[case]
@@ -180,6 +181,7 @@ def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
         assert (again["verdict"], again["message"]) == (d["verdict"], d["message"])
 
 
+@pytest.mark.long
 def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     """The effect that each step adds is the first suspect of the step before."""
     c = study_case(UR5E, "ur5e", "deflection", ("relaxing bench",), 3.0, 0, n_poses=12)

@@ -45,6 +45,7 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(
     assert json.loads(out)["variance_factor"] == pytest.approx(found["variance_factor"], rel=1e-6)
 
 
+@pytest.mark.long
 def test_a_misfit_that_the_prior_does_not_know_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

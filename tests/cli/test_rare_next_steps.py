@@ -55,6 +55,7 @@ def test_what_accept_says(run: Path, capsys: Capsys) -> None:
     assert ok(capsys, "info", run, "--json").document["accepted"] is None
 
 
+@pytest.mark.long
 def test_a_revision_of_other_targets(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run)
     with CampaignFile.open(run) as file:
@@ -104,6 +105,7 @@ def test_masses_that_a_description_lacks(tmp_path: Path, capsys: Capsys) -> None
     assert "hilcal add" not in ok(capsys, "info", path).out
 
 
+@pytest.mark.long
 def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     later = imported(capsys, tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
@@ -112,6 +114,7 @@ def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys
     assert "for this comparison alone" not in ok(capsys, "compare", run, later).out
 
 
+@pytest.mark.long
 def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
     ok(capsys, "add", run, "hysteresis")
     with Campaign.open(run) as o:
@@ -120,6 +123,7 @@ def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
     follow(capsys, said, "hilcal remove RUN hysteresis", RUN=run)
 
 
+@pytest.mark.long
 def test_joints_that_differ(tmp_path: Path, capsys: Capsys) -> None:
     path = imported(capsys, tmp_path / "run.hilcal", "nothing")
     common = ("--effects", "base_frame,joint_compliance(joints=common)")
@@ -131,15 +135,23 @@ def test_joints_that_differ(tmp_path: Path, capsys: Capsys) -> None:
     assert "Let joints differ" not in ok(capsys, "diagnose", path).out
 
 
+PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
+
+
 @pytest.mark.parametrize(
     ("reason", "words", "step"),
     [
         ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
-        ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
-        ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
         ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
-        ("background", "one by one", "hilcal plan CELL.toml -o PLAN.json --after {run}"),
-        ("residual_is_noise", "is adequate", "hilcal plan CELL.toml -o PLAN.json --after {run}"),
+        *(
+            pytest.param(*further, marks=pytest.mark.long)
+            for further in (
+                ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
+                ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
+                ("background", "one by one", PLAN_AFTER),
+                ("residual_is_noise", "is adequate", PLAN_AFTER),
+            )
+        ),
     ],
 )
 def test_what_next_says_of_each_verdict(
@@ -161,6 +173,7 @@ def test_what_next_says_of_each_verdict(
     follow(capsys, str(said.value), step.format(run=f"'{run}'"), **places)
 
 
+@pytest.mark.long
 def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:
@@ -169,6 +182,7 @@ def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
     assert ok(capsys, "refine", run, "--json").document["revisions"][-1]["added"] == "hysteresis"
 
 
+@pytest.mark.long
 def test_what_a_recording_names(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert "`hilcal refine` does, afterwards" in GUIDE
     assert "hilcal refine says what" in inspect.getsource(live_scene)
@@ -200,6 +214,7 @@ def test_a_stream_of_several_targets(run: Path, tmp_path: Path, capsys: Capsys) 
     ok(capsys, "import", path, "--config", cell, "-o", tmp_path / "t.hilcal")
 
 
+@pytest.mark.long
 def test_deflections_are_compared_after_a_fit_of_absolute_readings(
     run: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -220,6 +235,7 @@ def test_sections_of_a_cell(tmp_path: Path, capsys: Capsys) -> None:
     assert "hilcal config SECTION explains" in path.read_text()
 
 
+@pytest.mark.long
 def test_a_page_with_a_validation_names_its_command(
     run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -232,6 +248,7 @@ def test_a_page_with_a_validation_names_its_command(
     follow(capsys, step, step)
 
 
+@pytest.mark.long
 def test_the_page_says_how_to_be_judged(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     page = tmp_path / "page.html"
     ok(capsys, "identify", run, "--scaling", "gu")

@@ -66,6 +66,7 @@ def test_the_one_command_is_as_the_readme_says(tmp_path: Path, capsys: Capsys) -
         assert all(w in shown for w in words if w.startswith("--"))
 
 
+@pytest.mark.long
 def test_every_command_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
 ) -> None:

@@ -105,6 +105,7 @@ def test_the_certificate_never_takes_the_arm_to_come_back_exactly(
     assert "16 of 56 readings repeat an earlier one, too few to judge the noise" in text
 
 
+@pytest.mark.long
 def test_deflection_and_absolute_revisions_stand_in_no_column_together(
     tmp_path: Path, capsys: Capsys
 ) -> None:

@@ -153,6 +153,7 @@ def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: 
     assert [p.name for p in run.parent.iterdir()] == ["run.hilcal"]
 
 
+@pytest.mark.long
 def test_every_command_that_reads_a_model_takes_a_revision(
     run: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -186,6 +187,7 @@ def test_planning_on_takes_a_revision(
     assert "--after" in refused(capsys, 2, *plan, "--revision", "2")
 
 
+@pytest.mark.long
 def test_a_change_of_an_earlier_revision_follows_that_one(
     run: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -211,6 +213,7 @@ def test_refining_from_a_revision_follows_it(run: Path, capsys: Capsys) -> None:
         assert [r.number for r in chain(o.file.revisions())] == [1, 4]
 
 
+@pytest.mark.long
 def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
     run: Path, capsys: Capsys
 ) -> None:
@@ -268,7 +271,13 @@ def take(said: str, run: Path, capsys: Capsys) -> None:
 
 @pytest.mark.parametrize("made", [outdated, of_another_scaling])
 @pytest.mark.parametrize(
-    "asked", [("compare",), ("diagnose",), ("next", "-o", "{out}/p.json")], ids=lambda x: x[0]
+    "asked",
+    [
+        ("compare",),
+        ("diagnose",),
+        pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
+    ],
+    ids=lambda x: x[0],
 )
 def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
     run: Path, tmp_path: Path, capsys: Capsys, made: Made, asked: tuple[str, ...]
@@ -298,7 +307,7 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         ("export", "{run}", "--urdf", "{out}/arm.urdf"),
         ("report", "{run}", "-o", "{out}/r.html"),
         ("compensate", "{run}", "{out}/points.csv"),
-        ("next", "{run}", "-o", "{out}/p.json"),
+        pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
         ("view", "{run}", "--record", "{out}/v.rrd"),
     ],
     ids=lambda x: x[0],

@@ -75,6 +75,7 @@ def test_loaded_readings_count_from_their_unloaded_ones_on() -> None:
     assert status.met
 
 
+@pytest.mark.long
 def test_the_position_is_as_sure_as_it_says() -> None:
     """Over 40 campaigns the predicted positions scatter by what is stated."""
     c, p = campaign(mode="absolute", poses=6), plan(6, 1000)
@@ -261,6 +262,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
     return made
 
 
+@pytest.mark.long
 def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     """It stops early, `identify` says the same, and resuming measures the rest."""
     total, path = len(site.plan.steps), site.directory / "run.hilcal"
@@ -314,6 +316,7 @@ def test_a_wrong_goal_is_refused_before_anything_else(
     assert not (site.directory / "run.hilcal").exists()
 
 
+@pytest.mark.long
 def test_a_worker_of_many_measures_in_a_thread(site: Site) -> None:
     """Where no signal can be handled."""
     bench, path = site.bench, site.directory / "run.hilcal"

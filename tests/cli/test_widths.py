@@ -70,6 +70,7 @@ def test_the_words_of_a_campaign_stay_whole(
     whole(pages)
 
 
+@pytest.mark.long
 def test_the_words_of_lists_and_plans_stay_whole(
     home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
 ) -> None:
@@ -79,6 +80,7 @@ def test_the_words_of_lists_and_plans_stay_whole(
     whole(pages)
 
 
+@pytest.mark.long
 def test_what_commands_print_unasked_is_one_screen(
     readings: Path, home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
 ) -> None:

@@ -189,6 +189,7 @@ def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> Non
     assert not used.abandoned
 
 
+@pytest.mark.long
 def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path: Path) -> None:
     run = stored(tmp_path / "run.hilcal")
     code = f"""
@@ -391,7 +392,7 @@ def number(page: Page, what: str) -> float:
 
 
 @needs_chromium
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
 def test_the_page_fits_desktop_and_phone(
     browser: Browser, served: Served, scheme: str, tmp_path: Path
 ) -> None:
@@ -420,6 +421,7 @@ def test_the_page_fits_desktop_and_phone(
     assert told == []
 
 
+@pytest.mark.long
 @needs_chromium
 def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: Served) -> None:
     told: list[str] = []
@@ -498,6 +500,7 @@ def came(page: Page, place: str, how: str, words: str) -> None:
     expect(answer).to_be_in_viewport()
 
 
+@pytest.mark.long
 @needs_chromium
 def test_a_table_becomes_a_calibration_at_one_page(
     browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -600,6 +603,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(
     assert told == []
 
 
+@pytest.mark.long
 def test_ctrl_c_ends_it_and_leaves_nothing(served: Served) -> None:
     """The last one: whatever the others have done there."""
     served.process.send_signal(signal.SIGINT)

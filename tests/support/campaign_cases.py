@@ -74,7 +74,7 @@ class Fault:
         undo: puts it right, as the operator would.
         says: patterns that the one line has to contain.
         stops: whether the arm has to be stopped for it (else it stands already).
-        fast: whether it is one of the few that are tested every time.
+        fast: whether it is one of the few that are long, not slow.
     """
 
     name: str
@@ -96,9 +96,8 @@ def nothing(cell: Site) -> None:
 
 def each(faults: tuple[Fault, ...]) -> pytest.MarkDecorator:
     """Run a test with every fault, under its name."""
-    rows = [
-        pytest.param(one, id=one.name, marks=() if one.fast else pytest.mark.slow) for one in faults
-    ]
+    mark = {True: pytest.mark.long, False: pytest.mark.slow}
+    rows = [pytest.param(one, id=one.name, marks=mark[one.fast]) for one in faults]
     return pytest.mark.parametrize("fault", rows)
 
 

@@ -148,7 +148,9 @@ GENERATIONS = ("5.11.6.1010327", "10.14.0.0")
 """With a dashboard server, and with the Robot API of PolyScope X: one contract."""
 
 
-@pytest.fixture(scope="module", params=GENERATIONS)
+@pytest.fixture(
+    scope="module", params=[GENERATIONS[0], pytest.param(GENERATIONS[1], marks=pytest.mark.long)]
+)
 def sim(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Iterator[Sim]:
     """One controller of each generation for a file."""
     running = start(tmp_path_factory.mktemp("ur"), "--version", request.param)

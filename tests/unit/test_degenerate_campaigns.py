@@ -86,6 +86,7 @@ def judged_or_refused(of: tuple[Readings, Cell, Mode], extra: str | None) -> Non
     assert "\n" not in refused
 
 
+@pytest.mark.long
 @settings(max_examples=6, suppress_health_check=list(HealthCheck))
 @given(odd_campaigns(), st.sampled_from(EXTRA))
 def test_odd_campaigns_are_judged_or_refused_in_words(

@@ -75,6 +75,7 @@ def test_the_effect_of_the_guide_is_a_working_effect() -> None:
     hc.check_effect(effect)
 
 
+@pytest.mark.long
 def test_the_guide_to_the_library_runs_as_it_stands(
     campaign_of: Callable[..., None], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -64,7 +64,10 @@ def names() -> list[str]:
     return [name for name in hc.__all__ if not name.startswith("__")]
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(n, marks=pytest.mark.long if n == "discover" else ()) for n in names()],
+)
 def test_the_examples_of_a_docstring_run(name: str, site: SimpleNamespace) -> None:
     thing = getattr(hc, name)
     with socket.socket() as probe:

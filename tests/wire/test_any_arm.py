@@ -141,6 +141,7 @@ def test_eight_joints_with_two_slides_stand_where_their_kinematics_say(tmp_path:
     assert np.linalg.norm(seen[:3] - expected) < 5e-3
 
 
+@pytest.mark.long
 def test_a_campaign_of_seven_joints_is_rehearsed(tmp_path: Path, capsys: Capsys) -> None:
     (tmp_path / "cell.toml").write_text(
         """[robot]

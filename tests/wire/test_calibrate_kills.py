@@ -30,6 +30,7 @@ def finished(c: Calibration) -> None:
     assert error["after"]["rms_m"] < 0.3 * error["before"]["rms_m"]
 
 
+@pytest.mark.long
 def test_killed_twice_while_it_measures(tmp_path: Path) -> None:
     c = Calibration(tmp_path)
     for wanted in (2, 5):

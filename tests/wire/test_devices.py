@@ -30,7 +30,9 @@ SLOW = 0.2  # rad/s
 PATIENCE = 60.0  # s
 
 
-@pytest.fixture(scope="module", params=["ur10e", "track.toml"])
+@pytest.fixture(
+    scope="module", params=["ur10e", pytest.param("track.toml", marks=pytest.mark.long)]
+)
 def there(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[CellConfig, Cell]]:

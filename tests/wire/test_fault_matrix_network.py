@@ -22,6 +22,8 @@ from tests.support.campaign_cases import (
 from tests.support.campaign_run import Run
 from tests.support.campaign_site import Site, site
 
+pytestmark = pytest.mark.long
+
 __all__ = ["nothing_goes_on", "path"]  # fixtures
 
 

@@ -28,6 +28,8 @@ from tests.support.campaign_cases import (
 from tests.support.campaign_run import Run
 from tests.support.campaign_site import Site
 
+pytestmark = pytest.mark.long
+
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
 NO_FORCE = [0.0] * 6

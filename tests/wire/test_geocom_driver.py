@@ -201,6 +201,7 @@ def test_flipped_bits_and_cuts_are_repaired_or_refused(device, station):
             assert device.measure().value == pytest.approx(TARGET, abs=1e-3)
 
 
+@pytest.mark.long
 def test_mute_instrument_is_given_up_in_time_and_heard_again(device, station):
     station.admin("mute", on=True)
     seconds, text = seconds_of(DeviceError, device.measure)

@@ -87,6 +87,7 @@ def test_port_that_is_not_there(tmp_path):
     assert "no port" in refused(DeviceError, cell(tmp_path / "absent"))
 
 
+@pytest.mark.long
 def test_mute_instrument_and_wrong_rate_say_what_to_check():
     with simulated.tracker() as station:
         text = refused(DeviceError, cell(station.port, baud=57600))

@@ -83,6 +83,7 @@ def test_a_stalled_link_ends_the_torques_not_the_arm(tmp_path) -> None:
             arm.close()
 
 
+@pytest.mark.long
 def test_a_run_stores_torques_and_says_what_the_load_weighs(tmp_path, capsys) -> None:
     """The weights are half as heavy as the cell says; friction is taken by the side of arrival."""
     simulation = {"clock": 40.0, "controller_version": "10.11.0.0", "seed": 4}

@@ -13,6 +13,7 @@ from hilcal.drivers.natnet import NatNetTracker, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import TargetLostError
 from tests.support.network_cases import TARGET, TURNED, cell, natnet
+from tests.support.rows import first
 from tests.support.sim_serial_cases import Instrument
 
 There = tuple[Instrument, str]
@@ -130,6 +131,7 @@ def test_a_body_that_is_hidden_is_a_lost_target(there: There) -> None:
         right(device.measure())
 
 
+@pytest.mark.long
 def test_frames_that_repeat_or_do_not_come_are_no_readings(there: There) -> None:
     with opened(there[1]) as device:
         there[0].admin("pause", on=True)
@@ -157,7 +159,7 @@ def test_nobody_there() -> None:
         open_tracker(good.model_copy(update={"tracker": tracker}))
 
 
-@pytest.mark.parametrize("version", ["3.1", "4.1"])
+@pytest.mark.parametrize("version", first(1, ["4.1", "3.1"]))
 def test_the_client_of_others_reads_the_same(version: str) -> None:
     """Natnet takes frames and descriptions apart with code of its own."""
     others = pytest.importorskip("natnet")

@@ -44,6 +44,7 @@ def written(tmp_path, told: CellConfig, **robot):
     return path
 
 
+@pytest.mark.long
 def test_the_controllers_kinematics_are_checked_written_stored_and_judged(
     tmp_path, capsys, told
 ) -> None:

@@ -15,6 +15,7 @@ from hilcal.calibration.urscript import movej_program, waypoints, with_joints
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.errors import DeviceError
 from hilcal.robot.catalogue import load_arm
+from tests.support.rows import first
 from tests.support.sim_ur_cases import (
     Client,
     ClientError,
@@ -360,7 +361,7 @@ def test_the_truth_is_what_the_sensors_tell(tmp_path):
         sim.close()
 
 
-@pytest.mark.parametrize("port", [29999, 30003, 30004])
+@pytest.mark.parametrize("port", first(1, [30004, 29999, 30003]))
 def test_an_address_in_use_is_refused(tmp_path, port):
     Blackboard.create(tmp_path / "world.bin", 1.0)
     host = free_host()
@@ -386,6 +387,7 @@ def test_an_address_in_use_is_refused(tmp_path, port):
     assert not (tmp_path / "arm.sock").exists()
 
 
+@pytest.mark.long
 def test_a_restarted_controller_finds_its_arm_where_it_was(tmp_path):
     sim = start(tmp_path)
     q = sim.admin()["q"]

@@ -27,6 +27,7 @@ from hilcal.errors import DeviceError, InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import WEIGHT, config, same, states, world_of
 from tests.support.paths import ROOT
+from tests.support.rows import first
 
 DEVICES = ("world", "arm", "tracker", "force")
 SENSOR = {"driver": "ft300", "port": "to be filled in", "origin_m": [0.0, 0.0, 0.04]}
@@ -108,6 +109,7 @@ def test_the_configuration_leads_to_the_devices_and_keeps_the_rest(cell):
     assert filled == type(filled).from_json(filled.to_json())
 
 
+@pytest.mark.long
 def test_two_cells_have_arms_of_their_own(cell, tmp_path):
     with start(tmp_path, config()) as other:
         assert tuple(other.processes()) == DEVICES[:3]  # no force sensor was configured
@@ -125,7 +127,7 @@ def test_a_directory_in_use_is_refused(cell):
     assert all(map(running, cell.processes().values()))
 
 
-@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("device", first(1, DEVICES))
 def test_a_killed_device_comes_back_at_the_same_place(cell, device):
     before = cell.processes()
     cell.ask("world", "hang", name="5kg")
@@ -184,7 +186,7 @@ time.sleep(60)
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", first(1, [signal.SIGKILL, signal.SIGINT]))
 def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
     with subprocess.Popen(
         [sys.executable, "-c", PARENT, str(tmp_path)],
@@ -203,6 +205,7 @@ def test_the_devices_end_with_a_parent_that_is_killed(tmp_path, how):
 # what goes wrong at the start
 
 
+@pytest.mark.long
 def test_an_address_that_another_program_took_is_not_insisted_on(tmp_path, monkeypatch):
     taken, free = free_host(), free_host()
     hosts = iter([taken, free])
@@ -234,6 +237,7 @@ def test_a_device_that_ends_early_is_named_with_its_last_words(tmp_path, monkeyp
     assert children() == before
 
 
+@pytest.mark.long
 def test_a_device_that_never_gets_ready_is_named_at_the_deadline(tmp_path, monkeypatch):
     before = children()
     (tmp_path / "asleep.py").write_text("import time\ntime.sleep(600)\n")

@@ -121,6 +121,7 @@ def _sound(path: Path) -> None:
         assert campaign.n_readings == len(log.done()) == len(log.details())
 
 
+@pytest.mark.long
 def test_kill_minus_nine_at_random_moments(cell: Site, tmp_path: Path) -> None:
     short = cell.shorter(tmp_path, poses=2)
     path = tmp_path / "killed.hilcal"

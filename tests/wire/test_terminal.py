@@ -27,6 +27,7 @@ def toml(cell: Site, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_questions_stay_answers_are_understood_and_ctrl_c_says_how_to_go_on(
     cell: Site, toml: Path, tmp_path: Path
 ) -> None:

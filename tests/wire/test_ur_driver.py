@@ -244,7 +244,11 @@ def test_controller_that_does_not_tell_its_payload(tmp_path):
 
 @pytest.mark.parametrize(
     ("version", "says"),
-    [("10.7.0.0", "PolyScope X 10.11"), ("10.11.0.0", ""), ("10.12.0.0", "")],
+    [
+        ("10.7.0.0", "PolyScope X 10.11"),
+        ("10.11.0.0", ""),
+        pytest.param("10.12.0.0", "", marks=pytest.mark.long),
+    ],
 )
 def test_versions_of_polyscope_x(tmp_path, version, says):
     """Before 10.11 there is no Robot API; 10.11 does not tell modes, nor 10.12 the model."""

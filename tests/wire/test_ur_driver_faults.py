@@ -15,6 +15,7 @@ from hilcal.drivers.ur_link import dashboard
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 from tests.support import ur_driver_cases as cases
+from tests.support.rows import first
 from tests.support.ur_driver_cases import arm, sim
 
 __all__ = ["arm", "sim"]  # fixtures
@@ -140,6 +141,7 @@ def test_stop_says_so_when_it_cannot_be_seen_that_the_arm_stands(arm, sim):
     cases.check_resting(sim, since)
 
 
+@pytest.mark.long
 def test_controller_dies_in_motion(tmp_path):
     running = cases.start(tmp_path)
     arm = cases.controlled(running)
@@ -193,7 +195,7 @@ def test_link_lost_at_rest_gives_no_old_values(arm, sim, fault):
     ("worker", "number"),
     [(1, signal.SIGSEGV), (1, signal.SIGKILL), (1, signal.SIGSTOP), (0, signal.SIGKILL)],
 )
-@pytest.mark.parametrize("mute", [False, True])
+@pytest.mark.parametrize("mute", first(1, [False, True]))
 def test_child_process_that_dies_or_hangs_in_motion(arm, sim, worker, number, mute):
     cases.under_way(arm, sim)
     if mute:
@@ -290,6 +292,7 @@ open_arm(cases.config(sys.argv[1])).take_control(cases.MASS, cases.COM)
 """
 
 
+@pytest.mark.long
 def test_kill_9_while_control_is_taken_leaves_no_program_behind(sim):
     scripts = sim.admin()["scripts"]
     parent = subprocess.Popen(
@@ -330,6 +333,7 @@ thread.join()
 """
 
 
+@pytest.mark.long
 def test_child_that_hangs_in_the_client_library_ends_with_the_program():
     host = sim_ur_cases.free_host()
     with socket.socket() as server:

@@ -52,6 +52,7 @@ def test_the_poses_that_are_planned_end_in_the_effect_that_is_there() -> None:
     assert found.fit.variance_factor == pytest.approx(1.0, abs=0.2)
 
 
+@pytest.mark.long
 def test_each_pose_is_a_new_one_and_read_unloaded() -> None:
     c, before = fine_error()
     first = fit(baseline(c.cell, before, "absolute"), before, "absolute")

@@ -64,6 +64,7 @@ def test_the_power_is_the_share_of_rejections_in_linear_problems(size: float) ->
     assert promised == pytest.approx(LEVEL) if size == 0 else promised > 0.05
 
 
+@pytest.mark.long
 def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     """Tilting joints are there and bending links are fitted; 100 campaigns of the same poses."""
     c = campaign(TILT, "deflection", 3, poses=8, strength=1.3, plan_seed=21)
@@ -92,6 +93,7 @@ def test_the_power_is_the_share_of_rejections_in_the_simulated_world() -> None:
     assert share_is(rejected, 100, promised)
 
 
+@pytest.mark.long
 def test_the_powers_of_a_plan_are_shares_of_rejections() -> None:
     """Of what is known and planned for, with the parameters that the readings support."""
     first = doubtful("base_compliance", 2)

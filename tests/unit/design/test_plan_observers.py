@@ -59,6 +59,7 @@ def test_predicted_uncertainties_are_those_of_a_fit(what: str) -> None:
             assert planned == pytest.approx(fitted[name][1], rel=0.25), name
 
 
+@pytest.mark.long
 def test_a_cell_of_distances_is_planned(tmp_path: Path, capsys: Capsys) -> None:
     text = CELL.read_text().replace("candidates = 250", "candidates = 60\nagainst = []")
     text = text.replace('frame = "tracker"', 'frame = "base"\nobserves = "distance"')

@@ -46,7 +46,11 @@ CRITERIA: dict[str, Callable[[], Criterion]] = {
         )
     ),
 }
-every = pytest.mark.parametrize("name", CRITERIA)
+QUICK = {"D of some", "I", "compound determinant", "E"}
+"""One of each kind; the others are long."""
+every = pytest.mark.parametrize(
+    "name", [pytest.param(c, marks=() if c in QUICK else pytest.mark.long) for c in CRITERIA]
+)
 
 
 def polynomial(degree: int, points: Floats) -> CandidateSet:

@@ -53,6 +53,7 @@ def everything(world: World) -> list[Chosen]:
     return [Chosen(name, (UNLOADED, *LOADS)) for name in world.names]
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(
     st.integers(1, 12),
@@ -184,6 +185,7 @@ def _large() -> tuple[World, list[Ordered]]:
     return world, [world.ordered(everything(world), seed) for seed in range(5)]
 
 
+@pytest.mark.long
 def test_time_is_far_less_confounded_than_in_the_shortest_order() -> None:
     _, made = _large()
     for ordered in made:
@@ -191,6 +193,7 @@ def test_time_is_far_less_confounded_than_in_the_shortest_order() -> None:
         assert abs(ordered.confounding.bias_m) < 0.2 * ordered.confounding_shortest.bias_m
 
 
+@pytest.mark.long
 def test_orders_under_different_loads_are_independent() -> None:
     """A covariate that no regressor knows is confounded under each load in another way.
 

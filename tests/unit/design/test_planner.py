@@ -73,6 +73,7 @@ def test_the_plan_may_be_run_and_is_the_same_every_time(usual: Planned) -> None:
     assert read_plan(plan.to_json(), "plan").to_json() == plan.to_json()
 
 
+@pytest.mark.long
 def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual: Planned) -> None:
     config = small()
     cell, reference = cell_from_config(config), usual.ordered.plan.joints(REFERENCE)
@@ -82,6 +83,7 @@ def test_a_plan_to_append_is_made_for_the_reference_of_its_campaign(usual: Plann
     assert dry_run(cell, config, with_new_names(made, usual.ordered.plan, 2)).problems == ()
 
 
+@pytest.mark.long
 def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of what each round chooses is not reached: a plan was refused for that."""
     module = sys.modules["hilcal.design.planner"]
@@ -102,6 +104,7 @@ def test_the_last_round_takes_poses_that_are_reached(monkeypatch: pytest.MonkeyP
     assert {s.pose for s in made.ordered.plan.steps if s.load == "10kg"} > {REFERENCE}
 
 
+@pytest.mark.long
 def test_more_readings_promise_more() -> None:
     some, more = planned(small(), 10), planned(small(), 20)
     before = predicted(some.problem, some.counts, work=some.work)
@@ -121,7 +124,10 @@ def by_criterion(name: str) -> Planned:
     return planned(two if name == "separate" else small(), readings=30, criterion=name)
 
 
-@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize(
+    "criterion",
+    [pytest.param(c, marks=() if c in {"D", "I"} else pytest.mark.long) for c in CRITERIA],
+)
 def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
     made = by_criterion(criterion)
     assert made.criterion == criterion
@@ -129,6 +135,7 @@ def test_every_criterion_gives_a_certified_plan(criterion: str) -> None:
     assert made.ordered.plan.steps
 
 
+@pytest.mark.long
 def test_each_criterion_is_best_at_its_own(usual: Planned) -> None:
     of, work = usual.problem, usual.work
     designs = {name: by_criterion(name) for name in ("D", "A", "E", "I")}
@@ -151,6 +158,7 @@ def test_absolute_readings_are_planned_one_by_one() -> None:
     assert dry_run(cell_from_config(config), config, made.ordered.plan).problems == ()
 
 
+@pytest.mark.long
 def test_a_load_that_is_there_twice_is_said_to_cost_more_than_it_tells() -> None:
     config = small(load_change_s=600.0)
     twin = config.loads[1].model_copy(update={"name": "10kg again"})
@@ -210,6 +218,7 @@ def test_the_command(tmp_path: Path, capsys: Capsys) -> None:
     assert max(map(len, words.splitlines())) <= 100
 
 
+@pytest.mark.long
 def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys) -> None:
     cell = cell_file(tmp_path, quickly_planned(load_config(CELL)))
     result = run(capsys, "run", cell, "-o", tmp_path / "run.hilcal", "--yes")
@@ -221,6 +230,7 @@ def test_a_run_without_a_plan_keeps_the_same_rule(tmp_path: Path, capsys: Capsys
     assert "More would give, predicted for the deflection: 30 poses ±" in words
 
 
+@pytest.mark.long
 def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     r = rehearsal("nothing")
     table, run = tmp_path / "readings.csv", tmp_path / "run.hilcal"
@@ -240,6 +250,7 @@ def test_planning_on_from_what_is_known(tmp_path: Path, capsys: Capsys) -> None:
     assert any("planned on from" in words for words in on["remarks"])
 
 
+@pytest.mark.long
 def test_a_plan_after_a_measured_campaign_starts_from_its_reference_pose(
     tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -274,6 +285,7 @@ def test_numbers_and_names_that_cannot_be(
     assert words in refused(capsys, 2, "plan", cell, "-o", tmp_path / "p.json", *arguments)
 
 
+@pytest.mark.long
 def test_too_few_readings_say_so(tmp_path: Path, capsys: Capsys) -> None:
     cell = cell_file(tmp_path, small(against=()))
     line = refused(capsys, 4, "plan", cell, "-o", tmp_path / "p.json", "--readings", "2")

@@ -4,6 +4,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -130,6 +131,7 @@ def stopped(guard: Guard, q: Floats, load: str) -> str | None:
     return guard.check(here, None, load)
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells(), SEED, LOAD)
 def test_a_state_is_refused_by_all_or_by_none(
@@ -170,6 +172,7 @@ def test_all_checks_together_find_what_each_finds_alone(
     assert list(fresh.findings(q[-1:], load)) == alone[-1]
 
 
+@pytest.mark.long
 @settings(max_examples=20, deadline=None)
 @given(cells(), SEED, LOAD)
 def test_a_motion_that_is_planned_passes_and_touches_nothing(
@@ -196,6 +199,7 @@ def test_a_motion_that_is_planned_passes_and_touches_nothing(
             assert space.shapes.scene.itself.distance(between) > 0.0
 
 
+@pytest.mark.long
 @settings(max_examples=8, deadline=None)
 @given(st.sampled_from(["ur3e", "ur10e", URDF]), SEED, st.floats(0.05, 0.95), LOAD)
 def test_nothing_small_is_passed_between_two_samples(

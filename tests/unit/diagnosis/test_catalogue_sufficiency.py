@@ -37,7 +37,7 @@ def fitted(
 @pytest.mark.parametrize(
     ("mode", "law", "variable"),
     [
-        ("deflection", "relaxing bench", "time under load"),
+        pytest.param("deflection", "relaxing bench", "time under load", marks=pytest.mark.long),
         ("absolute", "swaying bench", "air temperature"),
         ("absolute", "coupled joint", "joint 2 torque"),
     ],
@@ -94,6 +94,7 @@ def test_effects_of_the_catalogue_explain_all(mode: Mode, effects: tuple[str, ..
     assert d.insufficiency is None
 
 
+@pytest.mark.long
 def test_noise_that_repeats_show_is_not_an_unknown_effect() -> None:
     found = fitted("deflection", "hysteresis", stated=0.5, cycles=2)
     d = diagnose(found)

@@ -59,6 +59,7 @@ def null_p_values(mode, m, seeds):
     return pure, lack
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("m", [3, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_factor_is_chi_square_and_so_is_what_is_left(mode, m):

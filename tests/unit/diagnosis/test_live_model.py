@@ -3,6 +3,7 @@
 from functools import cache
 
 import numpy as np
+import pytest
 
 from hilcal.config import CellConfig
 from hilcal.diagnosis.live_model import LiveModel
@@ -41,6 +42,7 @@ def told(seed: int) -> list[tuple[LiveResidual, Readings, float]]:
     return out
 
 
+@pytest.mark.long
 def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right():
     early, late, first_loads, unsure = [], [], [], 0
     for seed in SEEDS:
@@ -58,6 +60,7 @@ def test_sigma_is_about_one_from_the_first_reading_on_where_the_model_is_right()
         assert 0.6 < np.mean(np.square(sigmas)) < 1.5
 
 
+@pytest.mark.long
 def test_a_deflection_is_told_for_every_load_once_there_is_a_model():
     off = []
     for seed in SEEDS:

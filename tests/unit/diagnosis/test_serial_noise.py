@@ -25,6 +25,7 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.records import content_hash
 from studies.serial_noise import serial_readings
 from studies.study_cases import study_case
+from tests.support.rows import first
 
 
 def campaign(
@@ -41,7 +42,7 @@ def fitted(cell: Cell, readings: Readings, mode: Mode) -> Fit:
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("rho", [0.7, 0.9, 0.99])
+@pytest.mark.parametrize("rho", first(1, [0.9, 0.7, 0.99]))
 def test_the_correlation_comes_out(mode: Mode, rho: float) -> None:
     found = serial_noise(fitted(*campaign(rho, mode), mode))
     assert found is not None
@@ -70,7 +71,7 @@ def test_no_likelihood_is_climbed_for_white_noise_or_a_plain_effect(
     assert serial_noise(white) is None
 
 
-@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("mode", first(1, ["deflection", "absolute"]))
 def test_nothing_is_named_for_it_and_it_is_said(mode: Mode) -> None:
     cell, readings = campaign(0.9, mode, 3)
     found = refine(baseline(cell, readings, mode), readings, mode)
@@ -100,6 +101,7 @@ def test_intervals_of_a_frame_are_wider_and_of_differences_narrower() -> None:
     assert after > 1.5 * before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rho", [0.0, 0.5])
 def test_a_drift_is_named_as_one(rho: float) -> None:
     cell, readings = campaign(rho, hidden="tracker_drift", seed=1, poses=20)
@@ -108,6 +110,7 @@ def test_a_drift_is_named_as_one(rho: float) -> None:
     assert (found.fit.readings.serial is None) == (rho == 0.0)
 
 
+@pytest.mark.long
 def test_an_effect_is_named_beside_it() -> None:
     cell, readings = campaign(0.9, hidden="link_geometry", seed=2, poses=12)
     found = refine(baseline(cell, readings, "absolute"), readings, "absolute")
@@ -136,6 +139,7 @@ def test_what_effects_explain_as_well_is_in_doubt() -> None:
     assert "tracker_drift would explain the readings as well" in message(d)
 
 
+@pytest.mark.long
 def test_times_tell_a_pause() -> None:
     """Of readings in pairs, far apart in time, the order alone would miss the correlation."""
     cell, readings = campaign(0.0, poses=12)

@@ -125,6 +125,7 @@ def found() -> Discovery:
     return discover(campaign()[0], name="beyond")
 
 
+@pytest.mark.long
 def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
     law = found().laws[0]
     assert law.acts_on == ("joint 3",)
@@ -133,6 +134,7 @@ def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
     assert {symbol for symbol, *_ in law.ranges} == {"τ_2", "q_5"}
 
 
+@pytest.mark.long
 def test_the_effect_of_a_bend_does_what_was_hidden() -> None:
     before, moved = campaign()
     d = found()

@@ -198,6 +198,7 @@ def test_screening_is_what_the_columns_themselves_give() -> None:
         assert problem.slope[site, amplitude] == pytest.approx(slope, abs=1e-4 * size)
 
 
+@pytest.mark.long
 def test_a_screening_of_some_of_the_poses_finds_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.modules[Screen.__module__], "MOST_READINGS", 27)
     thinned = screen(linearise(campaign(LAW)))
@@ -289,6 +290,7 @@ def test_a_number_that_the_model_absorbs_is_dropped() -> None:
     check_effect(kind)
 
 
+@pytest.mark.long
 def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object) -> None:
         raise CannotAnswerError("it finds no equilibrium")

@@ -50,6 +50,7 @@ def found() -> Discovery:
     return discover(misread())
 
 
+@pytest.mark.long
 def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
     d = found()
     law = d.laws[0]
@@ -62,6 +63,7 @@ def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
     assert d.after.chi2 < 0.5 * misread().chi2
 
 
+@pytest.mark.long
 def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None:
     d = found()
     kind = effect_class(d.source, d.laws[0].name)
@@ -69,6 +71,7 @@ def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None
     check_effect(kind)
 
 
+@pytest.mark.long
 def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
     d = found()
     assert d.after is not None

@@ -99,6 +99,7 @@ def test_the_pareto_list_has_what_no_other_one_beats() -> None:
         assert beaten == (x not in pareto(of))
 
 
+@pytest.mark.long
 def test_a_discovery_says_how_likely_its_laws_are() -> None:
     d = found()
     (law,) = [x for x in d.structures if x.law]
@@ -121,6 +122,7 @@ def test_a_discovery_says_how_likely_its_laws_are() -> None:
     assert {"formula", "probability", "complexity", "holdout_share"} <= {*rows[0]}  # type: ignore[index]
 
 
+@pytest.mark.long
 def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
     d = found()
     assert d.after is not None

@@ -81,7 +81,7 @@ USUAL = tuple((name, SHORT.get(name, options_of(name))) for name in ALL_NAMES)
 
 
 @pytest.mark.parametrize(("name", "options"), USUAL + VARIANTS)
-@pytest.mark.parametrize("arm", ["odd", "rails"])
+@pytest.mark.parametrize("arm", ["odd", pytest.param("rails", marks=pytest.mark.long)])
 def test_each_effect_with_compliant_joints(name, options, arm):
     cell = CELLS[arm]
     if not effect_class(name).applies(cell):

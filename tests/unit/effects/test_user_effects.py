@@ -20,6 +20,7 @@ from hilcal.types import Floats
 from tests.support.campaigns import campaign as simulated
 from tests.support.campaigns import plan
 from tests.support.cli_cases import CELL, Capsys, ok, refused
+from tests.support.rows import first
 from tests.support.user_effect_cases import CLASS, COLUMNS
 
 NAME = "soft_side"
@@ -74,6 +75,7 @@ def run_file(case: Case, tmp_path: Path, capsys: Capsys) -> Path:
 # --- it takes part --------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_missing_law_is_named_added_and_the_error_falls_to_the_noise(
     case: Case, run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -133,6 +135,7 @@ def test_it_can_be_fitted_and_added_by_name(run_file: Path, file: Path, capsys: 
     assert NAME in words
 
 
+@pytest.mark.long
 def test_a_process_of_its_own_and_an_installed_package(
     run_file: Path, file: Path, tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -196,6 +199,7 @@ def hilcal(site: Path, *arguments: str | Path) -> tuple[int, str, str]:
     return done.returncode, done.stdout, done.stderr
 
 
+@pytest.mark.long
 def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -> None:
     cell = tmp_path / "cell.toml"
     text = CELL.read_text(encoding="utf-8")
@@ -210,6 +214,7 @@ def test_a_plan_is_made_against_it(file: Path, tmp_path: Path, capsys: Capsys) -
 # --- a campaign remembers it ----------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_revision_says_which_file_it_needs(run_file: Path, file: Path, capsys: Capsys) -> None:
     mine = ("--effects-from", file)
     ok(capsys, "identify", run_file, "--effects", f"joint_compliance,{NAME}", *mine)
@@ -272,11 +277,20 @@ def test_every_command_with_models_reads_it_first(
 
 @pytest.mark.parametrize(
     ("law", "said"),
-    [
-        ("[1.0][len(s.angle) > 40] * s.angle[:, :1]", ", line 13: effect mine: columns raises Ind"),
-        ("s.angle[:, :1] / (len(s.angle) <= 40)", ": effect mine: columns has dq values of which"),
-        ("s.angle[:40, :1]", ": effect mine: columns has dq values of 40 states; expected 1"),
-    ],
+    first(
+        1,
+        [
+            (
+                "[1.0][len(s.angle) > 40] * s.angle[:, :1]",
+                ", line 13: effect mine: columns raises Ind",
+            ),
+            (
+                "s.angle[:, :1] / (len(s.angle) <= 40)",
+                ": effect mine: columns has dq values of which",
+            ),
+            ("s.angle[:40, :1]", ": effect mine: columns has dq values of 40 states; expected 1"),
+        ],
+    ),
 )
 def test_a_law_that_fails_on_the_readings_is_one_clear_line(
     law: str, said: str, run_file: Path, tmp_path: Path, capsys: Capsys

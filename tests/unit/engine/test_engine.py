@@ -94,6 +94,7 @@ def sockets() -> list[str]:
     ]
 
 
+@pytest.mark.long
 def test_what_a_killed_worker_held_is_computed_by_another(tmp_path: Path) -> None:
     with open_engine(2) as engine:
         found = engine.map(partial(die_once, folder=tmp_path), range(6))

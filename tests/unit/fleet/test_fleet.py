@@ -153,6 +153,7 @@ def prior_file(one: Posterior, path: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_plan_counts_on_what_the_fleet_knows(
     one: Posterior, capsys: Capsys, tmp_path: Path
 ) -> None:

@@ -56,6 +56,7 @@ def test_campaigns_are_as_far_from_the_type_as_their_arm(one: Posterior) -> None
     assert apart.min() > 0.5
 
 
+@pytest.mark.long
 def test_the_odd_joint_alone_is_red_and_its_arm_framed(one: Posterior, tmp_path: Path) -> None:
     path = recorded(one, tmp_path / "fleet.rrd", 1.5)
     d = drawn_type(fleet(one, 1.5)[1], fleet(one, 1.5)[0].members)

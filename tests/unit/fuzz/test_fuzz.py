@@ -32,11 +32,22 @@ FEW = {
 PARSERS = {parser.name: parser for parser in (*wire.parsers(), *files.parsers())}
 
 
-@pytest.mark.parametrize("name", PARSERS)
-def test_damage_ends_in_an_error_of_the_programs_own(name: str, tmp_path: Path) -> None:
-    out = harness.fuzz(PARSERS[name], FEW.get(name, 150), seed=1, keep=tmp_path)
+COSTLY = ("campaign_fit", "preview", "measured", "krl", "rapid", "inform")
+"""Parsers that take long: a third of the inputs every time, all of them in the long tests."""
+INPUTS = {name: FEW.get(name, 150) for name in PARSERS}
+RUNS = [
+    *((name, INPUTS[name] // 3 if name in COSTLY else INPUTS[name]) for name in PARSERS),
+    *(pytest.param(name, INPUTS[name], marks=pytest.mark.long) for name in COSTLY),
+]
+
+
+@pytest.mark.parametrize(("name", "inputs"), RUNS)
+def test_damage_ends_in_an_error_of_the_programs_own(
+    name: str, inputs: int, tmp_path: Path
+) -> None:
+    out = harness.fuzz(PARSERS[name], inputs, seed=1, keep=tmp_path)
     assert not out.findings
-    assert out.inputs == FEW.get(name, 150)
+    assert out.inputs == inputs
     if not name.endswith("chain"):  # two inputs prove nothing of the following
         assert out.read > 0, "the harness never reaches the inside"
 

@@ -154,6 +154,7 @@ def test_scatter_that_is_stated_is_not_estimated() -> None:
     assert d.scatter is None
 
 
+@pytest.mark.long
 def test_refine_ends_with_the_scatter_in_the_fit_and_the_file_keeps_it(tmp_path: Path) -> None:
     cell, readings = scattering(np.full(6, 2e-5))
     config = configuration()

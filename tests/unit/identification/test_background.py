@@ -63,6 +63,7 @@ def test_it_predicts_other_poses_far_better_than_what_is_named(
     }
 
 
+@pytest.mark.long
 def test_it_is_stored_and_found_again(found: Refinement, series: Readings) -> None:
     fit, some = found.fit, series[:30]
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")
@@ -122,6 +123,7 @@ def test_the_sizes_of_its_families_are_told_with_intervals(found: Refinement) ->
     assert family_sizes(found.steps[0].fit) == ()
 
 
+@pytest.mark.long
 def test_bands_do_not_depend_on_how_large_the_noise_is_stated(series: Readings) -> None:
     """Of a table that states the arm's scatter, too: its factor is estimated and in the band."""
     cell = Cell.load(configs_dir() / "cells" / "ipa_ur10.toml")

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from hilcal.calibration.budget import budget
 from hilcal.config import load_config
@@ -23,6 +24,7 @@ HIDDEN = (
 )  # fmt: skip
 
 
+@pytest.mark.long
 def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses() -> None:
     config = load_config(CELL)
     case = study_case(config, "ur10e", "absolute", HIDDEN, 20.0, 1, n_poses=25)
@@ -46,6 +48,7 @@ def test_an_arm_that_errs_in_many_ways_is_predicted_from_few_poses() -> None:
     assert set(found.fit.model.named) - {"base_frame"} <= set(HIDDEN)
 
 
+@pytest.mark.long
 def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law() -> None:
     law = "compliance by another joint"  # link lengths of 14 mm would predict it
     asked = Asked("outside", "ur3e", "deflection", (law,), 3.0, 0)
@@ -55,6 +58,7 @@ def test_effects_of_implausible_size_do_not_stand_in_for_an_unknown_law() -> Non
     assert not found.fit.model.background
 
 
+@pytest.mark.long
 def test_noise_that_is_stated_too_small_is_no_background() -> None:
     asked = Asked("noise", "ur3e", "absolute", (), 0.0, 0, 0.5, cycles=2)
     case = simulate(asked)

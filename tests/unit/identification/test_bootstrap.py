@@ -31,6 +31,7 @@ def drawn(found: Fit, draws: int = 100, seed: int = 0) -> Bootstrap:
         return bootstrap(found, engine, draws, seed)
 
 
+@pytest.mark.long
 def test_its_spread_is_that_of_repeated_campaigns() -> None:
     c = campaign("none", "absolute", poses=POSES)
     clean = noiseless(c.world, plan(POSES, 1000))
@@ -49,6 +50,7 @@ def in_common(clean: Readings, seed: int) -> Readings:
     return replace(clean, value=clean.value + np.einsum("nij,nj->ni", root, normal))
 
 
+@pytest.mark.long
 def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
     c = campaign("none", "absolute", poses=POSES)
     clean = noiseless(c.world, plan(POSES, 1000))
@@ -66,6 +68,7 @@ def test_it_notices_readings_of_a_pose_that_are_not_independent() -> None:
     assert any("can be used" in line for line in bootstrap_remarks(independent))
 
 
+@pytest.mark.long
 def test_the_bits_depend_on_the_seed_and_not_on_the_workers() -> None:
     found = fitted(poses=12)
     one = drawn(found, 23)

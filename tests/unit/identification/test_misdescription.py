@@ -99,6 +99,7 @@ def test_positions_of_other_rows_are_named(shift):
     assert "each position stands 1 row after" in finding.words(cell, off)
 
 
+@pytest.mark.long
 def test_exchanged_columns_of_joints_are_named():
     good = readings_of(None, 3)
     for order, said in (
@@ -118,6 +119,7 @@ def test_a_gauge_is_not_proposed():
         assert found_in(readings_of(Hypothesis("joint", joint, 1, 0.7), 3))[0] is None
 
 
+@pytest.mark.long
 def test_nonsense_is_refused_with_what_was_tried():
     good = readings_of(None, 3)
     mixed = replace(good, value=good.value[np.random.default_rng(0).permutation(len(good))])

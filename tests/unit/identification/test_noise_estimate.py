@@ -49,6 +49,7 @@ def test_white_noise_of_any_size_is_noise(tmp_path: Path, sigma: float) -> None:
     assert judged(cell, readings).verdict == "adequate"
 
 
+@pytest.mark.long
 def test_gross_errors_are_not_noise(tmp_path: Path) -> None:
     of = measured("ur5", 1, OFF, 60, 2e-5)
     of.value[[5, 17], 0] += 3e-3

@@ -16,6 +16,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import Campaign, campaign, noiseless, plan, with_noise
+from tests.support.rows import first
 
 MODES = ("absolute", "deflection")
 
@@ -95,6 +96,7 @@ def false_alarms(count: int) -> int:
     return alarms
 
 
+@pytest.mark.long
 def test_clean_campaigns_keep_all_their_readings():
     count = 50
     assert false_alarms(count) <= poisson.isf(1e-3, FALSE_ALARMS * count)
@@ -187,7 +189,7 @@ FAST = (
 """One of each kind every time; all of them over many seeds in the slow suite."""
 
 
-@pytest.mark.parametrize(("effect", "mode"), FAST)
+@pytest.mark.parametrize(("effect", "mode"), first(2, FAST))
 def test_a_twentieth_of_gross_errors_changes_no_verdict(effect, mode):
     check_verdict(effect, mode, 0)
 

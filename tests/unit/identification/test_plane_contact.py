@@ -117,6 +117,7 @@ def fitted(cell: Cell, readings: Readings, effect: str = "") -> Fit:
 CASES = {"one": ["granite"], "three": list(PLATES)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("plates", CASES)
 @pytest.mark.parametrize("effect", ["", "encoder_offset"])
 def test_what_heights_of_0_determine_is_right_and_the_rest_is_named(

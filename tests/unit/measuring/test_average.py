@@ -74,9 +74,9 @@ def test_systematic_share_is_not_averaged_away():
 @pytest.mark.parametrize(
     ("count", "share"),
     [
-        (3, 0.0),
+        pytest.param(3, 0.0, marks=pytest.mark.long),
         pytest.param(5, 0.0, marks=pytest.mark.slow),
-        (5, 0.4),
+        pytest.param(5, 0.4, marks=pytest.mark.long),
         pytest.param(20, 0.0, marks=pytest.mark.slow),
         pytest.param(40, 0.2, marks=pytest.mark.slow),
     ],

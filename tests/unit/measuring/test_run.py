@@ -232,6 +232,7 @@ def test_what_is_as_configured_is_not_remarked(ran: Bench) -> None:
     assert not any("[tool]" in note.text for note in b.notes.of(Remark))
 
 
+@pytest.mark.long
 def test_repeatability_is_estimated_at_the_end() -> None:
     """The joints miss by 5e-5 rad from arrival to arrival; the estimate finds that."""
     b = Bench(repeatability=Repeatability(joint_std_rad=5e-5))

@@ -17,6 +17,7 @@ from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import Bench, plan_of
 from tests.support.fake_world import Killed
+from tests.support.rows import first
 
 FAULTS = (
     DeviceError("arm: the line is dead"),
@@ -57,10 +58,11 @@ def calls_of_a_whole_run() -> int:
     return len(b.world.calls)
 
 
-KINDS = pytest.mark.parametrize("kind", range(len(FAULTS)), ids=[type(f).__name__ for f in FAULTS])
+KINDS = range(len(FAULTS))
+IDS = [type(f).__name__ for f in FAULTS]
 
 
-@KINDS
+@pytest.mark.parametrize("kind", first(1, KINDS), ids=IDS)
 def test_fault_at_some_calls(kind: int) -> None:
     """Every 97th call, other ones for each kind of fault; all of them in the slow suite."""
     for k in range(1 + 10 * kind, calls_of_a_whole_run() + 1, 97):
@@ -68,7 +70,7 @@ def test_fault_at_some_calls(kind: int) -> None:
 
 
 @pytest.mark.slow
-@KINDS
+@pytest.mark.parametrize("kind", KINDS, ids=IDS)
 def test_fault_at_every_call(kind: int) -> None:
     for k in range(1, calls_of_a_whole_run() + 1):
         check_fault(FAULTS[kind], k)

@@ -28,6 +28,7 @@ def test_a_wrong_load_is_asked_for_again_with_the_reason() -> None:
     assert any("asked to hang 3kg" in note.text for note in b.notes.of(Remark))
 
 
+@pytest.mark.long
 def test_three_wrong_loads_end_the_run() -> None:
     b = Bench()
     b.world.wrong = ["none", "6kg", "none", "6kg"]
@@ -48,6 +49,7 @@ def test_a_load_that_is_not_taken_off_is_noticed() -> None:
     assert "3.0 kg still hangs" in b.operator.asked[3][1]
 
 
+@pytest.mark.long
 def test_a_swinging_load_is_weighed_twice() -> None:
     b = Bench()
     real = b.rig.force
@@ -129,6 +131,7 @@ def test_resume_measures_exactly_what_is_missing_and_time_goes_on() -> None:
     assert asked[1] == plan.steps[len(before)].load == "3kg"
 
 
+@pytest.mark.long
 def test_time_never_goes_back_whatever_the_clock_on_the_wall_does() -> None:
     b, plan = Bench(), usual_plan()
     b.world.kill_after = ("store.recorded", 4)
@@ -140,6 +143,7 @@ def test_time_never_goes_back_whatever_the_clock_on_the_wall_does() -> None:
     assert np.all(np.diff(readings.states.time) > 0)
 
 
+@pytest.mark.long
 def test_a_load_that_still_hangs_at_a_resume_is_noticed() -> None:
     b, plan = Bench(), usual_plan()
     b.world.kill_after = ("store.recorded", 7)
@@ -178,6 +182,7 @@ def test_a_finished_campaign_touches_nothing() -> None:
     assert b.notes.of(Phase)[-1].text == "nothing is missing"
 
 
+@pytest.mark.long
 def test_the_tool_is_known_from_an_earlier_session_after_the_sensor_was_off() -> None:
     """Another bias in the second session: the pulls are measured right nevertheless."""
     b, plan = Bench(), usual_plan()

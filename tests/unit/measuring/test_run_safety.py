@@ -153,6 +153,7 @@ def test_an_arm_that_does_not_arrive() -> None:
         measure(b)
 
 
+@pytest.mark.long
 def test_a_motion_that_never_ends_is_given_up() -> None:
     b = Bench()
     b.rig.arm.moving = lambda: True  # type: ignore[method-assign]
@@ -211,6 +212,7 @@ def test_readings_that_drift_are_waited_for_and_given_up() -> None:
     assert b.world.time - begun < 120.0
 
 
+@pytest.mark.long
 def test_drift_that_ends_is_waited_for() -> None:
     b, few = Bench(), plan_of(("p1", "none", 0), ("p2", "none", 0), ("p2", "3kg", 0))
     real = b.world.position
@@ -240,6 +242,7 @@ def test_an_arm_that_trembles_is_measured_again_and_given_up() -> None:
     assert b.store.rows == []
 
 
+@pytest.mark.long
 def test_somebody_who_jogs_the_arm_meanwhile_spoils_the_reading() -> None:
     b = Bench()
     real = b.rig.force

@@ -18,6 +18,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
+from tests.support.rows import first
 from tests.support.run_cases import measure
 
 HOME = POSES["reference"]
@@ -71,6 +72,7 @@ def test_a_goal_that_is_met_under_a_load() -> None:
     assert met_words(event) == "goal met after 7 of 15 readings: j2 std 7.0 %"
 
 
+@pytest.mark.long
 def test_progress_tells_the_goal_and_what_is_left_of_the_way() -> None:
     b = Bench()
     measure(b, goal=Enough(7))
@@ -135,6 +137,7 @@ def test_the_way_home_is_clear() -> None:
 # going on
 
 
+@pytest.mark.long
 def test_what_was_left_out_is_measured_on_resuming() -> None:
     b, plan = Bench(), usual_plan()
     measure(b, goal=Enough(7))
@@ -188,7 +191,7 @@ def short() -> tuple[Bench, Plan]:
 
 
 @pytest.mark.parametrize(
-    "fault", [DeviceError("arm: the line is dead"), KeyboardInterrupt(), Killed()]
+    "fault", first(1, [DeviceError("arm: the line is dead"), KeyboardInterrupt(), Killed()])
 )
 def test_interrupted_on_the_way_home(fault: BaseException) -> None:
     """At some calls after the goal: the arm stands, and resuming brings it home, once."""

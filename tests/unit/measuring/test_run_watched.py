@@ -14,6 +14,7 @@ from hilcal.measuring.progress import Phase, Remark
 from hilcal.robot.chain import evaluate
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_world import Killed
+from tests.support.rows import first
 from tests.support.run_cases import measure, rows
 
 FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
@@ -79,6 +80,7 @@ def test_an_arm_jogged_to_a_free_place_is_asked_for_and_the_way_checked_from_the
     assert b.world.calls.index("operator.confirm") < b.world.calls.index("arm.take_control")
 
 
+@pytest.mark.long
 def test_an_arm_that_is_moved_while_it_is_asked_for_is_asked_for_again() -> None:
     b = Bench()
     jogged(b, "none", FREE)
@@ -151,6 +153,7 @@ def test_an_operator_who_cannot_be_asked_is_not_taken_to_agree() -> None:
     assert "arm.start_move" not in b.world.calls
 
 
+@pytest.mark.long
 def test_a_campaign_that_goes_on_says_that_the_arm_stands_elsewhere_and_asks() -> None:
     for moved, questions in ((False, 0), (True, 1)):
         b = Bench()
@@ -257,6 +260,7 @@ def test_an_arm_that_leaves_its_straight_way_is_stopped() -> None:
     assert b.world.time - begun[0] < 0.1
 
 
+@pytest.mark.long
 def test_a_motion_at_the_slowest_slider_does_not_stand_still() -> None:
     b = Bench()
     near = np.array(POSES["reference"]) + 0.02
@@ -331,7 +335,7 @@ def test_a_load_that_falls_off_between_readings_leaves_no_reading_without_it() -
             assert np.linalg.norm(reading.value[0] - held.position()) < 1e-4
 
 
-@pytest.mark.parametrize("load", ["none", "3kg"])
+@pytest.mark.parametrize("load", first(1, ["none", "3kg"]))
 def test_leaning_on_the_tool_during_a_reading_is_kept_as_doubted_and_measured_again(
     load: str,
 ) -> None:
@@ -394,7 +398,7 @@ def leans_in_phase(b: Bench, phase: str, number: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "number"), [("moving to beside", 1), ("taring", 2), ("taring", 3)]
+    ("phase", "number"), first(1, [("moving to beside", 1), ("taring", 2), ("taring", 3)])
 )
 def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared_away(
     phase: str, number: int
@@ -408,6 +412,7 @@ def test_leaning_in_the_first_motion_or_during_a_tare_is_asked_for_and_not_tared
     assert np.allclose(zeros, b.world.offset, atol=1e-6)
 
 
+@pytest.mark.long
 def test_a_first_tare_that_was_leaned_on_ends_the_run_and_says_so() -> None:
     b = Bench()
     leans_in_phase(b, "taring", 1)
@@ -459,6 +464,7 @@ def test_a_tool_far_from_its_configuration_is_refused_before_it_is_measured_with
     assert any("[tool] mass_kg" in why for _, why in b.operator.asked), raised.value
 
 
+@pytest.mark.long
 def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
     """Below what is noticed at once: 5 N to one side in one of five."""
     b = Bench()
@@ -476,6 +482,7 @@ def test_unloaded_readings_that_were_leaned_on_do_not_spoil_the_tool() -> None:
     assert any("was the tool touched" in note.text for note in b.notes.of(Remark))
 
 
+@pytest.mark.long
 def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
     b = Bench()
     latest = b.rig.force.latest  # type: ignore[union-attr]
@@ -492,6 +499,7 @@ def test_a_load_that_swings_a_little_in_motion_is_let_swing() -> None:
     assert [name for name, _ in b.operator.asked] == ["none", "3kg", "none", "pull", "none"]
 
 
+@pytest.mark.long
 def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swing() -> None:
     """30 N from below a weight of 59 N: less than it may pull to the side while it swings."""
     b = Bench()
@@ -514,6 +522,7 @@ def test_who_bears_a_part_of_a_heavy_load_in_motion_is_noticed_though_it_may_swi
     assert "6kg" in [name for name, why in b.operator.asked if "where 6kg should hang" in why]
 
 
+@pytest.mark.long
 def test_a_load_that_stays_wrong_ends_the_run() -> None:
     b = Bench()
     moving, fell = b.rig.arm.moving, []
@@ -583,6 +592,7 @@ def test_a_tracker_that_keeps_to_the_place_of_the_last_pose_is_named_with_its_fi
     assert doubted == [asdict(b.store.rows[1][0])]
 
 
+@pytest.mark.long
 def test_a_repeated_reading_is_not_doubted_where_the_tracker_s_place_vouches_for_it() -> None:
     b = Bench()
     place = b.world.position
@@ -600,6 +610,7 @@ def test_a_repeated_reading_is_not_doubted_where_the_tracker_s_place_vouches_for
     assert not [told for _, told in b.store.events if told.get("stored")]
 
 
+@pytest.mark.long
 def test_stored_readings_of_a_stuck_tracker_do_not_keep_a_campaign_from_going_on() -> None:
     """As older versions stored them: four right ones, then three at one and the same place."""
     b = Bench()

@@ -114,6 +114,7 @@ def test_each_target_is_read_at_each_stop(tmp_path: Path) -> None:
     assert np.all(np.diff(r.states.time) > 0)
 
 
+@pytest.mark.long
 def test_a_hidden_reflector_is_a_missing_reading_with_a_word(tmp_path: Path) -> None:
     b, tracker = bench()
     angle = float(usual_plan().joints("p4")[0])
@@ -143,6 +144,7 @@ def test_a_neighbour_is_not_taken_for_a_target(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_all_targets_of_an_arrival_that_was_leaned_on_are_kept_as_doubted(tmp_path: Path) -> None:
     b, _ = bench()
     force = b.rig.force

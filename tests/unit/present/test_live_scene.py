@@ -86,6 +86,7 @@ def test_of_many_readings_only_those_outside_are_drawn_in_space(tmp_path):
     assert sum(map(len, shown)) == len(stored)
 
 
+@pytest.mark.long
 def test_of_a_thousand_readings_and_more_the_worst_of_each_group_stay(tmp_path):
     told = measuring(plan(FLUENT // 2 + 100))
     path = recorded(tmp_path / "thousands.rrd", events(told, wrong=2.0))

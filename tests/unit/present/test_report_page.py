@@ -246,7 +246,7 @@ def test_without_an_appendix_the_page_has_the_parameters_and_nothing_else_of_it(
     ("size", "scheme"),
     [
         pytest.param(DESKTOP, "light", id="desk-light"),
-        pytest.param(PHONE, "dark", id="phone-dark"),
+        pytest.param(PHONE, "dark", id="phone-dark", marks=pytest.mark.long),
         pytest.param(DESKTOP, "dark", id="desk-dark", marks=pytest.mark.slow),
         pytest.param(PHONE, "light", id="phone-light", marks=pytest.mark.slow),
     ],
@@ -283,7 +283,7 @@ def test_it_is_whole_in_a_browser(made, browser: Browser, size, scheme: str) -> 
 
 
 @needs_chromium
-@pytest.mark.parametrize("of", [plain, large])
+@pytest.mark.parametrize("of", [plain, pytest.param(large, marks=pytest.mark.long)])
 def test_it_prints_on_six_pages_at_most(made, browser: Browser, tmp_path: Path, of) -> None:
     path = tmp_path / "short.html"
     path.write_text(page_of(of(made[0])), encoding="utf-8")

@@ -60,6 +60,7 @@ def test_the_picture_shows_the_red_vanish(recording, tmp_path):
     assert share_of_red(last) == 0
 
 
+@pytest.mark.long
 @pytest.mark.vulkan
 @needs_vulkan
 def test_in_a_small_window_the_verdict_ends_above_its_edge(tmp_path):
@@ -103,6 +104,7 @@ def test_every_view_is_drawn_without_a_report(recording, tmp_path):
         assert colors(pixels(shot.png)) > 20, shot
 
 
+@pytest.mark.long
 @pytest.mark.vulkan
 @needs_vulkan
 def test_unknown_timeline_and_view_are_named(recording, tmp_path):

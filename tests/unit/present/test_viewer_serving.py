@@ -70,6 +70,7 @@ def test_a_port_in_use_is_refused(told, free_port):
             pass
 
 
+@pytest.mark.long
 @pytest.mark.skipif(sys.platform == "win32", reason="no file size limits on Windows")
 def test_a_file_that_cannot_grow_leaves_what_was_there(tmp_path):
     path = tmp_path / "x.rrd"

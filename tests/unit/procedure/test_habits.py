@@ -42,7 +42,7 @@ def two_targets() -> CellConfig:
         pytest.param(small(0), 14, "absolute", id="no loads", marks=pytest.mark.slow),
         pytest.param(small(1), 6, "deflection", id="one load", marks=pytest.mark.slow),
         pytest.param(weights(), 6, "deflection", id="dead weights", marks=pytest.mark.slow),
-        pytest.param(in_base_axes(), 6, "absolute", id="base axes"),
+        pytest.param(in_base_axes(), 6, "absolute", id="base axes", marks=pytest.mark.long),
         pytest.param(two_targets(), 5, "deflection", id="two targets", marks=pytest.mark.slow),
     ],
 )

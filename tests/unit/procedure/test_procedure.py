@@ -154,6 +154,7 @@ def test_another_validation_campaign_is_refused(done: tuple[Drawn, Improvement])
         files.validation.write_bytes(kept)
 
 
+@pytest.mark.long
 def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is_decided(
     tmp_path,
 ) -> None:
@@ -174,6 +175,7 @@ def test_a_goal_below_the_repeatability_is_not_measured_for_but_another_is_decid
     assert d.procedure.next().kind == "plan_validation"
 
 
+@pytest.mark.long
 def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path) -> None:
     """The arm's scatter is then what the maker states, and no number of the decision is NaN."""
     config = small(1).model_copy(update={"repeatability": Repeatability()})
@@ -185,6 +187,7 @@ def test_a_calibration_without_a_stated_repeatability_goes_to_its_end(tmp_path) 
     assert 0 < found["floor_m"] < found["predicted_m"] < 1e-3
 
 
+@pytest.mark.long
 def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
     d = drawn(tmp_path / "run.hilcal", poses=4)
     for _ in range(3):
@@ -208,6 +211,7 @@ def test_a_goal_within_reach_is_measured_for(tmp_path) -> None:
         assert len(log.plan.steps) == run.n_readings
 
 
+@pytest.mark.long
 def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> None:
     (code,) = blocks(ROOT / "docs" / "how-to" / "calibrate.md")
     monkeypatch.chdir(tmp_path)
@@ -220,6 +224,7 @@ def test_the_python_of_the_guide_runs_as_it_stands(tmp_path, monkeypatch) -> Non
     assert every.before.rms_m > 5 * every.after.rms_m
 
 
+@pytest.mark.long
 def test_what_an_earlier_calibration_taught_is_the_prior(done, tmp_path) -> None:
     first = done[0].procedure
     known = carried_prior(load_posterior(first.run), "arm", {}, first.catalogue)

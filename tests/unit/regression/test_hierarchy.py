@@ -57,6 +57,7 @@ def test_an_arm_that_is_unlike_the_others_is_named_and_leaves_the_spread_alone()
     assert np.sqrt(h.between[4]) == pytest.approx(np.sqrt(ordinary.between[4]), rel=0.1)
 
 
+@pytest.mark.long
 def test_in_ordinary_fleets_no_arm_is_named() -> None:
     fleets = 25
     alarms = sum(bool(hierarchy(fleet(100 + seed)[0])[1]) for seed in range(fleets))

@@ -40,6 +40,7 @@ def test_unequal_eigenvalues_agree_with_monte_carlo(seed):
         assert ratio_tail(values, dimension, c) == pytest.approx(p, abs=slack)
 
 
+@pytest.mark.long
 @given(
     st.lists(st.floats(1e-3, 1e3), min_size=1, max_size=12),
     st.integers(2, 300),

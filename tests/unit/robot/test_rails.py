@@ -227,7 +227,10 @@ def campaign(folder: Path, hidden: str, seed: int, poses: int = 36) -> tuple[Reh
     return read_plan(case, plan, [seed, 1]), cell_from_config(config, folder)
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+SEEDS = [1, *(pytest.param(k, marks=pytest.mark.long) for k in (2, 3, 4))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path: Path, seed: int) -> None:
     r, cell = campaign(tmp_path, "guide_error", seed)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
@@ -245,7 +248,7 @@ def test_a_hidden_error_of_the_rail_is_found_and_measured(tmp_path: Path, seed: 
     assert path.fit.holdout.rms_sigma < 1.3
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(
     tmp_path: Path, seed: int
 ) -> None:
@@ -270,7 +273,7 @@ def test_errors_of_three_guides_of_a_gantry_are_found_and_measured(
     assert path.fit.holdout.rms_sigma < 1.3
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", SEEDS[:2])
 def test_of_a_good_rail_nothing_is_named(tmp_path: Path, seed: int) -> None:
     r, cell = campaign(tmp_path, "nothing", seed)
     path = hc.refine(hc.baseline(cell, r.readings), r.readings, readings="absolute")
@@ -302,6 +305,7 @@ def test_a_table_of_a_rail_comes_back_and_is_checked(tmp_path: Path) -> None:
         read_table(tmp_path / "mm.csv", cell.arm, None)
 
 
+@pytest.mark.long
 def test_a_foreign_table_with_a_rail_goes_through_the_commands(
     tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -369,6 +373,7 @@ joint_std_rad = 1e-5
     assert "column 'q3_rad' is missing beside its group" in said
 
 
+@pytest.mark.long
 def test_the_jacobian_of_a_fitted_rail_is_the_difference_of_predictions(tmp_path: Path) -> None:
     r, cell = campaign(tmp_path, "guide_error", 1, 6)
     states = r.readings.states

@@ -100,6 +100,7 @@ things = st.one_of(
 )
 
 
+@pytest.mark.long
 @settings(max_examples=25, deadline=None)
 @given(st.sampled_from(["ur3e", "ur5", "ur10e", "ur20"]), things, st.integers(0, 999))
 def test_whatever_is_free_is_free_by_another_way_to_count(

@@ -108,6 +108,7 @@ def test_columns_of_any_table_are_counted() -> None:
         Grid("t.mat", names, np.arange(1), columns, (FileFormat(),) * len(names))
 
 
+@pytest.mark.long
 def test_memory_that_runs_out_is_one_line_and_the_limit_is_as_before(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -142,6 +142,7 @@ def test_a_tall_problem_has_the_rank_of_its_qr(monkeypatch: pytest.MonkeyPatch) 
     assert np.abs(tall.null) == pytest.approx(np.abs(whole.null), abs=1e-12)
 
 
+@pytest.mark.long
 def test_identify_takes_a_stream_and_writes_a_calibration(capsys: Capsys, tmp_path: Path) -> None:
     path, out = tmp_path / "gross.parquet", tmp_path / "cal.json"
     truth = write(path, COUNT, group=GROUP, gross=GROSS)

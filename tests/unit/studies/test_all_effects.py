@@ -1,10 +1,12 @@
 """Arms that have every effect at once: predicted nearly as well as the truth's own sizes allow."""
 
 import numpy as np
+import pytest
 
 from studies.all_effects_command import Case, refined
 
 
+@pytest.mark.long
 def test_few_positions_predict_nearly_as_well_as_can_be() -> None:
     """Of 30 arms the mean is 1.08 times, and 92 % of others are in the band; single arms scatter.
 

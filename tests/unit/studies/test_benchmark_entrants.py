@@ -258,6 +258,7 @@ def test_a_row_that_is_reproduced_stands_beside_the_published_ones(
     assert table.splitlines()[2].startswith("| hilcal | 1.00 |")
 
 
+@pytest.mark.long
 def test_an_environment_that_cannot_be_made_is_a_reason(tmp_path: Path, fakes: Path) -> None:
     (fakes / "good" / "requirements.txt").write_text("./no-such-folder\n")
     folders = ["-o", str(tmp_path / "out"), "--home", str(fakes), "--envs", str(tmp_path / "envs")]

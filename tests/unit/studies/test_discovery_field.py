@@ -16,6 +16,7 @@ from studies.records import resumed
 BY_TEXT = {f.text: f for f in FORMULAS}
 
 
+@pytest.mark.long
 def test_a_product_is_found_without_its_dummies_and_a_quotient_only_with_reciprocals() -> None:
     found = run_case(BY_TEXT["r F sin θ"], 0.01, 0, None)["hilcal"]
     assert found.equivalent
@@ -93,6 +94,7 @@ def test_an_answer_is_equivalent_only_where_it_holds_beyond_the_range() -> None:
     assert mark(Answer("a", 1e-2, 1e-9)) == "-"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("noise", [0.01])
 def test_answers_of_hilcal_repeat(noise: float) -> None:
     first, again = (run_case(BY_TEXT["μ N"], noise, 0, None)["hilcal"] for _ in range(2))

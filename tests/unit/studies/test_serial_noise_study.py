@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from hilcal.cli.demo import CELL
 from hilcal.config import load_config
@@ -25,6 +26,7 @@ def test_the_noise_has_the_stated_covariance_and_the_correlation() -> None:
     assert abs(float(np.mean(z[:, 1:] * z[:, :-1])) - 0.8) < 0.05
 
 
+@pytest.mark.long
 def test_a_case_counts_what_is_within() -> None:
     c = serial_case((3, 0.9, ""), config=CONFIG, robot="ur10e", poses=6)
     for o in (c.before, c.after):

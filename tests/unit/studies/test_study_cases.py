@@ -150,6 +150,7 @@ def diagnosed(c) -> Diagnosis:
     return diagnose(fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection"))
 
 
+@pytest.mark.long
 def test_a_further_round_adds_readings_of_new_poses_in_the_same_world():
     c = case("link_compliance", mode="deflection", strength=0.5, poses=10)
     d = diagnosed(c)

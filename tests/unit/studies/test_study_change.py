@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from hilcal.config import load_config
 from hilcal.robot.catalogue import configs_dir
@@ -12,6 +13,7 @@ from studies.change_command import figures_of
 CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
 
 
+@pytest.mark.long
 def test_a_case_says_how_visible_its_change_was_and_what_was_named() -> None:
     arm = studied_arm(CONFIG, "ur10e", 0, poses=20)
     found = case(arm, "zero", 3, True, 7)

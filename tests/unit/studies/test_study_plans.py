@@ -179,6 +179,7 @@ def test_the_study_depends_on_its_seed_alone(small: PlansStudy) -> None:
     assert other.of(RANDOM).result.position_real != small.of(RANDOM).result.position_real
 
 
+@pytest.mark.long
 def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None:
     assert [line.kind for line in small.lines] == [TEST, PARAMETERS, RANDOM, GRID, DOUBLE]
     for line in small.lines:
@@ -193,6 +194,7 @@ def test_the_study_compares_equal_numbers_of_readings(small: PlansStudy) -> None
         )
 
 
+@pytest.mark.long
 def test_the_command_gives_one_document(capsys: Capsys) -> None:
     done = run(
         capsys, "studies", "plans", "--robot", "ur5e", "--campaigns", "2", "--readings", "50",

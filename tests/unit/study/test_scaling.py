@@ -198,6 +198,7 @@ def test_wrong_options_are_named(options: dict[str, object], message: str) -> No
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.long
 def test_the_same_bits_on_several_workers() -> None:
     correlations, done = (0.5, 0.9), []
 

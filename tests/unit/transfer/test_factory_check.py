@@ -34,7 +34,14 @@ def readings(folder: Path, hide: str, seed: int) -> tuple[CellConfig, Readings]:
     return config, read_plan(secret, plan, [seed]).readings
 
 
-@pytest.mark.parametrize("hide", ["nothing", "encoder_offset", "link_geometry"])
+@pytest.mark.parametrize(
+    "hide",
+    [
+        "encoder_offset",
+        pytest.param("nothing", marks=pytest.mark.long),
+        pytest.param("link_geometry", marks=pytest.mark.long),
+    ],
+)
 def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path, hide) -> None:
     config, measured = readings(tmp_path, hide, 3)
     cell, nominal = cell_from_config(config, tmp_path), load_arm("ur15")
@@ -51,6 +58,7 @@ def test_a_change_since_the_factory_is_found_and_none_is_invented(tmp_path: Path
         assert found.moved_m > 3.0 * found.moved_std_m
 
 
+@pytest.mark.long
 def test_too_few_readings_cannot_answer(tmp_path: Path) -> None:
     config, measured = readings(tmp_path, "nothing", 3)
     cell = cell_from_config(config, tmp_path)

@@ -149,6 +149,7 @@ def test_readings_that_came_later_are_fitted_anew(run: Path) -> None:
     assert len(found.fit.readings) == len(snapshot.fit.readings) + 6
 
 
+@pytest.mark.long
 def test_fitting_anew_keeps_the_prior_of_another_campaign(run: Path) -> None:
     earlier, later = run.with_name("earlier.hilcal"), run.with_name("later.hilcal")
     found = campaign(BASE, "deflection", poses=16).readings
