@@ -106,7 +106,6 @@ class Calibration(Brief):
         """Make a calibration of a fit.
 
         Args:
-            found: the fit.
             source: what it is from, for people.
 
         Raises:
@@ -379,7 +378,6 @@ class Calibration(Brief):
         """Return where a tool is.
 
         Args:
-            of: the tool.
             states: N points.
             nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
             std: also state the uncertainty.

@@ -63,7 +63,6 @@ def invert(
     """Find joint values.
 
     Args:
-        arm: for limits of the chain.
         poses: takes joint values (K, n) and the numbers (K,) of their points; returns the poses.
         q: (N, n) joint values to begin with.
         rotation: (N, 3, 3) wanted orientation of the tool, base axes.

@@ -66,7 +66,6 @@ def conditions_of(
     """Return the conditions that effects of a model need, by column.
 
     Args:
-        model: the fitted model.
         states: that it was fitted to.
         moves: position (N, 3) of the tool and J R (N, 3, K) at N states.
     """

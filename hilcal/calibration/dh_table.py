@@ -153,9 +153,7 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
     """Return a file of the robot catalogue, which `[robot] model = "F.toml"` of a cell reads.
 
     Args:
-        rows: of the arm.
         arm: gives masses, limits and payload; what its description lacks is left out.
-        title: of the arm.
     """
     com = _centres(rows, arm)
     content: dict[str, object] = {

@@ -69,7 +69,6 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
 
     Args:
         arm: without couplings.
-        name: of the function.
         note: stands in a comment at the top.
     """
     out = [f"function robot = {name}()"]
@@ -118,7 +117,6 @@ def ur_kinematics(
 
     Args:
         nominal: the arm of the catalogue.
-        arm: the corrected one.
         note: stands in a comment at the top.
         digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
             an error where the file has another. One of the file's content where None.
@@ -160,8 +158,6 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
     PolyScope shows them, in mm.
 
     Args:
-        calibration: the calibration.
-        found: its corrected arm.
         beyond_flange: (4, 4) from the last frame of UR's kinematics file to the flange; None where
             that file is not written.
     """

@@ -53,7 +53,6 @@ class Measured:
         """Return where fitted states lie.
 
         Args:
-            states: of the fitted readings.
             p: what the fit knows of others.
             noise: (D,) trace of the position's covariance of each measurement, by noise and
                 misfit, m².

@@ -102,7 +102,6 @@ def read_points(
 
     Args:
         path: any kind of table that `import` reads.
-        arm: the arm.
         loads: (6,) wrench by the name of the load.
         mapping: what its columns hold, where they are not called as above.
 
@@ -164,8 +163,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     those of the point before it.
 
     Args:
-        points: the points.
-        arm: the arm.
         tool: (4, 4) T_flange_tool.
         near: (n,) joint values that the first point is near to, rad.
 

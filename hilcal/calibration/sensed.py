@@ -45,7 +45,6 @@ class SensorMount:
         As in a campaign, the arm is the nominal one.
 
         Args:
-            cell: the cell.
             q: (N, n) joint values, rad.
             reading: (N, 6) what the load adds to the sensor's reading, sensor axes.
         """

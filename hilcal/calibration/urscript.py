@@ -134,7 +134,6 @@ def program_points(
     """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool.
 
     Args:
-        path: of the program.
         leave: keep waypoints that are not understood as they are.
 
     Raises:

@@ -56,7 +56,6 @@ def to_record(
     """Store a fit: enough to find it again, and what was reported of it.
 
     Args:
-        found: the fit.
         diagnosis: its document, see `present.diagnosis_document`, where it was diagnosed.
         added: the effect that made it from the revision before; without any change a new chain
             starts.
@@ -149,9 +148,7 @@ def restore(
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
     Args:
-        record: the revision.
         cell: the cell of the campaign's configuration.
-        readings: all readings of the campaign.
         catalogue: has its effects; the installed ones unless given.
         stored: hash of the readings as the file stores them, where there is a file.
 
@@ -224,7 +221,6 @@ def restore_model(
     """Model and parameters (P,) of a revision, in the cell as it was registered then.
 
     Args:
-        record: the revision.
         cell: the cell of the campaign's configuration.
         readings: the readings that it was fitted to.
         catalogue: has its effects; the installed ones unless given.
@@ -309,8 +305,6 @@ def restore_predictive(
     """Return what a stored fit knows of readings that it has not seen.
 
     Args:
-        record: the revision.
-        model: its model.
         theta: (P,) its parameters.
         readings: all readings that it was fitted to.
     """
@@ -344,7 +338,6 @@ def chain(
     """Return a revision and those that it was made from, oldest first.
 
     Args:
-        records: all revisions of a campaign.
         last: number of the revision; the latest where None.
     """
     by_number = {r.number: r for r in records}

@@ -36,7 +36,6 @@ def cell_text(data: Mapping[str, Any], title: str) -> str:
 
     Args:
         data: the sections and keys that have values, as TOML has them.
-        title: first line.
     """
     lines, known = [_HEAD.format(title=escaped(title))], tables()
     for name, keys in SHOWN.items():

@@ -75,12 +75,10 @@ def relax(
     The bound is of the scan of all units.
 
     Args:
-        units: what can be taken.
         criterion: φ.
         budget: B, in the units of the cost.
         prior: (P, P) M0, what is known before; zero by default.
         most: how often a unit may be taken; any number of times by default.
-        names: of the parameters, for messages.
         tolerance: relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks.
         start: optimum of a similar problem over the same units.
 

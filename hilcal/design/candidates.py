@@ -72,7 +72,6 @@ def candidates(
 
     Args:
         nominal: the model that is planned for.
-        config: its loads.
         q: (N, n) joint angles, rad.
         allowed: (N, 1 + L) which states may be taken, unloaded first; all by default.
     """
@@ -95,8 +94,6 @@ def reading_derivatives(
 
     Args:
         nominal: the model, whose live parameters come first.
-        config: its noise.
-        of: the candidates.
         more: effects that are not in the model.
         scale: (P,) what one unit of each parameter is, SI.
     """
@@ -134,7 +131,6 @@ def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...])
     Block (i, j) of their covariance is δ_ij V_i + V_u: the unloaded reading's error is in all.
 
     Args:
-        of: the readings.
         which: poses, of those in `of`.
         loads: S indices of loads, 1 to L.
     """

@@ -64,8 +64,6 @@ def objective_of(
     """Return a design problem with a criterion.
 
     Args:
-        problem: the design problem.
-        config: its loads and noise.
         name: one of `CRITERIA`, or "test", the former name of "I".
         work: the prediction poses, for "I".
 
@@ -133,12 +131,7 @@ def choose_poses(
     readings at any number of poses, under any loads.
 
     Args:
-        asked: the question, of all units.
-        problem: the design problem.
         usable: (K,) which units there are to choose from.
-        poses: how many.
-        rng: generator.
-        effort: of the search.
     """
     free, index = only(asked, usable), np.flatnonzero(usable)
     of: dict[int, list[int]] = {}
@@ -192,11 +185,8 @@ def costly_loads(
     instead. Compared are the continuous optima over some of the poses, one load after the other.
 
     Args:
-        asked: the question.
-        problem: the design problem.
         budget: readings of the plan with all loads.
         change: readings that fit into the time of one load change.
-        rng: generator.
     """
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]

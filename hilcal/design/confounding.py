@@ -91,10 +91,8 @@ def confounding(
     its own mean, has the variance σ²/Σ(t - t̄)².
 
     Args:
-        plan: poses and steps.
         times: (S,) of the steps, s.
         wrenches: (6,) by load.
-        drift: rate in one coordinate, m/s.
         reading_std: standard uncertainty of a reading in one coordinate, m.
     """
     when = dict(zip(plan.steps, times.tolist(), strict=True))

@@ -64,7 +64,6 @@ def draw(
     """Return poses from a Sobol sequence over the joint space, turned by a random shift.
 
     Args:
-        space: what the cell allows.
         count: poses wanted; fewer where the cell leaves fewer.
         rng: shift of the sequence.
         least: so many have to be found.

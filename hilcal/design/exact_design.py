@@ -54,12 +54,9 @@ def exact(
     once, and what is a little worse is gone on from for a while.
 
     Args:
-        units: what can be taken.
         criterion: φ.
         budget: B.
         prior: (P, P) what is known before, and units that are in any case in the plan.
-        relaxed: the continuous optimum.
-        rng: generator.
         most: how often a unit may be taken; any number of times by default.
         effort: units put into a plan before the search ends; `EFFORT` by default.
         enough: share of the bound at which it ends earlier; `ENOUGH` by default.

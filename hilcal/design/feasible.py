@@ -75,7 +75,6 @@ class Space(Feasibility):
 
         Args:
             q: (N, n) joint angles, rad.
-            load: name of a load.
         """
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 

@@ -60,7 +60,6 @@ class GoalRule:
 
         Args:
             text: the goal, e.g. "joint std < 2 %".
-            cell: the cell.
             config: `[planning]`, loads, repeatability.
             catalogue: the effects that a model can have; the installed ones unless given.
             now: seconds that pass for people.

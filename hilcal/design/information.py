@@ -146,7 +146,6 @@ def problem(
     there are few loads. It costs as many readings as it takes, the unloaded one included.
 
     Args:
-        nominal: the model.
         config: loads, noise, and `[planning]`: kind of readings, potential terms.
         q: (N, n) candidate poses, rad.
         allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.

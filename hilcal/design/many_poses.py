@@ -39,12 +39,7 @@ def measure_poses(
     The candidates' order is that of a Sobol sequence: the first ones that are reached are taken.
 
     Args:
-        cell: the cell.
-        config: its limits and noise.
         fit: what has been measured, absolute readings.
-        poses: how many.
-        rng: generator.
-        say: takes progress, one line each.
         reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
 
     Raises:

@@ -76,7 +76,6 @@ def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -
     Args:
         of: the design problem of the model.
         config: its noise; where it states no repeatability, an ordinary one is assumed.
-        work: where positions are predicted.
     """
     nominal, config = of.nominal, _with_scatter(of.nominal, config)
     more, std = other_effects(nominal, config)

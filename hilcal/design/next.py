@@ -94,14 +94,10 @@ def measure_next(
     readings so far tell of each and at others that could be as well; see `discriminated_pairs`.
 
     Args:
-        cell: the cell.
-        config: its limits, loads and noise.
         fit: what has been measured, in scaling gc, of a model without the suspects.
         suspects: two effects or more.
         request: how many readings, or as many as so many poses take under every load: which
             poses and loads tell most of a difference is what the plan chooses.
-        rng: generator.
-        say: takes progress, one line each.
         reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
 
     Raises:
@@ -151,7 +147,6 @@ def expected(
     """Return the power of a pair, the mean over parameters that its effect may have.
 
     Args:
-        problem: the design problem.
         names: effect that is there, rival that is fitted.
         betas: (E,) parameters of the effect, in the problem's units.
         information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
@@ -222,12 +217,8 @@ def reordered(
     """Return a plan with other units of its problem, in an order of its own.
 
     Args:
-        space: what the cell allows.
-        made: the plan.
         counts: (K,) how often each unit is taken.
         reference: (n,) joints of the reference pose, from which all units are reached, rad.
-        rng: generator.
-        how: the order.
     """
     of, usable, taken = made.problem, np.flatnonzero(made.usable), np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})

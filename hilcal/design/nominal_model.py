@@ -100,8 +100,6 @@ def nominal_model(
     1e-3. Those of the baseline's effects are ordinary, all others zero.
 
     Args:
-        cell: the cell as configured.
-        config: its configuration.
         m: 3 for positions, 6 for poses.
         catalogue: the effects that a model can have; the installed ones unless given.
         prior: what another campaign taught. Its effects are in the model, too, but for families

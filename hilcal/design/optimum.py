@@ -59,13 +59,11 @@ def best(
     """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
 
     Args:
-        units: what can be taken.
         criterion: φ.
         budget: B, in the units of the cost.
         prior: (P, P) M0: what is known before, and units that are in the plan in any case.
         rng: generator; the plan depends on nothing else that is random.
         most: how often a unit may be taken; any number of times by default.
-        names: of the parameters, for messages.
         tolerance: relative gap of the continuous optimum; `TOLERANCE` by default.
         effort: of the search for whole numbers; see `exact`.
         relaxed: the continuous optimum, where it is known.

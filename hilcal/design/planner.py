@@ -128,12 +128,9 @@ def make(
     """Return the plan.
 
     Args:
-        cell: the cell.
         config: limits, loads, noise, and `[planning]`: what it is for.
         request: how many readings, and the criterion.
-        rng: generator.
         known: fit of what has been measured already.
-        say: progress callback.
         catalogue: the effects that a model can have; the installed ones unless given, or those
             of `known`.
         prior: what another campaign taught, where nothing has been measured yet.

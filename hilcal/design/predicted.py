@@ -54,10 +54,8 @@ def predicted(
     """Predict the standard uncertainties that a plan reaches.
 
     Args:
-        problem: the design problem.
         counts: (K,) how often each unit is taken.
         information: (P, P) instead, prior included; of the prior alone where neither is given.
-        work: where positions are predicted.
     """
     if information is None:
         information = problem.prior if counts is None else problem.information(counts)
@@ -118,7 +116,6 @@ def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Flo
     """Return (T,) standard deviations of positions, m; infinite where not determined.
 
     Args:
-        work: the poses.
         covariance: (L, L) of the model's live parameters.
         null: (L, U) directions that were left out: a position that one of them moves at an
             ordinary magnitude by a tenth of its standard deviation is not determined.

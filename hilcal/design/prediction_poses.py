@@ -99,7 +99,6 @@ def position_derivative(
 
     Args:
         nominal: the model, whose live parameters come first.
-        at: the poses.
         more: effects that are not in the model.
         scale: (P,) what one unit of each parameter is, SI.
     """

@@ -186,15 +186,9 @@ def order_plan(
       order stays random towards everything that is no regressor, such as temperatures.
 
     Args:
-        cell: the cell.
-        config: its loads, motion and acquisition.
         names: (P) names of poses.
         q: (P, n) their joint angles, rad.
         reference: (n,) joint angles of the reference pose, rad.
-        chosen: what to measure.
-        passable: which motions are clear.
-        rng: generator.
-        how: settings.
 
     Raises:
         InputError: nothing is chosen, or a name is unknown.
@@ -343,7 +337,6 @@ class OrderDraws:
         """Return the plan for an order of the stops under each load.
 
         Args:
-            orders: by load.
             half: whether the second half of the unloaded order comes after the loads.
             mixed: whether loops come in random order and direction.
         """
@@ -430,8 +423,6 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR)
     Args:
         q: (P + 1, n) joint angles, rad; the reference first.
         load: name of the load that hangs.
-        passable: which motions are clear.
-        pace: seconds of motions and readings.
         near: neighbours to which motions are tested; the nearest in time.
     """
     legs = pace.legs(q, q)

@@ -215,10 +215,7 @@ def summarise(
     """Return the summary of a plan.
 
     Args:
-        planned: the plan.
-        config: the cell's configuration.
         rng: generator, for the designs of the other criteria.
-        say: progress callback.
         compare: whether to compute the criterion comparison.
         curve: whether to compute the sample-size curve.
     """

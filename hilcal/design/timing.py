@@ -82,10 +82,7 @@ def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, F
     """Return the duration of a plan and (S,) the middle of each step's reading, s.
 
     Args:
-        plan: poses and steps.
-        arm: the arm.
         margin: distance kept from the joint limits, rad.
-        at: the pace.
     """
     stops = route(plan, arm, margin)
     motion = readings = changes = 0.0

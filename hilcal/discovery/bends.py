@@ -54,8 +54,6 @@ def bends(
     """Form all of them.
 
     Args:
-        grammar: the products.
-        sites: where they act.
         readings: (K,) those of the screening.
         form: (S, R', K) whitened motion of each site; see `screen`.
         free: (S, K, K) its products, the model projected out.

@@ -130,11 +130,7 @@ def _better(
 
 
 def composed_terms(beside: Beside) -> list[LawTerm]:
-    """Return terms of functions of composed quantities.
-
-    Args:
-        beside: the candidates beside chosen terms.
-    """
+    """Return terms of functions of composed quantities."""
     found = _screened(beside)
     at = {s: SiteSums(beside, s) for s in {b.s for b in found}}
     sums: list[_Bent] = []

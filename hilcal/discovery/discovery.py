@@ -142,7 +142,6 @@ def discover(
 
     Args:
         fit: a gc-scaled fit.
-        say: takes progress, one line each.
         name: of the effect that is proposed.
 
     Raises:

@@ -39,12 +39,7 @@ class FoldSearch:
 
 
 def search_by_folds(screen: Screen, most: int) -> FoldSearch:
-    """Repeat the search without each fold of poses.
-
-    Args:
-        screen: all candidates.
-        most: terms at most.
-    """
+    """Repeat the search without each fold of poses."""
     linear = screen.linear
     fit = linear.fit
     fold = fit.whitening.rows_of(random_folds(fit.pose, FOLDS))

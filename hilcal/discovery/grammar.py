@@ -219,8 +219,6 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of the functions of the quantities.
 
     Args:
-        known: the quantities.
-        s: the situation of the readings.
         poses: number of poses, which limits the multiples of an angle; see `FINEST`.
     """
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]

@@ -40,7 +40,6 @@ class SearchProblem:
         """Refit the model to the rows.
 
         Args:
-            screen: all candidates.
             rows: (R,) those that are used; all by default.
         """
         linear = screen.linear

@@ -180,10 +180,6 @@ def free_numbers(form: Form, s: Situation) -> list[FreeNumber]:
     """Return the free numbers of a law.
 
     The same function of the same quantity in several products has one number.
-
-    Args:
-        form: the law.
-        s: the situation of the readings.
     """
     groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
     for k, p in enumerate(form.parts):

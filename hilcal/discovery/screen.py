@@ -202,7 +202,6 @@ def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
     With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
 
     Args:
-        words: the amplitudes.
         values: (F, K) these, each with root mean square 1.
         lifted: (F, K) Q of them.
     """

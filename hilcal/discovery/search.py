@@ -55,11 +55,6 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
     """Return the best selection of each number of terms, from one on; none where chance would do.
 
     A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
-
-    Args:
-        problem: the rows to search on.
-        most: terms at most.
-        beam: first terms that are followed.
     """
     found = _ordered(problem)
     if not found or not _sure(found[0], problem):

@@ -93,12 +93,7 @@ def posterior(odds: Mapping[Hashable, Sequence[float]]) -> dict[Hashable, float]
 
 
 def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple[Structure, ...]:
-    """Return the likely structures and the best of each complexity, the likeliest first.
-
-    Args:
-        problem: of all rows, searched.
-        selections: what the search chose.
-    """
+    """Return the likely structures and the best of each complexity, the likeliest first."""
     screen = problem.screen
     met = _met(problem, selections)
     groups: dict[Hashable, list[tuple[float, Terms]]] = {}
@@ -199,7 +194,6 @@ def averaged(fit: Fit, of: Sequence[Structure], readings: Readings) -> tuple[Flo
     """Return what likely laws add to a fit's prediction of D measurements, and its uncertainty.
 
     Args:
-        fit: the fit without the laws.
         of: structures; their probabilities are taken relative to their sum.
         readings: of the same cell, measured or planned.
 

@@ -111,8 +111,6 @@ class Catalogue:
         """Build an effect by name.
 
         Args:
-            name: of the effect.
-            cell: the cell.
             states: those that it is set up for.
             options: where they are not the usual ones.
             m: 3 for readings of positions, 6 for poses.

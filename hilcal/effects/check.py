@@ -66,7 +66,6 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     used are named in `needs`.
 
     Args:
-        kind: the class.
         cell: of the arm that it is made for; an arm of six joints, or of seven, unless given.
 
     Raises:

@@ -32,7 +32,6 @@ def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, 
     Args:
         text: e.g. "joint_compliance, transmission_error(harmonics=20)".
         where: begins the message, e.g. "--effects".
-        catalogue: has the names.
 
     Returns:
         Options by name of the effect, in order.

@@ -118,7 +118,6 @@ def mixed_problem(
     Args:
         y: (R,) as in `MixedProblem`.
         jacobian: (R, P) whitened derivative by all parameters of the model.
-        families: of the model.
         noise: components, that of the instrument first.
     """
     frames = _frame_basis(jacobian[:, families.frames])

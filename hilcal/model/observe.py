@@ -65,9 +65,6 @@ def observe(
     """Read the target of a deviated chain.
 
     Args:
-        cell: registration, targets and observers.
-        chain: the deviated chain.
-        deviation: what it is deviated by.
         target: (N,) number of the target, where there are several.
         observer: (N,) number of what observes it, where there are several.
     """
@@ -303,7 +300,6 @@ class SlotFrames:
         """Rows (N, m, E) by the twist, from rows by v (None for zero) and ω (N, m, 3), base axes.
 
         Args:
-            slot: whose twist.
             v: rows by the displacement.
             w: rows by the turn.
             elements: range of the elements of the twist.

@@ -87,7 +87,6 @@ def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
     """Join groups to runs along `Readings.along`, each in its order.
 
     Args:
-        readings: the readings.
         groups: those that share another error; none is divided.
         most: measurements in a run, but for its last group.
     """

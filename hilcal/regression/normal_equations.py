@@ -229,7 +229,6 @@ def normal_equations(
     Args:
         a: A.
         target: (R,) right-hand side.
-        basis: the coordinates.
         gram: AᵀA.
         known: products of the flat coordinates, where they are known.
     """

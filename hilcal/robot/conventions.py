@@ -78,7 +78,6 @@ def with_conventions(
     Couplings C that the arm has already are applied to the converted values: θ = C (S q + o + K q).
 
     Args:
-        arm: the arm as drawn.
         sign: (n,) s.
         offset: (n,) o, rad; m where a joint slides.
         coupling: (n, n) k, zero on the diagonal.

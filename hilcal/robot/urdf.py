@@ -43,7 +43,6 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
 
     Args:
-        path: the file.
         base_link: link whose frame is the base; the root link if None.
         tip_link: link whose frame is the flange; the only leaf link if None.
 
@@ -288,7 +287,6 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
     Args:
         arm: the arm with every joint by itself.
         given: what joints of the file follow; those that the arm does not have do not count.
-        where: the file, for messages.
 
     Raises:
         InputError: what is followed is no joint of the arm, or follows another one itself.

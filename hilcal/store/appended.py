@@ -17,7 +17,6 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     pose, and its readings get new cycles, with unloaded readings of their own.
 
     Args:
-        plan: the further plan.
         before: all that was planned before.
         number: of the plan in the campaign, 2 or more.
 

@@ -75,8 +75,6 @@ class CampaignFile:
         """Make a campaign; the file appears only when it is complete.
 
         Args:
-            path: the file to make.
-            config_json: the cell's configuration.
             base_dir: the directory to which its relative paths refer.
             source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
@@ -104,7 +102,6 @@ class CampaignFile:
         """Open a campaign and check that it is whole.
 
         Args:
-            path: the file.
             read_only: write nothing, see `schema.connect`.
             check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
                 measure on, does not.

@@ -18,9 +18,7 @@ def new_campaign(
     """Give an empty campaign to the block; the file appears when the block has filled it.
 
     Args:
-        path: the file to make.
         about: texts about the campaign, by name.
-        overwrite: replace an existing campaign.
 
     Raises:
         InputError: as for `may_write`, or it cannot be written.

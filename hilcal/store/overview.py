@@ -202,8 +202,6 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     """Return the document of `info --json`.
 
     Args:
-        o: what the campaign holds.
-        path: of its file.
         covariance: what the covariances consist of, in words.
     """
     return {

@@ -101,8 +101,6 @@ def change(added: str | None, removed: str | None, scatter: bool = False) -> str
     """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model.
 
     Args:
-        added: an effect.
-        removed: an effect.
         scatter: whether the arm's estimated scatter is in its covariance.
     """
     if scatter and added is None and removed is None:

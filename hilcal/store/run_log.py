@@ -45,11 +45,7 @@ def create_run(
     """Make the empty campaign of a run, its plan inside.
 
     Args:
-        path: the file.
-        config: the cell's configuration.
         base_dir: the directory to which its relative paths refer.
-        plan: what is measured.
-        overwrite: replace an existing campaign.
         source: where the readings come from, in words.
         more: further texts about it; that of the key `COVERS` where readings are stored with
             another covariance than the instrument's.
@@ -67,7 +63,6 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
     """Refuse to continue a campaign in another cell.
 
     Args:
-        campaign: what was begun.
         config: the cell as it is told now.
         base_dir: directory to which relative paths in it refer.
 

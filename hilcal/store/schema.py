@@ -137,7 +137,6 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Open an existing file, every commit durable before it returns.
 
     Args:
-        path: the file.
         read_only: write nothing, neither to the file nor beside it. A journal beside the file is
             what a killed program left unfinished; SQLite has to undo that before anybody can
             read, and then the file is opened for writing all the same.

@@ -34,10 +34,6 @@ def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
 def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
     """Return a record with the posterior that it names.
 
-    Args:
-        record: as the file has it.
-        stored: texts by key.
-
     Raises:
         ValueError: the posterior is not among them.
     """

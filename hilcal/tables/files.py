@@ -46,8 +46,6 @@ def open_tables(
     """Open the file or the two files that a mapping is for, as one table.
 
     Args:
-        path: the first file.
-        mapping: its sections [file] and [second_file].
         second: the second file, where the mapping does not name it.
 
     Returns:
@@ -75,7 +73,6 @@ def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> 
     """Open one file as a table of cells.
 
     Args:
-        path: the file.
         how: it is written.
         check: is given the names of its columns as it has them, with repeats and empty ones.
 

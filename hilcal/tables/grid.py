@@ -103,7 +103,6 @@ class Grid:
         """(N,) numbers of a column, NaN where a value is missing.
 
         Args:
-            column: its name or number.
             complete: whether no value may be missing.
 
         Raises:

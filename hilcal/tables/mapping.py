@@ -517,7 +517,6 @@ def load_mapping(path: Path, kind: type[M]) -> M:
     """Read a mapping file.
 
     Args:
-        path: the file.
         kind: `Mapping` for readings, `PointMapping` for points.
 
     Raises:

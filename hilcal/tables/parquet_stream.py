@@ -105,8 +105,6 @@ def open_stream(
     """Open a Parquet file of readings; only its description and its first rows are read.
 
     Args:
-        path: the file.
-        arm: the arm that was measured.
         noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
 

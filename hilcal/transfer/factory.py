@@ -70,9 +70,7 @@ def check_factory(
     """Judge readings by the kinematics that the factory measured.
 
     Args:
-        cell: where they were measured.
         nominal: the arm as its maker designed it, its joints not yet counted as the cell says.
-        factory: kinematics of this arm.
         readings: of a few poses all over the workspace.
         catalogue: the effects; the installed ones where None.
 

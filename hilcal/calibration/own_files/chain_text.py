@@ -81,8 +81,6 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
     Args:
         steps: of the file, base to tip.
         nominal: the arm that the campaign began with.
-        arm: the corrected one.
-        file: its name, for messages.
 
     Raises:
         InputError: the file is of another arm; says which axis lies elsewhere.

@@ -45,7 +45,6 @@ def correct_file(
     Args:
         path: a file of `KINDS`.
         nominal: the arm that the campaign began with.
-        found: the corrected arm.
         base: name of the link or body that the arm begins at.
         tip: name of the link, body or site that is its flange.
 

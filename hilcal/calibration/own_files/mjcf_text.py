@@ -26,7 +26,6 @@ def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base body to a tip, a body or a site.
 
     Args:
-        document: the file.
         base: name of the body; the one that carries the first hinge where None.
         tip: name of a body or a site; the last body with a hinge where None.
 

@@ -162,7 +162,6 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain
     """Return the chain from a base link to a tip link.
 
     Args:
-        document: the file.
         base: name of the link; the first one where None.
         tip: name of the link; the only one behind the turning joints where None.
 

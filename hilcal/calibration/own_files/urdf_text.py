@@ -27,7 +27,6 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base link to a tip link.
 
     Args:
-        document: the file.
         base: name of the link, without what a xacro puts before it; the root link where None.
         tip: the same of the last one; the only leaf behind the last joint where None.
 

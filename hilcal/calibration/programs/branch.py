@@ -94,7 +94,6 @@ def resolve(
 
     Args:
         program: N points of which are understood.
-        arm: the nominal one.
         near: (6,) joint values that the first pose is near to, rad; None where none are given.
 
     Returns:
@@ -194,7 +193,6 @@ def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: I
     """(N, F) configuration to be stated after a correction: others where those were left alone.
 
     Args:
-        arm: the nominal one.
         language: of the program.
         given: (N, 6) joint values before, rad.
         q: (N, 6) joint values after.

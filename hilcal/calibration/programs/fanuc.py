@@ -75,7 +75,6 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
     """Read a program.
 
     Args:
-        path: of the file.
         frames_file: TOML with tools, user frames and turn axes; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 

@@ -62,7 +62,6 @@ def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     """Read a job.
 
     Args:
-        path: of the file.
         frames_file: TOML with tools, user frames, pulses per degree; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 

@@ -90,7 +90,6 @@ def understood(
 
     Args:
         path: the program; the end of its name says of which maker.
-        arm: the nominal one.
         frames: file with what the controller keeps apart from programs.
         tool: (4, 4) T_flange_tool of tools that neither has.
         near: (6,) joint values that the first pose is near to, rad.

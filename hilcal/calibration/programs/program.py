@@ -144,7 +144,6 @@ class Program:
         """Return the files, by suffix, with other points.
 
         Args:
-            arm: the nominal one.
             found: N points of it.
             given: (N, 6) joint values of them as they were, rad.
             q: (N, 6) joint values that they get.
@@ -297,9 +296,7 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
     """Read `--frames F.toml`.
 
     Args:
-        path: the file.
         pose: of the maker's numbers.
-        count: how many these are.
 
     Raises:
         InputError: it cannot be used.

@@ -122,7 +122,6 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
     """Read a module.
 
     Args:
-        path: of the module.
         frames_file: TOML, or a module with tooldata and wobjdata; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 

@@ -112,7 +112,6 @@ class Guesser:
         """Take the table apart.
 
         Args:
-            grid: the table.
             joints: of the arm, where the cell is known.
         """
         self.grid = grid

@@ -46,7 +46,6 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
     """Look at a table and propose a mapping.
 
     Args:
-        path: the table.
         second: a second file that holds the other columns of the same readings.
         joints: number of the arm's joints, where it is known.
 
@@ -119,7 +118,6 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     """Propose a mapping for a table.
 
     Args:
-        grid: the table.
         joints: number of the arm's joints, where it is known.
     """
     g = Guesser(grid, joints)
