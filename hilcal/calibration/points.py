@@ -239,9 +239,6 @@ def _nearest(
 
     The solution that Newton's method finds from there, where it is near; else the nearest of those
     that it finds from everywhere.
-
-    Raises:
-        InputError: the arm does not reach the pose.
     """
     starts = near[None]
     for _ in range(2):
@@ -284,11 +281,7 @@ def _form(path: Path) -> FileFormat:
 
 
 def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
-    """Return what the columns of a table seem to hold, and that in words.
-
-    Raises:
-        InputError: something is missing, unsure or not understood.
-    """
+    """Return what the columns of a table seem to hold, and that in words."""
     of = propose(path, joints=arm.n)
     found = of.proposal
     understood = [
@@ -360,11 +353,7 @@ def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
 def _checked(
     path: Path, header: Sequence[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Check a header; returns its text and its number columns.
-
-    Raises:
-        InputError: an unknown or double column, an incomplete group, or one in two units.
-    """
+    """Check a header; returns its text and its number columns."""
     known = [name for names in groups.values() for name in names]
     exchanged = set(known_columns(arm.units))
     ours = {*known, *exchanged} - {"pose", "load", "target"}
@@ -398,11 +387,7 @@ def _checked(
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
-    """(6,) wrench of a named load.
-
-    Raises:
-        InputError: no such load.
-    """
+    """(6,) wrench of a named load."""
     name = table.text["load"][row]
     if name in (NO_LOAD, ""):
         return np.zeros(6)
@@ -413,11 +398,7 @@ def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
 
 
 def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
-    """(N, 4, 4) poses, taken out of what was found; None where there are none.
-
-    Raises:
-        InputError: a position without an orientation or joint values, or an orientation alone.
-    """
+    """(N, 4, 4) poses, taken out of what was found; None where there are none."""
     position, rotation = found.pop("position_m", None), found.pop("rotation_rad", None)
     if "position_mm" in found:
         position = 1e-3 * found.pop("position_mm")

@@ -178,11 +178,7 @@ class A(InverseVariance):
 
 
 def _interest(interest: Ints, size: int) -> Ints:
-    """Return checked indices of parameters.
-
-    Raises:
-        InputError: none, one that is there twice, or one that does not exist.
-    """
+    """Return checked indices of parameters."""
     chosen = np.asarray(interest, dtype=np.int64).reshape(-1)
     unique = np.unique(chosen)
     if not len(chosen) or len(unique) < len(chosen) or unique[0] < 0 or unique[-1] >= size:

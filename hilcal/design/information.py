@@ -221,12 +221,7 @@ class _Layout:
 
 
 def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
-    """Decide on the units; fewer kinds of them where memory would not do.
-
-    Raises:
-        CannotAnswerError: no unit is left.
-        InputError: too many candidates.
-    """
+    """Decide on the units; fewer kinds of them where memory would not do."""
     patterns, pattern = np.unique(of.allowed, axis=0, return_inverse=True)
     pattern = pattern.reshape(-1)
     tally = np.bincount(pattern, minlength=len(patterns))

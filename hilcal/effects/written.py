@@ -143,11 +143,7 @@ def _single(text: str, where: str) -> object:
 
 
 def _split(text: str, separators: str, where: str, valid: str) -> list[str]:
-    """Split outside of quotes, parentheses and brackets; empty parts are left out.
-
-    Raises:
-        InputError: one of them is not closed, or was not opened.
-    """
+    """Split outside of quotes, parentheses and brackets; empty parts are left out."""
     parts, start = [], 0
     for k in _outside(text, where, valid):
         if text[k] in separators:

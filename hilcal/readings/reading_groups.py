@@ -132,11 +132,7 @@ def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
 
 
 def _refuse_without_unloaded(readings: Readings) -> None:
-    """Refuse a pose and cycle without any unloaded reading.
-
-    Raises:
-        InputError: names it.
-    """
+    """Refuse a pose and cycle without any unloaded reading."""
     has = has_unloaded(readings)
     if not has.all():
         row = int(np.argmin(has))

@@ -192,9 +192,6 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
     """Count the elements of a part of a workbook, of which openpyxl keeps more than it is long.
 
     Of a sheet it keeps a row, of other parts all.
-
-    Raises:
-        InputError: too many, too deep, or one that is too long.
     """
     where, sheet = f"{path}: {name}", name.startswith("xl/worksheets/")
     most = limits.COLUMNS * 10 if sheet else limits.ELEMENTS

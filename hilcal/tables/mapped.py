@@ -589,9 +589,6 @@ def _plausible(
     repeat a pose those whose positions disagree by more than what an arm repeats to and
     lever · Σ|dq|, what the joints' difference moves the target by at most: which one is wrong
     cannot be known.
-
-    Raises:
-        InputError: nothing is left.
     """
     from scipy.spatial import cKDTree
 

@@ -211,11 +211,7 @@ def _index(names: list[str]) -> tuple[Ints, list[str]]:
 
 
 def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
-    """(N,) numbers of the targets by the cell's names; None where there is one target.
-
-    Raises:
-        InputError: table and cell name different targets.
-    """
+    """(N,) numbers of the targets by the cell's names; None where there is one target."""
     given = table.text.get(columns.TARGET)
     if given is None:
         if len(names) > 1:
@@ -250,9 +246,6 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
     """What the table's covariances cover, by its column `covers`, and whether rounding, too.
 
     Without the column it is the instrument.
-
-    Raises:
-        InputError: another word, or not the same one in all rows.
     """
     given = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(given):

@@ -100,11 +100,7 @@ def mapped_covariance(
 
 
 def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
-    """(N, k) figures of columns; every row has one.
-
-    Raises:
-        InputError: a cell without a value.
-    """
+    """(N, k) figures of columns; every row has one."""
     values = np.stack([grid.numbers(column) for column in columns], axis=1)
     bad = np.isnan(values)
     if bad.any():

@@ -89,9 +89,6 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
 
     The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
     its model.
-
-    Raises:
-        InputError: it is none, or the arm is none of UR's.
     """
     try:
         text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")

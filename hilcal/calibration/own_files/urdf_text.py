@@ -111,11 +111,7 @@ def _leaf(document: Document, parents: dict[str, tuple[str, Node]], links: set[s
 
 
 def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlace:
-    """Return the step of a joint; `turned`: from its child to its parent.
-
-    Raises:
-        InputError: it neither turns nor is fixed, or its place cannot be read.
-    """
+    """Return the step of a joint; `turned`: from its child to its parent."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     axis = joint.first("axis")
     if kind not in (*_TURNING, _FIXED) or (turned and kind != _FIXED):
@@ -164,11 +160,7 @@ def _of_rpy(rpy: Floats) -> Floats:
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:
-    """Return three numbers, of which a xacro may compute some.
-
-    Raises:
-        InputError: an expression of others than numbers.
-    """
+    """Return three numbers, of which a xacro may compute some."""
 
     def computed(m: re.Match[str]) -> str:
         try:
@@ -183,11 +175,7 @@ def _values(document: Document, node: Node, text: str) -> Floats:
 
 
 def _constant(node: ast.expr) -> float:
-    """Value of an expression of numbers, pi and radians().
-
-    Raises:
-        ValueError: it is another one.
-    """
+    """Value of an expression of numbers, pi and radians()."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)

@@ -123,11 +123,7 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
 
 
 def _instructions(text: str, name: str) -> Iterator[tuple[int, str]]:
-    """Yield line and text of each instruction, without comments.
-
-    Raises:
-        InputError: one changes a frame.
-    """
+    """Yield line and text of each instruction, without comments."""
     start = re.search(r"^/MN\b[^\n]*\n", text, re.M)
     at = start.end() if start else len(text)
     for m in re.finditer(r"[^;]*;", text[at:]):

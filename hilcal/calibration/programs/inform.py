@@ -117,11 +117,7 @@ def _instruction(
     found: dict[str, ProgramPoint],
     otherwise: dict[str, int],
 ) -> None:
-    """Take note of an instruction.
-
-    Raises:
-        InputError: it changes what points mean.
-    """
+    """Take note of an instruction."""
     if r := _REFUSED.match(code):
         raise InputError(
             f"{file}: line {line}: {r[1]} changes what points mean; valid: a job without it"

@@ -477,11 +477,7 @@ class _KrlReader:
 
 
 def _value(text: str) -> float:
-    """Value of a number: 1.5, 'B010', 'H2A'.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Value of a number: 1.5, 'B010', 'H2A'."""
     if text.startswith("'"):
         return int(text[2:-1], 2 if text[1] in "Bb" else 16)
     return float(text)

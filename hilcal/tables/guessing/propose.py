@@ -77,11 +77,7 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
 
 
 def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
-    """Columns that name the rows of two tables; None where they belong together row by row.
-
-    Raises:
-        InputError: tables of different length without such columns.
-    """
+    """Columns that name the rows of two tables; None where they belong together row by row."""
     best: tuple[int, str, str] | None = None
     for here in first.names:
         texts = first.text(here)
