@@ -8,8 +8,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.choice import choose
-from hilcal.design.compound_criteria import compound_objective
+from hilcal.design.choice import choose, compound_objective
 from hilcal.design.draw import draw
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem, problem

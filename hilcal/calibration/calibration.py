@@ -9,7 +9,7 @@ C the covariance of the parameters, what a family does at places that nobody mea
 metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
 allows; Σ_q the arm's scatter from one arrival to the next.
 
-What points do not tell of their state has a further share, see `calibration.conditions`.
+What points do not tell of their state has a further share, see `calibration.measured`.
 
 Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
 arm.
@@ -23,13 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.compensated import Compensation, ToolPoses
 from hilcal.calibration.compensation import Inverse, Pose, invert
 from hilcal.calibration.compiled import Compiled, compiled
-from hilcal.calibration.conditions import Condition, conditions_of, needed
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Measured
-from hilcal.calibration.poses import ToolPoses
+from hilcal.calibration.measured import Condition, Measured, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
@@ -193,7 +191,7 @@ class Calibration(Brief):
             std: also state the uncertainty, and whether points lie far from what was measured.
             recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; those
                 that the model needs and are not given are taken as in the middle of what was
-                measured, see `calibration.conditions`.
+                measured, see `calibration.measured`.
 
         Raises:
             InputError: another shape, or a column is missing that the model needs, and that the

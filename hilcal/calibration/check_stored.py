@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hilcal.calibration.conditions import WORDS, Condition
-from hilcal.calibration.measured import Measured
+from hilcal.calibration.measured import WORDS, Condition, Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell
 from hilcal.robot.arm import Arm

@@ -1,4 +1,4 @@
-"""A corrected arm as others read it: URDF, the kinematics file of UR's ROS driver, frames.
+"""The constant part of an identified arm, and how others read it: URDF, UR's kinematics, frames.
 
 URDF: fixed-axis roll, pitch, yaw and xyz of every joint's origin; every joint turns about its z.
 
@@ -7,20 +7,25 @@ by `ur_calibration`) has one origin per joint in the frames of that package: tho
 moved along the joints' axes. The first one counts from `base_link_inertia`, which is the
 controller's base (`base`), half a turn about z from `base_link`. It has no origin for the flange;
 what cannot be moved before the last joint is part of the tool, see `frames`.
+
+An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
+of another length or angle) goes into the constant transforms, from the declared base to the
+declared flange, see `identification.robot_frames`. Everything else (compliances, waves of gears,
+temperature) cannot, and is named.
 """
 
 import hashlib
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.corrected import Corrected
 from hilcal.calibration.dh_table import screw, twist_first
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -28,6 +33,40 @@ from hilcal.types import Floats
 
 UR_JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 FULL_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """An arm with what is constant of a calibration.
+
+    Attributes:
+        arm: the arm.
+        within: effects that it contains.
+        beyond: effects that it does not contain.
+    """
+
+    arm: Arm
+    within: tuple[str, ...]
+    beyond: tuple[str, ...]
+
+
+def corrected(calibration: Calibration) -> Corrected:
+    """Return the arm with the constant effects of a calibration in its transforms.
+
+    Raises:
+        CannotAnswerError: the calibration is of deflections, which do not show constant errors.
+        InputError: joints of the arm are coupled.
+    """
+    if calibration.mode == "deflection":
+        raise CannotAnswerError(
+            "a calibration of deflections knows nothing of the unloaded arm's geometry; fit "
+            "absolute readings: hilcal identify RUN --readings absolute"
+        )
+    arm = calibration.model.cell.arm
+    if arm.coupling is not None or arm.drive is not None:
+        raise InputError(f"{arm.name}: joints are coupled, which constant transforms cannot hold")
+    found = calibration.frames
+    return Corrected(replace(arm, links=found.links), found.within, found.beyond)
 
 
 def urdf(arm: Arm, note: str = "") -> str:

@@ -24,9 +24,8 @@ from hilcal.calibration.check_stored import (
     check_numbers,
     check_spread,
 )
-from hilcal.calibration.conditions import Condition
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Measured
+from hilcal.calibration.measured import Condition, Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.sensed import SensorMount
 from hilcal.cell import Cell, Observer

@@ -28,8 +28,7 @@ from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.command_line import COMMAND
 from hilcal.store.records import content_hash
-from hilcal.store.revision import STORED, RevisionRecord, to_text
-from hilcal.store.stored_priors import CARRIED
+from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
 from hilcal.types import Floats
 
 _LARGEST = 1e9

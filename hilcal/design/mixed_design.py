@@ -34,10 +34,9 @@ from hilcal.design.candidates import (
     reading_derivatives,
 )
 from hilcal.design.criterion import inverse
-from hilcal.design.information import DesignProblem
+from hilcal.design.information import DesignProblem, information_of
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
-from hilcal.design.prior_information import information_of
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD

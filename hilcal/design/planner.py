@@ -9,21 +9,21 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.candidates import reading_covariance
 from hilcal.design.choice import (
     EFFORT,
     Objective,
     canonical,
     choose,
     choose_poses,
+    compound_objective,
     costly_loads,
     only,
     promising,
 )
-from hilcal.design.compound_criteria import compound_objective
 from hilcal.design.draw import DrawnPoses, draw
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem, problem, readings_of
-from hilcal.design.noise_model import reading_covariance
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.optimum import Design
 from hilcal.design.predicted import PredictedUncertainty, predicted

@@ -11,8 +11,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import relax
 from hilcal.design.candidates import reading_derivatives
-from hilcal.design.choice import choose, choose_poses, only, unknown
-from hilcal.design.compound_criteria import compound_objective
+from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
 from hilcal.design.confounding import Confounding
 from hilcal.design.information import DesignProblem
 from hilcal.design.planner import Planned, Say

@@ -21,10 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.bends import unit_rows
-from hilcal.discovery.composed import composed
-from hilcal.discovery.screen import LEAST_MOTION, SEEN
+from hilcal.discovery.amplitudes import Amplitude, Factor, composed
+from hilcal.discovery.screen import LEAST_MOTION, SEEN, unit_rows
 from hilcal.discovery.shapes import Shape
 from hilcal.types import Floats
 

@@ -14,8 +14,7 @@ from math import comb, log
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, different
-from hilcal.discovery.composed import Composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, different
 from hilcal.discovery.functions import FINEST, fine_waves, functions
 from hilcal.discovery.shapes import Numbers
 from hilcal.discovery.variables import Variable

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.composed import Composed, composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed
 from hilcal.discovery.law import (
     LETTERS,
     Coefficient,

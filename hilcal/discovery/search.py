@@ -11,8 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discovery.gains import SHORT_LIST
-from hilcal.discovery.problem import SearchProblem
+from hilcal.discovery.problem import SHORT_LIST, SearchProblem
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.terms import LawTerm, Scored
 from hilcal.regression.evidence import FamilyScore

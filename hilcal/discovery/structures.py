@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from hilcal.discovery.amplitudes import Factor
-from hilcal.discovery.composed import Composed
+from hilcal.discovery.amplitudes import Composed, Factor
 from hilcal.discovery.law import Coefficient, Form, coefficients, form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine

@@ -21,13 +21,13 @@ from hilcal.effects.protocol import (
     Response,
     Role,
     Situation,
+    source_of,
+    total,
 )
-from hilcal.effects.source import source_of
-from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
 from hilcal.names import escaped
 from hilcal.readings.readings import States
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import load_wrench_change, slot_wrenches
 from hilcal.types import Floats
 

@@ -8,11 +8,9 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import Compensation
-from hilcal.calibration.conditions import WORDS
+from hilcal.calibration.compensated import BAND, Compensation
 from hilcal.calibration.improvement import Improved, Improvement
-from hilcal.calibration.measured import Outside
-from hilcal.calibration.poses import BAND
+from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.acceptance import Acceptance

@@ -24,9 +24,16 @@ from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
 from hilcal.store.new_campaign import new_campaign
 from hilcal.store.records import Layout, content_hash, layout_of, read_layout
-from hilcal.store.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
+from hilcal.store.revision import (
+    RevisionRecord,
+    fitted_to,
+    from_text,
+    join,
+    split,
+    to_text,
+    utc_now,
+)
 from hilcal.store.robot_file import robot_file_of
-from hilcal.store.stored_priors import join, split
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"

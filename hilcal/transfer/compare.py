@@ -23,8 +23,7 @@ from hilcal.identification.registration import register
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted
-from hilcal.store.revision import RevisionRecord
-from hilcal.store.stored_priors import CARRIED
+from hilcal.store.revision import CARRIED, RevisionRecord
 
 
 def compare(

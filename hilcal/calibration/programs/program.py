@@ -98,7 +98,7 @@ class Language:
         decimals: of a position in mm, of the orientation, of joint values; at least these.
         axes: (6, 3) directions of the axes of the maker's arms with spherical wrist, all joint
             values zero, in axes of the controller's base.
-        flags: (K, F) configuration at joint values (K, 6), by the `branch.shape` (K, 2) there.
+        flags: (K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there.
         of_shape: (F,) which of these the shape of the arm tells, and not the joint values alone.
         written: what stands at `ProgramPoint.config`, from the flags and the texts that are there.
         padded: whether numbers stand in columns.

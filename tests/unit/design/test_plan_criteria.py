@@ -7,10 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.design.compound_criteria import CompoundDeterminant, CompoundVariance
-from hilcal.design.criteria import A, D, MeanVariance
+from hilcal.design.choice import CompoundDeterminant, CompoundVariance
+from hilcal.design.criteria import A, D, E, K, MeanVariance
 from hilcal.design.criterion import Criterion, require_determined
-from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Floats

@@ -11,10 +11,9 @@ from hypothesis import strategies as st
 
 from hilcal.design.approximate_design import ApproximateDesign, relax
 from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.compound_criteria import CompoundDeterminant, CompoundVariance
-from hilcal.design.criteria import A, D, MeanVariance
+from hilcal.design.choice import CompoundDeterminant, CompoundVariance
+from hilcal.design.criteria import A, D, E, K, MeanVariance
 from hilcal.design.criterion import Criterion
-from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.optimum import best
 from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError

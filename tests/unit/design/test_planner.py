@@ -20,9 +20,8 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.measuring.dry_run import dry_run
 from hilcal.readings.covariance import WHOLE
-from hilcal.store.appended import with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
 from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints

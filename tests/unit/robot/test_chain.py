@@ -7,8 +7,7 @@ import pytest
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
-from hilcal.robot.chain import evaluate, joint_jacobian, slot_jacobian
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, slot_jacobian
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
