@@ -24,7 +24,7 @@ from xml.etree.ElementTree import Element, SubElement, indent, tostring
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.dh_table import screw, twist_first
+from hilcal.calibration.dh_table import twist_first
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
@@ -176,8 +176,8 @@ def ur_kinematics(
     turn, shift[-1] = twist_first(arm.links[-1])  # a turn about the last axis can be made before it
     lines = ["kinematics:"]
     for k, name in enumerate(UR_JOINTS):
-        before = np.eye(4) if k == 0 else _along(-shift[k - 1])
-        after = _along(shift[k]) if k < arm.n - 1 else screw(turn, shift[k])
+        before = np.eye(4) if k == 0 else se3.screw(2, 0.0, -shift[k - 1])
+        after = se3.screw(2, turn if k == arm.n - 1 else 0.0, shift[k])
         xyz, rpy = origin_of(before @ arm.links[k] @ after)
         lines.append(f"  {name}:")
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -185,7 +185,7 @@ def ur_kinematics(
     own = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
     lines.append(f"  hash: {digest or f'calib_{own}'}")
     comment = [f"# {escaped(line)}" for line in note.split("\n")]
-    return "\n".join([*comment, *lines]) + "\n", screw(-turn, -shift[-1]) @ arm.links[-1]
+    return "\n".join([*comment, *lines]) + "\n", se3.screw(2, -turn, -shift[-1]) @ arm.links[-1]
 
 
 def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | None) -> str:
@@ -229,12 +229,6 @@ def _millimetres(pose: Floats) -> list[float]:
     """Position in mm to 0.1 nm and rotation vector in rad, as a person types them."""
     values = se3.six(pose)
     return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
-
-
-def _along(z: float) -> Floats:
-    out = np.eye(4)
-    out[2, 3] = z
-    return out
 
 
 def origin_of(place: Floats) -> tuple[Floats, Floats]:

@@ -21,6 +21,7 @@ import pinocchio as pin
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm, missing
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
@@ -311,11 +312,5 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
         values[j, n] = m.offset
         if arm.slides[i] != arm.slides[j]:
             raise InputError(f"{said}, of which one slides and one turns; valid: two of a kind")
-        turn = np.eye(4)
-        if arm.slides[j]:
-            turn[2, 3] = m.offset
-        else:
-            c, s = math.cos(m.offset), math.sin(m.offset)
-            turn[:2, :2] = [[c, -s], [s, c]]
-        links[j] = links[j] @ turn
+        links[j] = links[j] @ se3.screw(2, *((0.0, m.offset) if arm.slides[j] else (m.offset,)))
     return replace(arm, links=links, coupling=turns, drive=turns, mimic=values)

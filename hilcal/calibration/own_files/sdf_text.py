@@ -111,8 +111,7 @@ class _Model:
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
             raise self._refused(pose, "a <pose> in degrees or quaternions; valid: x y z r p y, rad")
         v = self.document.numbers(pose, self.text(pose), 6)
-        turns = [se3.rotation(row) for row in np.diag(v[3:])]
-        return se3.matrix(turns[2] @ turns[1] @ turns[0], v[:3])
+        return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
     def axis(self, joint: Node) -> tuple[Node | None, str]:
         """`<xyz>` of a joint, and the frame that it is written in where that is not the joint's."""

@@ -123,7 +123,7 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
     origin = joint.first("origin")
     given = {} if origin is None else origin.attributes
     xyz, rpy = (_values(document, origin or joint, given.get(k, "0 0 0")) for k in ("xyz", "rpy"))
-    place = se3.matrix(_of_rpy(rpy), xyz)
+    place = se3.matrix(se3.of_rpy(rpy), xyz)
     turn = None
     if kind != _FIXED:
         node = axis or joint
@@ -151,12 +151,6 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
         return out
 
     return ChainPlace(name, joint.line, se3.inverse(place) if turned else place, turn, write)
-
-
-def _of_rpy(rpy: Floats) -> Floats:
-    """(3, 3) of fixed-axis roll, pitch, yaw."""
-    turns = [se3.rotation(row) for row in np.diag(rpy)]
-    return np.asarray(turns[2] @ turns[1] @ turns[0])
 
 
 def _values(document: Document, node: Node, text: str) -> Floats:

@@ -352,16 +352,10 @@ def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:
 
 def of_euler(values: Floats) -> Floats:
     """T (4, 4) of x, y, z in mm and turns about z, then y, then x in degrees: Rz(A) Ry(B) Rx(C)."""
-    with np.errstate(invalid="ignore"):  # what is not finite is refused by its line
-        (ca, cb, cc), (sa, sb, sc) = (f(np.radians(values[3:6])) for f in (np.cos, np.sin))
-    r = np.array(
-        [
-            [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],
-            [sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc],
-            [-sb, cb * sc, cb * cc],
-        ]
-    )
-    return se3.matrix(r, 1e-3 * np.asarray(values[:3], dtype=float))
+    if not np.isfinite(values).all():  # refused by its line
+        return np.full((4, 4), np.nan)
+    turn = se3.of_rpy(np.radians(values[5:2:-1]))
+    return se3.matrix(turn, 1e-3 * np.asarray(values[:3], dtype=float))
 
 
 def to_euler(t: Floats, near: Floats) -> Floats:

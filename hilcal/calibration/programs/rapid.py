@@ -76,17 +76,12 @@ def of_quaternion(values: Floats) -> Floats:
     q = np.asarray(values[3:7], dtype=float)
     with np.errstate(all="ignore"):  # what is not finite is refused by its line
         q = q / np.linalg.norm(q)
-    w, v = q[0], q[1:]
-    k = se3.skew(v)
-    return se3.matrix(np.eye(3) + 2 * w * k + 2 * k @ k, 1e-3 * np.asarray(values[:3], dtype=float))
+    return se3.matrix(se3.of_quaternion(q), 1e-3 * np.asarray(values[:3], dtype=float))
 
 
 def to_quaternion(t: Floats, near: Floats) -> Floats:
     """Inverse of `of_quaternion`, of the sign that was there."""
-    w = se3.rotation_vector(t[:3, :3])
-    angle = float(np.linalg.norm(w))
-    axis = w / angle if angle > 0 else w
-    q = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    q = se3.quaternion(t[:3, :3])
     return np.concatenate([1e3 * t[:3, 3], q if q @ near[3:7] >= 0 else -q])
 
 
