@@ -67,7 +67,6 @@ class Calibration(Brief):
     (True, (3, 6))
 
     Attributes:
-        model: the fitted model.
         theta: (P,) its parameters.
         mode: kind of readings that it was fitted to.
         root: (P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`.

@@ -40,7 +40,6 @@ class Corrected:
     """An arm with what is constant of a calibration.
 
     Attributes:
-        arm: the arm.
         within: effects that it contains.
         beyond: effects that it does not contain.
     """

@@ -72,7 +72,6 @@ class Points:
     """N points.
 
     Attributes:
-        names: of the points.
         q: (N, n) joint values, rad; rows of NaN where only a pose is given.
         wanted: (N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all.
         wrench: (N, 6) force and moment at the load point, base axes; None where none are given.

@@ -76,8 +76,6 @@ class Campaign(Brief):
 
     Attributes:
         file: the SQLite file, open for appending revisions.
-        config: the cell's configuration.
-        cell: the cell.
         readings: all readings, with the covariance of instrument, averaging and repeatability.
         catalogue: the effects that a model of it can have.
         changes: what is different in the cell from what it was told to be when the readings were

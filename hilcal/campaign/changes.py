@@ -28,10 +28,7 @@ class Changed:
 
     Attributes:
         before_number: number of the revision before.
-        before: its fit.
         number: of the new revision.
-        fit: of it.
-        diagnosis: of that fit.
         added: the effect that was added, with its options where a finer form took its place.
         removed: the effect that was taken out.
         expected: what the fit before promised of an effect that was added, and what was kept of it;

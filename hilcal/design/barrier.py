@@ -136,7 +136,6 @@ class Optimum:
         smooth: f there, with the matrices of the bound.
         value: φ.
         bound: of φ over these units.
-        order: of the surrogate.
     """
 
     weight: Floats

@@ -62,7 +62,6 @@ class ReadingDerivatives:
     """What would be read of a chunk of N poses under 1 + L loads.
 
     Attributes:
-        rows: which poses.
         jacobian: (N, 1 + L, m, P) derivative by the parameters, in their scales; m are the elements
             of all targets that are read in one arrival.
         covariance: (N, 1 + L, m, m) of them.

@@ -44,7 +44,6 @@ class GoalRule:
     Fits take at most a tenth of the time (`SHARE`), so that none delays the campaign.
 
     Attributes:
-        goal: the goal.
         status: that of the last fit.
     """
 

@@ -95,11 +95,9 @@ class DesignProblem:
     Attributes:
         nominal: the model that is planned for.
         mode: "deflection" or "absolute".
-        candidates: the states.
         units: K units; their parameters are those of the model, then potential terms.
         what: pose and loads of each unit; "none" is the unloaded reading of absolute positions,
             that of deflections goes without saying.
-        terms: the P parameters.
         families: effects of the potential terms.
         prior: (P, P) what is known before: priors, and what was measured already.
         measured: (P, P) the part of it that was measured already.

@@ -63,7 +63,6 @@ class Next:
     """The measurements that separate suspects.
 
     Attributes:
-        planned: the plan.
         powers: of each pair, both ways round.
         shares: by load, the share of what separates the weakest pair.
         reach_ratio: horizontal reach of the target, averaged over the planned poses by how much

@@ -29,7 +29,6 @@ class Design:
         bound: φ of no plan within the budget exceeds it.
         information: (P, P) of it, with what was known before.
         cost: Σ n_k c_k.
-        relaxed: the continuous optimum.
     """
 
     counts: Ints

@@ -80,13 +80,9 @@ class Planned:
         ordered: the plan in order, with what the order costs.
         design: the units that were chosen, with the certificate.
         costly: loads that cost more than they tell, with what leaving each out would gain.
-        problem: the design problem.
         asked: the design problem with its criterion.
         usable: (K,) which units were to choose from.
-        work: the prediction poses.
-        drawn: the candidates.
         budget: readings of the design.
-        criterion: name of the criterion.
         predicted: standard uncertainties that a fit to the readings will have.
         undetermined: parameters of the model that no reading of the cell determines.
         asked_poses: poses that were asked for, see `Request`; None where readings were.

@@ -21,7 +21,6 @@ class PredictedUncertainty:
 
     Attributes:
         names: of the model's live parameters, as identification prints them.
-        units: their units.
         values: at which they are assumed, SI.
         std: with the model complete, SI; infinite where not identifiable.
         std_open: with the potential terms, SI.

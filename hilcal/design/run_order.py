@@ -39,7 +39,6 @@ class PlannedStop:
 
     Attributes:
         pose: index from 1; 0 is the reference.
-        cycle: its cycle.
     """
 
     pose: int
@@ -51,7 +50,6 @@ class LoadBlock:
     """What is measured while one load hangs.
 
     Attributes:
-        load: its name.
         loops: stops of each loop from the reference.
         seconds: what the loops take, s.
     """
@@ -92,7 +90,6 @@ class Chosen:
     """Readings to take at a pose.
 
     Attributes:
-        pose: its name.
         loads: under which loads, "none" among them where it is measured unloaded.
         count: how often all of it; each time is a cycle of its own.
     """
@@ -136,9 +133,7 @@ class Ordered:
 
     Attributes:
         plan: the plan; `about` holds these figures too.
-        duration: of the plan.
         shortest: of the shortest order with the same readings.
-        confounding: of the plan.
         confounding_shortest: of the shortest order.
     """
 
@@ -279,12 +274,9 @@ class OrderDraws:
     """Plans of the same readings in different orders: short ones and random ones.
 
     Attributes:
-        cell: the cell.
         config: its loads, motion and acquisition.
         names: (P) names of the poses that are measured.
         q: (P + 1, n) joint angles of the reference and of these, rad.
-        how: settings.
-        rng: generator.
         stops: by load.
         ways: between the stops under each load.
         short: shortest order of the stops under each load, counted from 1.

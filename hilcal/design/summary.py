@@ -46,7 +46,6 @@ class DetectableEffect:
     """Minimum detectable strength of an effect outside of the model.
 
     Attributes:
-        effect: its name.
         least_m: rms displacement of the target, m, whose whitened residual after fitting the
             model is one sigma; None where the model absorbs the effect.
     """
@@ -80,7 +79,6 @@ class CriterionResult:
     the parameters in ordinary magnitudes with the singular values σ.
 
     Attributes:
-        criterion: its name.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
         position_open_m: the same with all potential terms estimated as well.
         joint_share: largest relative standard uncertainty of a joint compliance; None without.
@@ -124,8 +122,6 @@ class PlanSummary:
         poses: number of poses beside the reference.
         readings: of all, those at the reference included.
         loads: readings by load, "none" among them, in the order in which they are hung.
-        duration: of the campaign.
-        criterion: name of the criterion.
         efficiency: certified lower bound of the efficiency; None without a certificate.
         parameters: predicted precision by parameter.
         position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None

@@ -47,7 +47,6 @@ class Duration:
     """Seconds of a campaign.
 
     Attributes:
-        motion: of the arm.
         readings: at rest.
         load_changes: by hand.
     """

@@ -47,15 +47,12 @@ class Grammar:
     """All amplitudes that are tried, and their values.
 
     Attributes:
-        known: the quantities.
-        amplitudes: the products.
         values: (F, N) their values, single precision, each with root mean square 1.
         size: (F,) what they were divided by.
         cost: (F,) complexities.
         partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
         less: (2, F) the amplitude without the first and without the second factor of a product of
             two; −1 for no product.
-        situation: of the readings.
         singles: the functions of one quantity from which products are made.
     """
 

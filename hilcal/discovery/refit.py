@@ -142,7 +142,6 @@ class FreeNumber:
         places: (part, factor) of each function that has it.
         index: of it among the function's numbers, or among the weights of its quantity.
         weight: whether it is a weight.
-        begin: its value.
         scale: one unit of its change; 0 where it changes by factors instead, eˣ.
         least: value that it has at least.
     """

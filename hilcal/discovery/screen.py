@@ -51,7 +51,6 @@ class Bends:
     Attributes:
         argument: (C,) index of the product in the grammar.
         shape: function of each.
-        numbers: of it.
         values: (C, K) at the readings of the screening, with root mean square 1.
         square: (S, C) xᵀ M x; zero where a site does not take it.
         across_one: (S, C) xᵀ M x' with a constant at the site.

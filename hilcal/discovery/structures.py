@@ -57,7 +57,6 @@ class Structure:
 
     Attributes:
         kind: sites and functions; see `structure_of`.
-        form: the law.
         probability: posterior, of all that were met.
         holdout_share: share of the misfit that it explains on poses left out, by algebra.
         step: (P,) posterior mean of its coefficients, in ordinary motions.

@@ -55,8 +55,6 @@ class Situation:
     """N states at their deflected configuration: everything that a law may depend on.
 
     Attributes:
-        cell: arm, tool and target.
-        states: the N states.
         angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
             recorded; those of the drives where joints are coupled, and the phase of its travel
             where a joint slides (`Arm.phases`).

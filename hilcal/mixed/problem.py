@@ -27,7 +27,6 @@ class Noise:
     """One component of the noise: covariance exp(2 η) R_k.
 
     Attributes:
-        name: of it.
         variance: (R,) diagonal of R_k.
         prior: what is known of η.
     """

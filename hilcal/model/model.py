@@ -77,7 +77,6 @@ class Model(Brief):
     """Robot and effects.
 
     Attributes:
-        cell: the cell.
         effects: its effects, each of another name.
         catalogue: the effects that it could have.
         readings: those that effects are set up for when they are added by name; None where the

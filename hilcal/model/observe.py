@@ -170,12 +170,6 @@ class ReadingDerivative:
     (see `equilibrium`).
 
     Attributes:
-        cell: arm and target.
-        observation: the reading.
-        chain: the deviated chain.
-        deviation: the deviation.
-        m: number of rows.
-        frames: of the slots.
         dq: (N, m, n) derivative by displacements of the chain's joints.
         yielding: derivative by motions of the chain of what the arm yields to them.
     """
@@ -288,7 +282,6 @@ class SlotFrames:
     J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
 
     Attributes:
-        chain: the deviated chain.
         known: R J and R Q (None for zero) of the slots that were asked for.
     """
 

@@ -94,7 +94,6 @@ class Addition:
 
     Attributes:
         name: the family with most evidence.
-        score: its score.
         scores: of all families that can be added.
         before: the families beside the model without it.
     """

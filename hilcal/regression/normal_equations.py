@@ -163,7 +163,6 @@ class NormalEquations:
     """H z = b in the coordinates of a basis, H = gram + β·diag(prior precision).
 
     Attributes:
-        basis: the coordinates.
         gram: (K, K) Tᵀ AᵀA T.
         rhs: (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior.
     """

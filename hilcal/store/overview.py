@@ -25,7 +25,6 @@ class MeasuringDevice:
 
     Attributes:
         part: of the cell, e.g. "tracker".
-        driver: name of its driver.
         name: as it told it.
         serial: its serial number; None where it told none.
         facts: what else it told, by name.
@@ -79,20 +78,17 @@ class Overview:
         program_version: of the program that made it.
         source: where the readings come from.
         command: that made the file, as it was typed; empty where it is not kept.
-        config: the cell's configuration.
         readings: all of them, with the covariances as stored; None before the first.
         loads: number of readings by load.
         targets: number of readings by target, where there are several.
         planned: number of planned steps; None for an imported campaign.
         measured: of them those that were measured.
-        plans: number of plans.
         instruments: that were connected, each once.
         tares: of the force sensor, in order.
         returns: to the reference pose, in order.
         tool: as the force sensor found it last: mass_kg, com_m, ...; None where it did not.
         repeatability: as the last session found it; None where it did not.
         events: all that happened, in order: "kind", "utc" and more.
-        revisions: all, in order.
         accepted: number of the accepted revision, if any.
         in_use: number of the revision that commands use, if there is any.
     """

@@ -29,7 +29,6 @@ class Step:
     """One reading to take; (pose, load, cycle) names it in the whole campaign.
 
     Attributes:
-        pose: name of the pose.
         load: name of the load, "none" for unloaded.
         cycle: readings of one pose and one cycle share their unloaded reading.
     """

@@ -47,7 +47,6 @@ class FactoryCheck(Shown):
         factory_m: rms misfit of the positions with the factory's kinematics alone, m.
         nominal_m: the same with the maker's nominal ones.
         noise_m: rms of the noise that is stated for the readings, m.
-        readings: their number.
     """
 
     changed: bool

@@ -34,7 +34,6 @@ class Entry:
     """A campaign file, and what the list beside it says.
 
     Attributes:
-        path: the file.
         name: its path within the directory.
         arm: which arm; empty where that is not stated.
         date: when it was measured, ISO 8601; empty where that is not stated.
@@ -52,13 +51,11 @@ class Member:
 
     Attributes:
         name: its path within the directory.
-        arm: which arm.
         known: how that is known: "list", "serial number", "folder" or "file".
         type: name of the arm's type.
         date: when it was measured, ISO 8601.
         posterior: of the arm's parameters.
         added: effects of the arm that the diagnosis added to the baseline.
-        verdict: of the model.
         rms_m: 3-D position error on poses left out.
     """
 

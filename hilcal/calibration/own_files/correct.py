@@ -29,7 +29,6 @@ class Correction:
     """A file with another arm in it.
 
     Attributes:
-        content: the whole file.
         said: what was changed, and what the file has no place for.
     """
 

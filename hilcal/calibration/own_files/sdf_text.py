@@ -30,8 +30,6 @@ class SdfChain:
 
     Attributes:
         steps: from the base link to the tip link; their `write` is that of `edits`.
-        document: the file.
-        joints: of the steps.
     """
 
     steps: list[ChainPlace]

@@ -53,7 +53,6 @@ class UnderstoodProgram:
 
     Attributes:
         program: the program; what is not understood of it is left.
-        arm: the nominal one.
         q: (N, 6) joint values at which it is at them, rad.
         tool: (4, 4) T_flange_tool that errors are stated for.
         said: what is to be said of their branches.

@@ -92,7 +92,6 @@ class Language:
     """How a maker writes points.
 
     Attributes:
-        name: of the language.
         pose: T (4, 4) of the numbers of a pose.
         numbers: the numbers of T (4, 4), near to those that were there.
         decimals: of a position in mm, of the orientation, of joint values; at least these.
@@ -120,11 +119,8 @@ class Program:
     """A program.
 
     Attributes:
-        language: its language.
-        suffixes: of its files.
         texts: of its files, as they are.
         points: in the order of their first use.
-        encoding: of the files.
     """
 
     language: Language

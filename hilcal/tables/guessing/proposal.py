@@ -32,7 +32,6 @@ class UnderstoodColumn:
 
     Attributes:
         what: section of the mapping.
-        columns: names of its columns.
         meaning: unit and convention.
         example: the cells of the first reading.
     """

@@ -34,7 +34,6 @@ class Sniffed:
 
     Attributes:
         how: keys of [file] that differ from a plain CSV file.
-        grid: the table.
         doubts: sentences on what is unsure.
     """
 
