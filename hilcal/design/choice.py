@@ -62,6 +62,15 @@ class Objective:
     names: tuple[str, ...]
     apart: DiscriminatedPairs | None = None
 
+    def relaxed(
+        self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None
+    ) -> ApproximateDesign:
+        """Return the continuous optimum of so many readings; see `approximate_design.relax`."""
+        return relax(
+            self.units, self.criterion, budget, self.prior, names=self.names,
+            tolerance=tolerance, start=start,
+        )  # fmt: skip
+
 
 def canonical(name: str) -> str:
     """Return the name of a criterion: I-optimality was called "test" before."""
@@ -168,9 +177,7 @@ def choose_poses(
     for mine, count in zip(members, found.counts.tolist(), strict=True):
         counts[mine] = count
     cost = float(counts @ free.units.cost)
-    relaxed = relax(
-        free.units, asked.criterion, cost, asked.prior, names=asked.names, tolerance=LOOSE
-    )
+    relaxed = free.relaxed(cost)
     bound = max(relaxed.bound, found.value)
     return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
 
@@ -178,9 +185,7 @@ def choose_poses(
 def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units that a plan is likely to be made of, those of the best prices, and why."""
     tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
-    found = relax(
-        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=tolerance
-    )
+    found = asked.relaxed(budget, tolerance)
     count = min(2 * len(found.index), len(asked.units))
     best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
     return np.union1d(found.index, best_first[:count]), found
@@ -233,12 +238,9 @@ def _value(
     allowed = {*loads, problem.candidates.loads[0]}
     some = only(asked, sample & np.array([set(names) <= allowed for _, names in problem.what]))
     try:
-        found = relax(
-            some.units, some.criterion, budget, some.prior, names=some.names, tolerance=LOOSE
-        )
+        return some.relaxed(budget).value
     except (CannotAnswerError, InputError):
         return 0.0
-    return float(found.value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,13 +314,5 @@ def compound_objective(
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
     units = CandidateSet(some.units.rows[:, :, :size], some.units.cost)
     alone = Objective(own, units, asked.prior[:size, :size], asked.names[:size])
-    a, b = (_best(q, budget) / 2.0 for q in (replace(some, criterion=whole), alone))
+    a, b = (q.relaxed(budget).value / 2.0 for q in (replace(some, criterion=whole), alone))
     return replace(asked, criterion=CompoundVariance(c, size, a, b, name))
-
-
-def _best(asked: Objective, budget: float) -> float:
-    """φ of the continuous optimum."""
-    found = relax(
-        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=LOOSE
-    )
-    return float(found.value)

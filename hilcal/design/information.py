@@ -9,7 +9,7 @@ DuMouchel and Jones, *A simple Bayesian modification of D-optimal designs to red
 on an assumed model*, Technometrics 36 (1994) 37-47.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -165,9 +165,9 @@ def problem(
     scale = np.array([t.scale for t in terms])
     layout = _layout(of, mode, nominal.elements, len(terms))
     rows = np.zeros((len(layout.what), layout.height, len(terms)))
-    for part in reading_derivatives(nominal, config, of, against.effects, scale):
-        for place, block in _blocks(part, layout, mode):
-            rows[place, : block.shape[1]] = block
+    parts = reading_derivatives(nominal, config, of, against.effects, scale)
+    for place, block in unit_rows(parts, of.loads, layout.what, mode):
+        rows[place, : block.shape[1]] = block
     measured = information_of(nominal, against.effects, scale)
     count = len(nominal.live)
     precision = np.ones(len(terms))
@@ -202,18 +202,8 @@ def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Where the units lie: pose by pose, those of one pose in the order of `subsets`.
+    """The units pose by pose; `height` is that of the one with most rows."""
 
-    Attributes:
-        first: (N,) index of a pose's first unit.
-        pattern: (N,) index into `subsets`.
-        subsets: per pattern, the loads of each unit, as indices from 0.
-        height: most rows of a unit.
-    """
-
-    first: Ints
-    pattern: Ints
-    subsets: tuple[tuple[tuple[int, ...], ...], ...]
     height: int
     what: tuple[tuple[int, tuple[str, ...]], ...]
     cost: Floats
@@ -247,14 +237,13 @@ def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
             "no candidate pose may be taken"
             + (" both unloaded and under a load" if mode == "deflection" else "")
         )
-    per_pose = np.array([len(some) for some in subsets])[pattern]
     of_pose = [subsets[k] for k in pattern]
     what = tuple(
         (pose, tuple(of.loads[k] for k in s)) for pose, some in enumerate(of_pose) for s in some
     )
     unloaded = 1.0 if mode == "deflection" else 0.0
     cost = np.array([len(loads) + unloaded for _, loads in what])
-    return _Layout(np.cumsum(per_pose) - per_pose, pattern, subsets, height, what, cost, notes)
+    return _Layout(height, what, cost, notes)
 
 
 def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, ...]]:
@@ -273,17 +262,35 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
         yield tuple(loads)
 
 
-def _blocks(part: ReadingDerivatives, layout: _Layout, mode: Mode) -> Iterator[tuple[Ints, Floats]]:
-    """Yield units of a chunk of poses and their rows."""
-    pattern, first = layout.pattern[part.rows], layout.first[part.rows]
-    single = absolute_rows(part) if mode == "absolute" else np.empty(0)
-    for p in np.unique(pattern):
-        mine = np.flatnonzero(pattern == p)
-        for k, loads in enumerate(layout.subsets[p]):
+def unit_rows(
+    parts: Iterable[ReadingDerivatives],
+    loads: tuple[str, ...],
+    what: Sequence[tuple[int, tuple[str, ...]]],
+    mode: Mode,
+    step: int = 1,
+) -> Iterator[tuple[Ints, Floats]]:
+    """Yield indices of units and their whitened rows (k, R, P), some poses at a time.
+
+    Args:
+        parts: of every `step`-th candidate pose.
+        loads: names of all loads, "none" first.
+        what: pose and loads of each unit.
+    """
+    several: dict[tuple[str, ...], list[int]] = {}
+    for k, (pose, names) in enumerate(what):
+        if pose % step == 0:
+            several.setdefault(names, []).append(k)
+    pose_of = np.array([pose // step for pose, _ in what])
+    for part in parts:
+        single = absolute_rows(part) if mode == "absolute" else np.empty(0)
+        for names, members in several.items():
+            mine, which = np.array(members), tuple(loads.index(name) for name in names)
+            mine = mine[(pose_of[mine] >= part.rows.start) & (pose_of[mine] < part.rows.stop)]
+            at = pose_of[mine] - part.rows.start
             if mode == "absolute":
-                yield first[mine] + k, single[mine, loads[0]]
+                yield mine, single[at, which[0]]
             else:
-                yield first[mine] + k, deflection_rows(part, mine, loads)
+                yield mine, deflection_rows(part, at, which)
 
 
 def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...]:

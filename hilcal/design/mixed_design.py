@@ -29,12 +29,10 @@ from hilcal.design.bound import total_information
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.candidates import (
     Candidates,
-    absolute_rows,
-    deflection_rows,
     reading_derivatives,
 )
 from hilcal.design.criterion import inverse
-from hilcal.design.information import DesignProblem, information_of
+from hilcal.design.information import DesignProblem, information_of, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
 from hilcal.effects.catalogue import Catalogue
@@ -168,25 +166,9 @@ class _AllColumns:
 
     def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
         """Yield units and their whitened rows (k, R, P), of every `step`-th candidate pose."""
-        of = self.of
-        pose = np.array([p for p, _ in of.what]) / step
-        loads = np.array([of.candidates.loads.index(names[0]) for _, names in of.what])
-        several: dict[tuple[str, ...], list[int]] = {}
-        for k, (p, names) in enumerate(of.what):
-            if p % step == 0:
-                several.setdefault(names, []).append(k)
-        some = candidates[slice(None, None, step)]
-        for part in reading_derivatives(of.nominal, self.config, some, self.more, self.scale):
-            single = absolute_rows(part) if of.mode == "absolute" else np.empty(0)
-            for names, members in several.items():
-                mine = np.array(members)
-                mine = mine[(pose[mine] >= part.rows.start) & (pose[mine] < part.rows.stop)]
-                at = pose[mine].astype(np.int64) - part.rows.start
-                if of.mode == "absolute":
-                    yield mine, single[at, loads[mine]]
-                else:
-                    which = tuple(of.candidates.loads.index(name) for name in names)
-                    yield mine, deflection_rows(part, at, which)
+        of, some = self.of, candidates[slice(None, None, step)]
+        parts = reading_derivatives(of.nominal, self.config, some, self.more, self.scale)
+        yield from unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

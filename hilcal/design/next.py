@@ -18,9 +18,9 @@ from hilcal.design.discriminated_pairs import (
 )
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem, readings_of
-from hilcal.design.planner import Planned, Request, Say, make
+from hilcal.design.planner import Planned, Request, Say, make, ordered
 from hilcal.design.predicted import predicted
-from hilcal.design.run_order import Chosen, Ordering, order_plan
+from hilcal.design.run_order import Ordering
 from hilcal.design.t_optimality import Pair
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
@@ -219,18 +219,7 @@ def reordered(
         counts: (K,) how often each unit is taken.
         reference: (n,) joints of the reference pose, from which all units are reached, rad.
     """
-    of, usable, taken = made.problem, np.flatnonzero(made.usable), np.flatnonzero(counts)
-    poses = sorted({of.what[k][0] for k in taken})
-    names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
-    chosen = [
-        Chosen(names[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k]))
-        for k in taken
-    ]
-    ordered = order_plan(
-        space.cell, space.config, list(names.values()), of.candidates.q[poses], reference, chosen,
-        space.passable, rng, how,
-    )  # fmt: skip
-    asked = made.asked
+    of, usable, asked = made.problem, np.flatnonzero(made.usable), made.asked
     information = asked.prior + asked.units.information(counts.astype(float))
     design = replace(
         made.design,
@@ -240,7 +229,8 @@ def reordered(
         cost=float(counts @ of.units.cost),
     )
     knows = predicted(of, counts.astype(float), work=made.work)
-    return replace(made, ordered=ordered, design=design, predicted=knows)
+    order = ordered(space, of, reference, counts, rng, how)
+    return replace(made, ordered=order, design=design, predicted=knows)
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:

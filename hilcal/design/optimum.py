@@ -131,7 +131,6 @@ def exact(
     *,
     most: int | None = None,
     effort: int | None = None,
-    enough: float | None = None,
 ) -> Ints:
     """Return (K,) whole numbers n of units with Σ n_k c_k ≤ B that nearly maximise φ.
 
@@ -147,13 +146,11 @@ def exact(
         prior: (P, P) what is known before, and units that are in any case in the plan.
         most: how often a unit may be taken; any number of times by default.
         effort: units put into a plan before the search ends; `EFFORT` by default.
-        enough: share of the bound at which it ends earlier; `ENOUGH` by default.
     """
     prior = checked(units, budget, prior, most)
     if effort is None:
         effort = KINKED_EFFORT if criterion.kinked else EFFORT
-    if enough is None:
-        enough = KINKED_ENOUGH if criterion.kinked else ENOUGH
+    enough = KINKED_ENOUGH if criterion.kinked else ENOUGH
     search = _search(units, criterion, budget, prior, relaxed, most)
     floor = np.floor(search.ideal_weight + 1e-6).astype(np.int64)
     plan = search.refilled(np.minimum(floor, search.most))

@@ -196,10 +196,12 @@ def make(
     say("ordering the readings")
     counts = np.zeros(len(usable), dtype=np.int64)
     counts[np.flatnonzero(usable)] = design.counts
-    ordered = _ordered(space, of, home, counts, rng, request.unloaded)
+    repeats = max(2, (visited - 1) // 10)
+    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    order = ordered(space, of, home, counts, rng, how)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
-        ordered, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
+        order, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
         undetermined, request.poses if whole else None,
     )  # fmt: skip
 
@@ -257,23 +259,26 @@ def _unreachable(space: Space, of: DesignProblem, home: Floats, units: Ints) -> 
     return np.array(sorted(lost), dtype=np.int64)
 
 
-def _ordered(
+def ordered(
     space: Space,
     of: DesignProblem,
     home: Floats,
     counts: Ints,
     rng: np.random.Generator,
-    unloaded: Literal["around", "first"],
+    how: Ordering,
 ) -> Ordered:
-    """Name the chosen poses, and put their readings in order."""
+    """Name the poses of the chosen units p1, p2, ..., and put their readings in order.
+
+    Args:
+        home: (n,) joints of the reference pose, from which all units are reached, rad.
+        counts: (K,) how often each unit is taken.
+    """
     taken = np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})
     name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
     chosen = [
         Chosen(name[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k])) for k in taken
     ]
-    repeats = max(2, len(poses) // 10)
-    how = Ordering(unloaded=unloaded, repeats=repeats, reading_std=_reading_std(space, of))
     q = of.candidates.q[poses]
     return order_plan(
         space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how

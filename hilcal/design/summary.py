@@ -9,7 +9,6 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.approximate_design import relax
 from hilcal.design.candidates import reading_derivatives
 from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
 from hilcal.design.confounding import Confounding
@@ -30,8 +29,6 @@ SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""
 WORTH = 0.9
 """Efficiency of a plan below which it is said what another one would give; a choice."""
-LOOSE = 3e-3
-"""Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -385,10 +382,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         if budget < asked.units.cost.max() or poses == before:
             continue
         before = poses
-        last = relax(
-            asked.units, asked.criterion, budget, asked.prior, names=asked.names,
-            tolerance=LOOSE, start=last,
-        )  # fmt: skip
+        last = asked.relaxed(budget, start=last)
         whole = of.prior + of.units.information(last.weight, usable[last.index])
         position = _finite(predicted(of, information=whole, work=planned.work).position)
         if position is not None:

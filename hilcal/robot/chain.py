@@ -189,12 +189,6 @@ def drive_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
     return out if arm.drive is None else np.asarray(out @ arm.drive)
 
 
-def slot_jacobian(chain: Chain, slot: int, x: Floats) -> Floats:
-    """Motion (N, 6, 6) of a flange-fixed point at x (N, 3) per change of the twist of a slot."""
-    twist = None if chain.twist is None else chain.twist[slot]
-    return twist_jacobian(chain.rotation[slot], x - chain.position[slot], twist)
-
-
 def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
     """Motion (N, 6, 6) of a point carried by a frame, per change of the frame's twist.
 
