@@ -18,7 +18,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criteria import A, D, Determinant, E, InverseVariance, K, MeanVariance
+from hilcal.design.criteria import D, E, K, MeanVariance
 from hilcal.design.criterion import Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.information import DesignProblem
@@ -96,7 +96,7 @@ def objective_of(
     if name == "D":
         return whole
     if name == "A":
-        return replace(whole, criterion=A(np.arange(size)))
+        return replace(whole, criterion=MeanVariance(_mean_of(size, len(names)), "A"))
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
@@ -243,43 +243,9 @@ def _value(
         return 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class CompoundDeterminant(Determinant):
-    """φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s), a compound D-criterion.
-
-    Attributes:
-        size: s, of the model, whose parameters come first.
-    """
-
-    size: int
-    name = "D"
-
-    def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return half of the weight each on all and on the model's parameters."""
-        return (0.5 / size, np.arange(size)), (0.5 / self.size, np.arange(self.size))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CompoundVariance(InverseVariance):
-    """φ(M) = 1 / (a tr(C M⁻¹) + b tr(C_ss M_ss⁻¹)).
-
-    Attributes:
-        c: (P, P) C, of all parameters.
-        size: s, of the model, whose parameters come first.
-        a: weight of the belief that all parameters are unknown, over 0.
-        b: weight of the belief that the model is complete, over 0.
-        name: name by which a configuration calls it.
-    """
-
-    c: Floats
-    size: int
-    a: float
-    b: float
-    name: str = "A"
-
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return a C and b C_ss."""
-        return self.a * self.c, self.b * self.c[: self.size, : self.size]
+def _mean_of(size: int, every: int) -> Floats:
+    """(P, P) C of the mean variance of the first s parameters."""
+    return np.diag(np.where(np.arange(every) < size, 1.0 / size, 0.0))
 
 
 def compound_objective(
@@ -307,12 +273,12 @@ def compound_objective(
     if size == len(problem.terms) or name not in ("A", "D"):
         return asked
     if name == "D":
-        return replace(asked, criterion=CompoundDeterminant(size))
-    c = np.diag(np.where(np.arange(len(problem.terms)) < size, 1.0 / size, 0.0))
+        return replace(asked, criterion=D(size))
+    c = _mean_of(size, len(problem.terms))
     whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
     units = CandidateSet(some.units.rows[:, :, :size], some.units.cost)
     alone = Objective(own, units, asked.prior[:size, :size], asked.names[:size])
     a, b = (q.relaxed(budget).value / 2.0 for q in (replace(some, criterion=whole), alone))
-    return replace(asked, criterion=CompoundVariance(c, size, a, b, name))
+    return replace(asked, criterion=MeanVariance(a * c, name, b * c[:size, :size]))

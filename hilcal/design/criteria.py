@@ -31,12 +31,25 @@ class SmoothCriterion(Criterion):
         """Return f = log φ; None where M is singular."""
 
 
-class Determinant(SmoothCriterion):
-    """φ(M) = Π det(M_bb)^c over weighted blocks b of parameters."""
+@dataclass(frozen=True, slots=True)
+class D(SmoothCriterion):
+    """φ(M) = det(M)^(1/P), the inverse volume of the confidence ellipsoid.
 
-    @abstractmethod
+    Fedorov (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics
+    Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
+
+    Attributes:
+        model: s of a model whose parameters come first; None where all are taken for unknown.
+    """
+
+    model: int | None = None
+    name = "D"
+
     def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return exponents c and indices b, for M of this size."""
+        """Return exponents and indices of the determinants, for M of this size."""
+        if self.model is None:
+            return ((1.0 / size, np.arange(size)),)
+        return (0.5 / size, np.arange(size)), (0.5 / self.model, np.arange(self.model))
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -45,7 +58,7 @@ class Determinant(SmoothCriterion):
         for c, at in self.blocks(m.shape[-1]):
             factor, regular = factors(flat[:, at[:, None], at])
             log += 2.0 * c * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-            good &= regular | (c < 0.0)
+            good &= regular
         found = np.where(good, np.exp(np.where(good, log, 0.0)), 0.0)
         return np.asarray(found.reshape(m.shape[:-2]))
 
@@ -66,42 +79,44 @@ class Determinant(SmoothCriterion):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class D(Determinant):
-    """φ(M) = det(S)^(1/s), the inverse volume of the confidence ellipsoid.
+class MeanVariance(SmoothCriterion):
+    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: A- and I-optimality.
 
-    S is M, or with parameters of interest the Schur complement of the others (D_s). Fedorov
-    (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics Research
-    10(6).
+    With C = 1/s at s parameters it is their mean variance: O5 of Sun & Hollerbach (2008), IEEE
+    ICRA, "Observability index selection for robot calibration". With C the mean of VᵀV over
+    prediction poses, V the Jacobian of the position there, it is that of the predicted position:
+    Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
+    model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
 
     Attributes:
-        interest: indices of the s parameters of interest; all by default.
+        c: (P, P) C, positive semidefinite.
+        name: name by which a configuration calls it.
+        model: (s, s) C_s of a model whose parameters come first; None where all are unknown.
     """
 
-    interest: Ints | None = None
-    name = "D"
+    c: Floats
+    name: str = "I"
+    model: Floats | None = None
 
-    def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return M, and by Schur's formula det S = det M / det M_nn the nuisance n."""
-        every = np.arange(size)
-        if self.interest is None:
-            return ((1.0 / size, every),)
-        chosen = _interest(self.interest, size)
-        rest, share = np.setdiff1d(every, chosen), 1.0 / len(chosen)
-        return ((share, every), (-share, rest)) if len(rest) else ((share, every),)
+    def __post_init__(self) -> None:
+        """Refuse a matrix that is no mean of squares."""
+        c = square(self.c, "the matrix of the prediction poses")
+        scale = float(np.trace(c))
+        if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
+            raise InputError(
+                "the matrix of the prediction poses is not positive semidefinite, or zero"
+            )
 
-
-class InverseVariance(SmoothCriterion):
-    """φ(M) = 1 / q with q = Σ tr(C M_bb⁻¹), b the first len(C) parameters."""
-
-    @abstractmethod
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return the matrices C (b, b), for M of this size."""
+    @property
+    def parts(self) -> tuple[Floats, ...]:
+        """The matrices C (b, b) of M_bb⁻¹, b the first parameters."""
+        return (self.c,) if self.model is None else (self.c, self.model)
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices; 0 where singular."""
         flat = m.reshape(-1, *m.shape[-2:])
         q, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
-        for c in self.parts(m.shape[-1]):
+        for c in self.parts:
             factor, regular = factors(flat[:, : len(c), : len(c)])
             found = np.linalg.inv(factor)
             q += np.einsum("nij,nij->n", found @ c, found)
@@ -113,7 +128,7 @@ class InverseVariance(SmoothCriterion):
         """Return f = −log q with gradient Σ M_bb⁻¹ C M_bb⁻¹ / q."""
         found: list[tuple[Floats, Floats]] = []
         q = 0.0
-        for c in self.parts(len(m)):
+        for c in self.parts:
             b = len(c)
             root = inverse(m[:b, :b])
             if root is None:
@@ -128,70 +143,6 @@ class InverseVariance(SmoothCriterion):
         gradient = sum((inner for inner, _ in found), np.zeros_like(m)) / q
         products = tuple((-2.0 / q, inner, inverted) for inner, inverted in found)
         return Smooth(-float(np.log(q)), gradient, products, ((1.0, gradient),), gradient / q)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MeanVariance(InverseVariance):
-    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: I-optimality.
-
-    With C the mean of VᵀV over prediction poses, V the Jacobian of the position there, tr(C M⁻¹)
-    is the mean variance of the predicted position. Atkinson, Donev and Tobias, *Optimum
-    Experimental Designs, with SAS* (2007), chapter 10.
-
-    Attributes:
-        c: (P, P) positive semidefinite.
-        name: name by which a configuration calls it.
-    """
-
-    c: Floats
-    name: str = "I"
-
-    def __post_init__(self) -> None:
-        """Refuse a matrix that is no mean of squares."""
-        c = square(self.c, "the matrix of the prediction poses")
-        scale = float(np.trace(c))
-        if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
-            raise InputError(
-                "the matrix of the prediction poses is not positive semidefinite, or zero"
-            )
-
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return C."""
-        return (self.c,)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class A(InverseVariance):
-    """φ(M) = s / Σ (M⁻¹)_ii over s parameters, the inverse of their mean variance.
-
-    O5 of Sun & Hollerbach (2008), IEEE ICRA, "Observability index selection for robot
-    calibration".
-
-    Attributes:
-        interest: indices of the parameters; all by default.
-    """
-
-    interest: Ints | None = None
-    name = "A"
-
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return the diagonal matrix of 1/s at the parameters of interest."""
-        chosen = np.arange(size) if self.interest is None else _interest(self.interest, size)
-        out = np.zeros((size, size))
-        out[chosen, chosen] = 1.0 / len(chosen)
-        return (out,)
-
-
-def _interest(interest: Ints, size: int) -> Ints:
-    """Return checked indices of parameters."""
-    chosen = np.asarray(interest, dtype=np.int64).reshape(-1)
-    unique = np.unique(chosen)
-    if not len(chosen) or len(unique) < len(chosen) or unique[0] < 0 or unique[-1] >= size:
-        raise InputError(
-            f"parameters of interest {chosen.tolist()}; valid: different indices from 0 to "
-            f"{size - 1}, at least one"
-        )
-    return chosen
 
 
 _FLOOR = 1e-14
