@@ -18,19 +18,18 @@ unsure.
 - `air_degC`, `joint1_degC` …, `load_time_s`, `time_s`, `approach1` …: where the model needs them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.compensation import Pose, invert
+from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
 from hilcal.tables.columns import (
     OWN_PREFIX,
     POSITION,
@@ -50,7 +49,7 @@ from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import mapped_table
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.tables.units import LENGTHS
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 NO_LOAD = "none"
 
@@ -171,7 +170,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     if points.wanted is None:
         return points.q
 
-    poses = _poses_of(arm, tool)
     found: list[Floats] = []
     for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
         start = q if np.isfinite(q).all() else found[-1] if found else near
@@ -182,8 +180,8 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
             )
         if np.isfinite(goal[:3, 3]).all():
             if not np.isfinite(goal).all():  # turned as the nominal arm has it
-                goal = se3.matrix(poses(start[None], np.zeros(1, int))[0][0], goal[:3, 3])
-            start = _nearest(arm, poses, name, start, goal)
+                goal = se3.matrix(nominal_pose(arm, tool, start[None])[0][0], goal[:3, 3])
+            start = _nearest(arm, tool, name, start, goal)
         found.append(start)
     return np.stack(found)
 
@@ -198,10 +196,7 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
         goal: (4, 4) T_base_tool.
     """
     starts = _everywhere(arm) if near is None else near
-    rotation, position = (
-        np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
-    )
-    found = invert(arm, _poses_of(arm, tool), starts, rotation, position)
+    found = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
     q = found.q[found.solved]
     if near is not None:
         return q
@@ -213,17 +208,6 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
     return np.array(kept).reshape(-1, arm.n)
 
 
-def _poses_of(arm: Arm, tool: Floats) -> Callable[[Floats, Ints], Pose]:
-    """Where the nominal arm has a tool."""
-
-    def poses(at: Floats, rows: Ints) -> Pose:
-        chain = evaluate(arm, at)
-        rotation = se3.product(chain.rotation[-1], tool[:3, :3])
-        return rotation, chain.point(tool[:3, 3]), chain
-
-    return poses
-
-
 def _everywhere(arm: Arm) -> Floats:
     """(STARTS, n) joint values all over the range of the joints."""
     low, high = arm.usual_range
@@ -231,9 +215,7 @@ def _everywhere(arm: Arm) -> Floats:
     return arm.complete(low + spread * (high - low))
 
 
-def _nearest(
-    arm: Arm, poses: Callable[[Floats, Ints], Pose], name: str, near: Floats, goal: Floats
-) -> Floats:
+def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> Floats:
     """Return of all joint values (n,) of a pose those nearest to given ones.
 
     The solution that Newton's method finds from there, where it is near; else the nearest of those
@@ -241,10 +223,7 @@ def _nearest(
     """
     starts = near[None]
     for _ in range(2):
-        rotation, position = (
-            np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
-        )
-        solved = invert(arm, poses, starts, rotation, position)
+        solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
         q = solved.q
         if arm.coupling is None and arm.mimic is None:  # whole turns on it is the same pose
             q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi)) * ~arm.slides

@@ -25,12 +25,12 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    controller_frames,
     frame_of,
     line_of,
     of_wpr,
     read_text,
     to_wpr,
-    toml_frames,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
@@ -82,7 +82,7 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known = toml_frames(frames_file, LS, tool)
+    known = controller_frames(frames_file, LS, tool)
     if not re.search(r"^/MN\b", text, re.M) or not re.search(r"^/POS\b", text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")
     begin = re.search(r"^/POS\b", text, re.M)

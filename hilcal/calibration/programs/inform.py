@@ -23,11 +23,11 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    controller_frames,
     frame_of,
     of_wpr,
     read_text,
     to_wpr,
-    toml_frames,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
@@ -69,7 +69,7 @@ def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known = toml_frames(frames_file, INFORM, tool)
+    known = controller_frames(frames_file, INFORM, tool)
     if "//POS" not in text or "//INST" not in text:
         raise InputError(f"{path.name}: no sections //POS and //INST; valid: a job as text")
     points: dict[str, ProgramPoint] = {}

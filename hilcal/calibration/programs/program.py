@@ -87,6 +87,24 @@ class ProgramPoint:
 UNSTATED = -99
 
 
+def used_again(
+    old: ProgramPoint | None, new: ProgramPoint, line: int, what: str, obeyed: bool = False
+) -> ProgramPoint:
+    """Return a point that a further motion, in a line, moves to: left where its frames differ.
+
+    Args:
+        what: the maker's word for the frame that it counts from.
+        obeyed: whether this motion takes the configuration that is stated.
+    """
+    if old is None or new.left:
+        return new if old is None or not old.left else old
+    if old.left:
+        return old
+    if not np.array_equal(old.tool, new.tool) or not np.array_equal(old.frame, new.frame):
+        return replace(old, left=f"line {line} has it with another tool or {what}")
+    return replace(old, obeyed=old.obeyed or obeyed)
+
+
 @dataclass(frozen=True, slots=True)
 class Language:
     """How a maker writes points.
@@ -288,15 +306,22 @@ class ControllerFrames:
     tool: Floats | None = None
 
 
-def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> ControllerFrames:
-    """Read `--frames F.toml`.
+def controller_frames(
+    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
+) -> ControllerFrames:
+    """Read `--frames F.toml`, where there is one.
 
     Args:
-        pose: of the maker's numbers.
+        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
+        count: how many numbers a pose of the maker has.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: it is no TOML file, or cannot be used.
     """
+    if path is None:
+        return ControllerFrames(tool=tool)
+    if path.suffix.lower() != ".toml":
+        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
     found = load_section(path, _FramesFile)
     groups = []
     for key, group in (("tools", found.tools), ("bases", found.bases)):
@@ -307,7 +332,7 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
                     f"{count}, as the controller shows them: mm and degrees"
                     + (", x y z q1 q2 q3 q4" if count > JOINTS else "")
                 )
-        groups.append({name: pose(np.array(numbers)) for name, numbers in group.items()})
+        groups.append({name: language.pose(np.array(given)) for name, given in group.items()})
     pulses = found.pulses_per_degree
     if pulses is not None and (len(pulses) != JOINTS or not all(pulses)):
         raise InputError(f"{path.name}: pulses_per_degree; valid: {JOINTS} numbers other than 0")
@@ -315,22 +340,7 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
     if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
         raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
     per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
-    return ControllerFrames(groups[0], groups[1], per_rad, axes)
-
-
-def toml_frames(
-    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
-) -> ControllerFrames:
-    """Read `--frames F.toml`, where there is one; raises as `frames_of_toml` does.
-
-    Raises:
-        InputError: it is no TOML file.
-    """
-    if path is None:
-        return ControllerFrames(tool=tool)
-    if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
-    return replace(frames_of_toml(path, language.pose, count), tool=tool)
+    return ControllerFrames(groups[0], groups[1], per_rad, axes, tool)
 
 
 def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:

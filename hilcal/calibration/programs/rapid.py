@@ -29,10 +29,11 @@ from hilcal.calibration.programs.program import (
     ProgramPoint,
     Span,
     arguments_of,
-    frames_of_toml,
+    controller_frames,
     line_of,
     of_euler,
     read_text,
+    used_again,
 )
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -124,12 +125,10 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known, more = ControllerFrames(), ""
-    if frames_file is not None and frames_file.suffix.lower() == ".toml":
-        known = frames_of_toml(frames_file, of_quaternion, POSE)
-    elif frames_file is not None:
-        more = read_text(frames_file)[0]
-    reader = _RapidReader(path.name, text, more, replace(known, tool=tool))
+    module = frames_file is not None and frames_file.suffix.lower() != ".toml"
+    known = controller_frames(None if module else frames_file, RAPID, tool, POSE)
+    more = read_text(frames_file)[0] if frames_file is not None and module else ""
+    reader = _RapidReader(path.name, text, more, known)
     return Program(RAPID, (path.suffix,), (text,), reader.points(), encoding)
 
 
@@ -308,13 +307,7 @@ class _RapidReader:
             new = replace(new, tool=tool, frame=frame, obeyed=obeyed)
             if made:
                 new = self._moved(new, made)
-        old = self.found.get(key)
-        if old is not None and not old.left and not new.left:
-            same = np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
-            new = (
-                old if same else replace(old, left=f"line {line} has it with another tool or frame")
-            )
-        self.found[key] = old if old is not None and old.left else new
+        self.found[key] = used_again(self.found.get(key), new, line, "frame")
 
     def _value(self, text: str, at: int, name: str, joints: bool) -> ProgramPoint:
         """Return a point of an aggregate."""
