@@ -26,7 +26,7 @@ from hilcal.cli.planning import make_plan, read_cell
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.config import CellConfig
-from hilcal.config.write import to_toml
+from hilcal.config.template import to_toml
 from hilcal.design.checked_plan import refuse
 from hilcal.drivers.simulated.rehearsal import (
     NOTHING,

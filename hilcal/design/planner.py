@@ -21,8 +21,7 @@ from hilcal.design.choice import (
     only,
     promising,
 )
-from hilcal.design.draw import DrawnPoses, draw
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.design.information import DesignProblem, problem, readings_of
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.optimum import Design

@@ -14,8 +14,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design import tour
-from hilcal.design.confounding import Confounding, confounding
-from hilcal.design.timing import Duration, Pace, pace, timeline
+from hilcal.design.timing import Confounding, Duration, Pace, confounding, pace, timeline
 from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

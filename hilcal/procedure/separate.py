@@ -7,8 +7,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.many_poses import measure_poses
-from hilcal.design.next import Next, PairPower, measure_next
+from hilcal.design.next import Next, PairPower, measure_next, measure_poses
 from hilcal.design.planner import Request
 from hilcal.design.summary import about
 from hilcal.diagnosis.diagnosis import Diagnosis

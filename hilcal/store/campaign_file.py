@@ -22,7 +22,6 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
-from hilcal.store.new_campaign import new_campaign
 from hilcal.store.records import Layout, content_hash, layout_of, read_layout
 from hilcal.store.revision import (
     RevisionRecord,
@@ -520,3 +519,57 @@ def rescued(connection: sqlite3.Connection, path: Path) -> Path:
     with replacing(place, must_be_new=True) as new, closing(sqlite3.connect(new)) as copy:
         connection.backup(copy)
     return place
+
+
+@contextmanager
+def new_campaign(
+    path: Path, about: Mapping[str, str], overwrite: bool
+) -> Iterator[sqlite3.Connection]:
+    """Give an empty campaign to the block; the file appears when the block has filled it.
+
+    Args:
+        about: texts about the campaign, by name.
+
+    Raises:
+        InputError: as for `may_write`, or it cannot be written.
+        DeviceError: the disk is full or failed.
+    """
+    may_write(path, overwrite)
+    with replacing(path) as new:
+        try:
+            with schema.sqlite_errors(path):
+                connection = schema.connect(new)
+                try:
+                    connection.execute("PRAGMA journal_mode = DELETE")
+                    with schema.transaction(connection):
+                        for statement in schema.statements():
+                            connection.execute(statement)
+                        for key, value in about.items():
+                            rows.insert_meta(connection, key, value)
+                        yield connection
+                finally:
+                    connection.close()
+        except BaseException:
+            _without_sidecars(new)
+            raise
+        _without_sidecars(Path(os.path.realpath(path)))  # another file's journal
+
+
+def may_write(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a file that is no campaign, or any without `overwrite`.
+
+    Raises:
+        InputError: names the file and the reason.
+    """
+    if not path.exists():
+        return
+    if not overwrite:
+        raise InputError(f"{path}: the file exists; choose another name or ask to overwrite it")
+    if not path.is_file() or (path.stat().st_size > 0 and not schema.is_campaign(path)):
+        raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
+
+
+def _without_sidecars(path: Path) -> None:
+    """Remove what would be rolled back into a new file of this name."""
+    for end in ("-journal", "-wal", "-shm"):
+        path.with_name(path.name + end).unlink(missing_ok=True)

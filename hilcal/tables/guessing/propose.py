@@ -15,8 +15,12 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
 from hilcal.tables.guessing import column_names as words
 from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.guess_axes import guess_axes
-from hilcal.tables.guessing.guess_values import guess_by_values, is_quaternion, time_unit
+from hilcal.tables.guessing.guess_values import (
+    guess_axes,
+    guess_by_values,
+    is_quaternion,
+    time_unit,
+)
 from hilcal.tables.guessing.proposal import (
     FEWEST_JOINTS,
     GUESSED,

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config, tracker_place
 from hilcal.config import CellConfig
-from hilcal.design.draw import draw
-from hilcal.design.feasible import REASONS, Space
+from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
