@@ -388,7 +388,7 @@ class Calibration(Brief):
             turn, chain = of.base[:3, :3], prediction.situation.chain
             at = (position - of.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(of.model.cell, chain, at)
-            rest = self.misfit + sum(self.conditions[name].variance for name in untold)
+            rest = self.misfit + sum(self.conditions[name].variance_m2 for name in untold)
             covariance = turn @ (known + scatter) @ turn.T + rest * np.eye(3)
             known = np.sqrt(np.trace(known, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, known, self.turns))

@@ -110,4 +110,4 @@ def check_conditions(conditions: Mapping[str, Condition], n: int) -> None:
         if name not in WORDS:
             raise ValueError(f"{name!r} is no condition")
         check_numbers(name, c.mean, (n,) if name in ("joint_temperature", "approach") else ())
-        check_numbers(f"variance by {name}", c.variance, least=0.0)
+        check_numbers(f"variance by {name}", c.variance_m2, least=0.0)

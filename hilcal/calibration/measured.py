@@ -9,8 +9,8 @@ of each axis of the tool's position p:
 J the derivative of p by the parameters, R Rᵀ their covariance.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -102,16 +102,6 @@ class Measured:
         none = np.zeros(states.q.shape[1], dtype=np.bool_)
         return [o for o in self.outside(states, None, none) if o.of.unit == "rad"]
 
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
-        return asdict(self)
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Measured":
-        """Return what `to_json` wrote."""
-        ranges = tuple(Range(**r) for r in content["ranges"])
-        return cls(ranges, float(content["most_std_m"]))
-
 
 WORDS = {
     "time": "time",
@@ -131,20 +121,11 @@ class Condition:
 
     Attributes:
         mean: x̄: a number, or (n,).
-        variance: v, m².
+        variance_m2: v, m².
     """
 
     mean: Floats
-    variance: float
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
-        return {"mean": self.mean.tolist(), "variance_m2": self.variance}
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Condition":
-        """Return what `to_json` wrote."""
-        return cls(np.array(content["mean"], dtype=float), float(content["variance_m2"]))
+    variance_m2: float
 
 
 def needed(model: Model, states: States) -> tuple[str, ...]:

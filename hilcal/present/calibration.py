@@ -308,7 +308,7 @@ def _parts(calibration: Calibration, untold: Sequence[str]) -> list[str]:
     """What the stated error after compensation consists of."""
     parts = ["the parameters"]
     for name in untold:
-        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance)))
+        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
         parts.append(f"{WORDS[name]}, which the points do not tell ({moved} rms)")
     if calibration.misfit > 0:
         left = numbers.length(float(np.sqrt(3 * calibration.misfit)))
