@@ -181,7 +181,9 @@ def _of_fit(
     entry: Entry, run: Campaign, found: Fit, usual: tuple[str, ...], verdict: str
 ) -> Member:
     of = overview(run.file)
-    serial = next((i.serial for i in of.instruments if i.part == "arm" and i.serial), None)
+    serial = next(
+        (i.serial_number for i in of.instruments if i.device == "arm" and i.serial_number), None
+    )
     arm, known = entry.arm, "list"
     if not arm and serial:
         arm, known = serial, "serial number"
