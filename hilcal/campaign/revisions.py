@@ -64,6 +64,7 @@ def to_record(
     """
     effects, cell = found.model.effects, found.model.cell
     scatter, serial = found.readings.arm_scatter, found.readings.serial
+    observers = [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
@@ -88,7 +89,7 @@ def to_record(
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
-            **({"observers": _observers_json(cell)} if cell.observers else {}),
+            **({"observers": observers} if cell.observers else {}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
             **({} if serial is None else {SERIAL: serial.to_json()}),
@@ -97,10 +98,6 @@ def to_record(
         },
         result_json=result,
     )
-
-
-def _observers_json(cell: Cell) -> list[dict[str, object]]:
-    return [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
 
 
 def _placed(cell: Cell, stored: Sequence[Mapping[str, Any]]) -> Cell:

@@ -35,7 +35,6 @@ from hilcal.design.criterion import inverse
 from hilcal.design.information import DesignProblem, information_of, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
-from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.mixed.families import families_of
@@ -125,20 +124,17 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     """
     model, known = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)
-    finest = {"harmonics": HARMONICS}
+    finest = {
+        name: {"harmonics": HARMONICS} for name in names if "harmonics" in known[name].option_help
+    }
     more = tuple(
-        build(known, name, nominal.cell, nominal.m, finest if _in_waves(known, name) else {})
-        for name in names
+        build(known, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
     )
     alone = replace(model, effects=more, random={}, background=frozenset(), prior=None)
     std = np.zeros(alone.size)
     for f in families_of(alone).random:
         std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
     return more, std
-
-
-def _in_waves(known: Catalogue, name: str) -> bool:
-    return "harmonics" in known[name].option_help
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:

@@ -114,8 +114,9 @@ def nominal_model(
     notes = []
     cell = _observed(cell, config, place)
     if not given and not (cell.observers and all(o.tied for o in cell.observers)):
+        shown = ", ".join(f"{v:.2g}" for v in place)
         notes.append(
-            f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
+            f"the tracker's place is not configured: taken to be [{shown}] m in base axes "
             "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, config, place)
@@ -370,7 +371,3 @@ def _prior_std(model: Model) -> Floats:
     prior, groups = prior_of(model)
     scale = np.array([p.scale for e in model.effects for p in e.parameters])
     return np.asarray(np.where(groups >= 0, scale, prior))
-
-
-def _metres(x: Floats) -> str:
-    return "[" + ", ".join(f"{v:.2g}" for v in x) + "] m"

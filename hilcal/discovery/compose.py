@@ -321,7 +321,7 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
         low, high = 1.0 if elastic else LEAST_POWER, MOST_POWER
 
     def parts(x: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        now = [_rounded(v) for v in begin + np.asarray(scale) * x]
+        now = [float(f"{v:.{DIGITS}g}") for v in begin + np.asarray(scale) * x]
         return (1.0, *now[:more]), tuple(now[more:])
 
     def objective(x: Floats) -> float:
@@ -343,7 +343,3 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
     recorded = len(terms) == 1 and len(factors) == 1 and factors[0].shape is shapes.LINEAR
     quantity = factors[0].variable if recorded else composed(terms)
     return Amplitude((Factor(quantity, b.shape, own),))
-
-
-def _rounded(x: float) -> float:
-    return float(f"{x:.{DIGITS}g}")

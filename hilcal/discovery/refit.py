@@ -62,7 +62,7 @@ def refine(screen: Screen, form: Form) -> Form:
     found = minimize(
         objective, np.zeros(len(free)), method="Nelder-Mead",
         options={"maxfev": 60 * len(free), "xatol": 1e-3, "fatol": 1e-3,
-                 "initial_simplex": _simplex(len(free))},
+                 "initial_simplex": np.eye(len(free) + 1, len(free), -1) * 0.3},
     )  # fmt: skip
     values = [float(f"{v:.{DIGITS}g}") for v in at(found.x)]
     refined = with_values(form, free, values)
@@ -70,10 +70,6 @@ def refine(screen: Screen, form: Form) -> Form:
     dof = linear.fit.dof
     gain = 0.5 * dof * np.log(best / max(after, 1e-300))
     return refined if gain > len(free) * (0.5 * np.log(dof)) + WORTH else form
-
-
-def _simplex(count: int) -> Floats:
-    return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
 
 
 def left_by(screen: Screen, form: Form, s: Situation) -> float:

@@ -77,7 +77,10 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
             # What was added last is the best beside the others already.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             _keep(problem, best, s)
-    return [_plainly(problem.screen, s) for s in worth_their_length(best[k] for k in sorted(best))]
+    return [
+        replace(s, terms=tuple(plain(problem.screen, t) for t in s.terms))
+        for s in worth_their_length(best[k] for k in sorted(best))
+    ]
 
 
 def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
@@ -141,11 +144,6 @@ def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> N
     count = len(s.terms)
     if count not in best or _better(problem, s, best[count]):
         best[count] = s
-
-
-def _plainly(screen: Screen, s: Selection) -> Selection:
-    """Name the simplest of the sites that move all readings alike."""
-    return replace(s, terms=tuple(plain(screen, t) for t in s.terms))
 
 
 def plain(screen: Screen, t: LawTerm) -> LawTerm:

@@ -267,7 +267,7 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names, by = self._target_names(), self._observers()
+            names, by = self._names_in(self._read_meta().get(_TARGETS, "[]")), self._observers()
             return rows.fetch_readings(self._connection, self.path, layout, names, by)
 
     def data_hash(self, count: int | None = None) -> str:
@@ -416,9 +416,6 @@ class CampaignFile:
             return None if text is None else read_layout(text)
         except ValueError as e:
             raise InputError(f"{self.path}: the campaign file is damaged ({e})") from e
-
-    def _target_names(self) -> list[str]:
-        return self._names_in(self._read_meta().get(_TARGETS, "[]"))
 
     def _names_in(self, text: str) -> list[str]:
         names = rows.stored_json(self.path, text)

@@ -419,7 +419,11 @@ class _KrlReader:
                 return replace(bare, left="not all of A1 to A6 are written")
             spans = tuple(value.span(k) for k in AXES)
             return replace(
-                bare, numbers=spans, values=numbers, joints=True, tool=self._tool_or_one()
+                bare,
+                numbers=spans,
+                values=numbers,
+                joints=True,
+                tool=np.eye(4) if isinstance(self.state.tool, str) else self.state.tool,
             )
         numbers = value.numbers(POSE)
         if numbers is None:
@@ -442,9 +446,6 @@ class _KrlReader:
             config=() if t is None else (value.span(TURN),),
             obeyed=obeyed,
         )
-
-    def _tool_or_one(self) -> Floats:
-        return self.state.tool if isinstance(self.state.tool, np.ndarray) else np.eye(4)
 
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements use which are no motions to them, with their lines."""
