@@ -211,14 +211,12 @@ class Calibration(Brief):
     ) -> Compensation:
         """Find the joint values that put the tool where it is asked to be.
 
+        Arguments that are not named here are those of `predict`.
+
         Args:
             q: (n,) or (N, n) joint values, rad; the nominal arm has the tool there. Those found
                 are on their branch.
-            wrench: as for `predict`.
-            tool: as for `predict`.
             wanted: (4, 4) or (N, 4, 4) T_base_tool to go to instead.
-            std: as for `predict`.
-            recorded: as for `predict`.
 
         Raises:
             InputError: as for `predict`.
@@ -255,11 +253,7 @@ class Calibration(Brief):
         return compiled(self._tracked, self.mode)
 
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
-        """Names of what the compiled kernel has no form for: some hundred times slower with it.
-
-        Args:
-            tool: as for `predict`.
-        """
+        """Names of what the compiled kernel has no form for: some hundred times slower with it."""
         of = self._tool(tool)
         found = self._compiled if of is self._tracked else compiled(of, self.mode)
         return () if isinstance(found, Compiled) else found

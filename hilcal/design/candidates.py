@@ -78,7 +78,6 @@ def candidates(
     """Return the states of poses under the loads of a configuration.
 
     Args:
-        nominal: the model that is planned for.
         q: (N, n) joint angles, rad.
         allowed: (N, 1 + L) which states may be taken, unloaded first; all by default.
     """

@@ -259,7 +259,6 @@ def compound_objective(
     """Return a design problem with a criterion; D and A are compound with potential terms.
 
     Args:
-        name: as for `objective_of`.
         work: the prediction poses, for "I".
         budget: readings, for which the two optima of A are found.
         rng: generator; they are found among some of the poses.

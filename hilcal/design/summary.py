@@ -206,7 +206,6 @@ def summarise(
     """Return the summary of a plan.
 
     Args:
-        rng: generator, for the designs of the other criteria.
         compare: whether to compute the criterion comparison.
         curve: whether to compute the sample-size curve.
     """

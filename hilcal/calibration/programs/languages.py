@@ -313,7 +313,6 @@ def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: I
     """(N, F) configuration to be stated after a correction: others where those were left alone.
 
     Args:
-        language: of the program.
         given: (N, 6) joint values before, rad.
         q: (N, 6) joint values after.
         stated: (N, F) as stated.
