@@ -172,7 +172,6 @@ def draw(
     rng: np.random.Generator,
     *,
     least: int = 1,
-    also: Floats | None = None,
     most: int | None = None,
 ) -> DrawnPoses:
     """Return poses from a Sobol sequence over the joint space, turned by a random shift.
@@ -181,7 +180,6 @@ def draw(
         count: poses wanted; fewer where the cell leaves fewer.
         rng: shift of the sequence.
         least: so many have to be found.
-        also: (M, n) states that are looked at first, rad.
         most: so many states are drawn at most; by default many times `count`.
 
     Raises:
@@ -200,9 +198,6 @@ def draw(
     found = [np.empty((0, len(low)))]
     drawn = have = 0
     most = max(_MOST[0], _MOST[1] * count) if most is None else most
-    if also is not None:
-        found.append(_kept(space, also, left, lost))
-        drawn, have = len(also), len(found[-1])
     while have < count and drawn < (most if have else _VAIN):
         u = (sequence.random(_CHUNK) + shift) % 1.0
         q = space.cell.arm.complete(low + u * (high - low))
