@@ -8,8 +8,7 @@ import numpy as np
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.discovery.agreement import agreement
-from hilcal.discovery.discovery import discover
+from hilcal.discovery.discovery import agreement, discover
 from hilcal.discovery.law import Law
 from hilcal.drivers.simulated.injected_effects import hide, nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate

@@ -8,10 +8,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.choice import choose
-from hilcal.design.compound_criteria import compound_objective
-from hilcal.design.draw import draw
-from hilcal.design.feasible import Space
+from hilcal.design.choice import choose, compound_objective
+from hilcal.design.feasible import Space, draw
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import NominalModel, nominal_model
 from hilcal.design.predicted import PredictedUncertainty, predicted, rms

@@ -10,11 +10,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hilcal.calibration.compensation import Pose, invert
+from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.calibration.urscript import Waypoint
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
 from hilcal.types import Bools, Floats
 
 STEPS = 40
@@ -65,11 +64,11 @@ def doubts(
 
 def _nearest(arm: Arm, tool: Floats, near: Floats, q: Floats) -> Bools:
     """(N,) whether no other solution of the poses at q (N, 6) is as near to joint values (N, 6)."""
-    rotation, position, _ = _poses(arm, tool, q)
+    rotation, position, _ = nominal_pose(arm, tool, q)
     mine = _turn(q - near)
     out = np.ones(len(q), dtype=bool)
     for start in _flipped(q):
-        found = invert(arm, lambda at, _: _poses(arm, tool, at), start, rotation, position)
+        found = invert_nominal(arm, tool, start, rotation, position)
         other = found.solved & (np.abs(_turn(found.q - q)).max(axis=1) > SAME)
         theirs = _turn(found.q - near)
         for order in (1, 2, np.inf):
@@ -100,21 +99,16 @@ def _flipped(q: Floats) -> list[Floats]:
 
 def _straight(arm: Arm, tool: Floats, begin: Floats, q: Floats) -> Bools:
     """(N,) whether the straight motion from joint values (N, 6) to the poses at q ends at q."""
-    r0, p0, _ = _poses(arm, tool, begin)
-    r1, p1, _ = _poses(arm, tool, q)
+    r0, p0, _ = nominal_pose(arm, tool, begin)
+    r1, p1, _ = nominal_pose(arm, tool, q)
     turn = se3.rotation_vector(se3.product(r1, np.swapaxes(r0, 1, 2)))
     at, out = begin, np.ones(len(q), dtype=bool)
     for share in np.arange(1, STEPS + 1) / STEPS:
         rotation = se3.product(se3.rotation(share * turn), r0)
-        found = invert(arm, lambda x, _: _poses(arm, tool, x), at, rotation, p0 + share * (p1 - p0))
+        found = invert_nominal(arm, tool, at, rotation, p0 + share * (p1 - p0))
         out &= found.solved & (np.abs(found.q - at).max(axis=1) < LARGEST_STEP)
         at = found.q
     return np.asarray(out & (np.abs(_turn(at - q)).max(axis=1) < SAME))
-
-
-def _poses(arm: Arm, tool: Floats, q: Floats) -> Pose:
-    chain = evaluate(arm, q)
-    return se3.product(chain.rotation[-1], tool[:3, :3]), chain.point(tool[:3, 3]), chain
 
 
 def _turn(angle: Floats) -> Floats:

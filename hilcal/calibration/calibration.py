@@ -9,7 +9,7 @@ C the covariance of the parameters, what a family does at places that nobody mea
 metres; s² what the positions' residuals have beyond the noise, where χ² is larger than chance
 allows; Σ_q the arm's scatter from one arrival to the next.
 
-What points do not tell of their state has a further share, see `calibration.conditions`.
+What points do not tell of their state has a further share, see `calibration.measured`.
 
 Of a fit to deflections only what the load does is known: errors are then counted from the unloaded
 arm.
@@ -23,13 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.compensated import Compensation, ToolPoses
 from hilcal.calibration.compensation import Inverse, Pose, invert
 from hilcal.calibration.compiled import Compiled, compiled
-from hilcal.calibration.conditions import Condition, conditions_of, needed
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Measured
-from hilcal.calibration.poses import ToolPoses
+from hilcal.calibration.measured import Condition, Measured, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
 from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
@@ -69,7 +67,6 @@ class Calibration(Brief):
     (True, (3, 6))
 
     Attributes:
-        model: the fitted model.
         theta: (P,) its parameters.
         mode: kind of readings that it was fitted to.
         root: (P, K) R with κ C = R Rᵀ; None where it is computed when needed, from `learnt`.
@@ -106,7 +103,6 @@ class Calibration(Brief):
         """Make a calibration of a fit.
 
         Args:
-            found: the fit.
             source: what it is from, for people.
 
         Raises:
@@ -194,7 +190,7 @@ class Calibration(Brief):
             std: also state the uncertainty, and whether points lie far from what was measured.
             recorded: other columns of `States` by name: `air_temperature`, `load_time`, ...; those
                 that the model needs and are not given are taken as in the middle of what was
-                measured, see `calibration.conditions`.
+                measured, see `calibration.measured`.
 
         Raises:
             InputError: another shape, or a column is missing that the model needs, and that the
@@ -215,14 +211,12 @@ class Calibration(Brief):
     ) -> Compensation:
         """Find the joint values that put the tool where it is asked to be.
 
+        Arguments that are not named here are those of `predict`.
+
         Args:
             q: (n,) or (N, n) joint values, rad; the nominal arm has the tool there. Those found
                 are on their branch.
-            wrench: as for `predict`.
-            tool: as for `predict`.
             wanted: (4, 4) or (N, 4, 4) T_base_tool to go to instead.
-            std: as for `predict`.
-            recorded: as for `predict`.
 
         Raises:
             InputError: as for `predict`.
@@ -259,11 +253,7 @@ class Calibration(Brief):
         return compiled(self._tracked, self.mode)
 
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
-        """Names of what the compiled kernel has no form for: some hundred times slower with it.
-
-        Args:
-            tool: as for `predict`.
-        """
+        """Names of what the compiled kernel has no form for: some hundred times slower with it."""
         of = self._tool(tool)
         found = self._compiled if of is self._tracked else compiled(of, self.mode)
         return () if isinstance(found, Compiled) else found
@@ -379,7 +369,6 @@ class Calibration(Brief):
         """Return where a tool is.
 
         Args:
-            of: the tool.
             states: N points.
             nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
             std: also state the uncertainty.
@@ -393,7 +382,7 @@ class Calibration(Brief):
             turn, chain = of.base[:3, :3], prediction.situation.chain
             at = (position - of.base[:3, 3]) @ turn
             scatter = self.scatter.covariance(of.model.cell, chain, at)
-            rest = self.misfit + sum(self.conditions[name].variance for name in untold)
+            rest = self.misfit + sum(self.conditions[name].variance_m2 for name in untold)
             covariance = turn @ (known + scatter) @ turn.T + rest * np.eye(3)
             known = np.sqrt(np.trace(known, axis1=1, axis2=2))
         outside = tuple(self.measured.outside(states, known, self.turns))

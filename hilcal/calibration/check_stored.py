@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from hilcal.calibration.conditions import WORDS, Condition
-from hilcal.calibration.measured import Measured
+from hilcal.calibration.measured import WORDS, Condition, Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.cell import Cell
 from hilcal.robot.arm import Arm
@@ -111,4 +110,4 @@ def check_conditions(conditions: Mapping[str, Condition], n: int) -> None:
         if name not in WORDS:
             raise ValueError(f"{name!r} is no condition")
         check_numbers(name, c.mean, (n,) if name in ("joint_temperature", "approach") else ())
-        check_numbers(f"variance by {name}", c.variance, least=0.0)
+        check_numbers(f"variance by {name}", c.variance_m2, least=0.0)

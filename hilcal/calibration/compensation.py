@@ -16,7 +16,7 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import Chain, joint_jacobian
+from hilcal.robot.chain import Chain, evaluate, joint_jacobian
 from hilcal.types import Bools, Floats, Ints
 
 TOLERANCE = 1e-10
@@ -63,7 +63,6 @@ def invert(
     """Find joint values.
 
     Args:
-        arm: for limits of the chain.
         poses: takes joint values (K, n) and the numbers (K,) of their points; returns the poses.
         q: (N, n) joint values to begin with.
         rotation: (N, 3, 3) wanted orientation of the tool, base axes.
@@ -87,6 +86,25 @@ def invert(
         q[active[going]] += step[going]
         active = active[going]
     return Inverse(q, left[:, 0], left[:, 1])
+
+
+def nominal_pose(arm: Arm, tool: Floats, q: Floats) -> Pose:
+    """Where the nominal arm has a tool T_flange_tool (4, 4) at joint values (N, n)."""
+    chain = evaluate(arm, q)
+    return se3.product(chain.rotation[-1], tool[:3, :3]), chain.point(tool[:3, 3]), chain
+
+
+def invert_nominal(
+    arm: Arm, tool: Floats, q: Floats, rotation: Floats, position: Floats
+) -> Inverse:
+    """Find joint values at which the nominal arm has a tool; one pose or N, else as `invert`."""
+    return invert(
+        arm,
+        lambda at, _: nominal_pose(arm, tool, at),
+        q,
+        np.broadcast_to(rotation, (len(q), 3, 3)),
+        np.broadcast_to(position, (len(q), 3)),
+    )
 
 
 def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:

@@ -49,9 +49,7 @@ class CovarianceSource:
         """Return R (P, P) with κ C = R Rᵀ.
 
         Args:
-            model: the model.
             theta: (P,) its parameters.
-            mode: kind of readings.
         """
         w = whitening(self.readings, mode, "gc")
         prediction = model.predict(self.readings.states, theta)

@@ -98,16 +98,16 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     first, last = arm.links[0], arm.links[n]
     if convention == "modified" and _tilt(first) > CROSSED:
         start, across[0], after[0] = _common_normal(first)
-        base = screw(*start)
+        base = se3.screw(2, *start)
     else:
         after[0] = _twist_last(first)
-        base = first @ screw(*-after[0])
+        base = first @ se3.screw(2, *-after[0])
     if convention == "standard" and _tilt(last) > CROSSED:
         before[n], across[n], end = _common_normal(last)
-        flange = screw(*end)
+        flange = se3.screw(2, *end)
     else:
         before[n] = twist_first(last)
-        flange = screw(*-before[n]) @ last
+        flange = se3.screw(2, *-before[n]) @ last
     along = after[:n] + before[1:]
     shift = 1 if convention == "standard" else 0
     a, alpha = across[shift : n + shift].T
@@ -122,10 +122,10 @@ def row_transforms(rows: DhRows, q: Floats) -> Floats:
     """(N, n, 4, 4) transforms of the rows at joint values (N, n), rad; m where joints slide."""
     out = np.empty((*q.shape, 4, 4))
     for k in range(q.shape[1]):
-        across = _across(rows.a[k], rows.alpha[k])
+        across = se3.screw(0, rows.alpha[k], rows.a[k])
         for i, value in enumerate(q[:, k]):
             angle, travel = (0.0, value) if k in rows.slides else (value, 0.0)
-            turn = screw(angle + rows.offset[k], rows.d[k] + travel)
+            turn = se3.screw(2, angle + rows.offset[k], rows.d[k] + travel)
             out[i, k] = turn @ across if rows.convention == "standard" else across @ turn
     return out
 
@@ -153,9 +153,7 @@ def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
     """Return a file of the robot catalogue, which `[robot] model = "F.toml"` of a cell reads.
 
     Args:
-        rows: of the arm.
         arm: gives masses, limits and payload; what its description lacks is left out.
-        title: of the arm.
     """
     com = _centres(rows, arm)
     content: dict[str, object] = {
@@ -254,7 +252,7 @@ def _common_normal(link: Floats) -> tuple[Floats, Floats, Floats]:
     if sine > PARALLEL:
         t = float(across[1] * p[0] - across[0] * p[1]) / np.sin(alpha)
     s = float(p[2] - t * np.cos(alpha))
-    turned = (screw(phi, 0.0) @ _across(0.0, alpha))[:3, :3].T @ link[:3, :3]
+    turned = (se3.screw(2, phi) @ se3.screw(0, alpha))[:3, :3].T @ link[:3, :3]
     psi = np.arctan2(turned[1, 0], turned[0, 0])
     return np.array([phi, s]), np.array([a, alpha]), np.array([psi, t])
 
@@ -279,24 +277,6 @@ def _about_z(link: Floats) -> float:
 
 def _tilt(link: Floats) -> float:
     return float(np.arctan2(np.hypot(link[0, 2], link[1, 2]), abs(link[2, 2])))
-
-
-def screw(angle: float, along: float) -> Floats:
-    """(4, 4) Rz(angle) Tz(along)."""
-    out = np.eye(4)
-    c, s = np.cos(angle), np.sin(angle)
-    out[:2, :2] = [[c, -s], [s, c]]
-    out[2, 3] = along
-    return out
-
-
-def _across(a: float, alpha: float) -> Floats:
-    """(4, 4) Tx(a) Rx(alpha)."""
-    out = np.eye(4)
-    c, s = np.cos(alpha), np.sin(alpha)
-    out[1:3, 1:3] = [[c, -s], [s, c]]
-    out[0, 3] = a
-    return out
 
 
 def _wrapped(angle: Floats) -> Floats:

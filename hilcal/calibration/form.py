@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.effects.protocol import Effect, Situation
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.types import Floats
 
 TURN = 2 * np.pi

@@ -1,4 +1,4 @@
-"""A corrected arm as others read it: URDF, the kinematics file of UR's ROS driver, frames.
+"""The constant part of an identified arm, and how others read it: URDF, UR's kinematics, frames.
 
 URDF: fixed-axis roll, pitch, yaw and xyz of every joint's origin; every joint turns about its z.
 
@@ -7,20 +7,25 @@ by `ur_calibration`) has one origin per joint in the frames of that package: tho
 moved along the joints' axes. The first one counts from `base_link_inertia`, which is the
 controller's base (`base`), half a turn about z from `base_link`. It has no origin for the flange;
 what cannot be moved before the last joint is part of the tool, see `frames`.
+
+An effect whose deviation is the same in every state and under every load (an encoder's zero, a link
+of another length or angle) goes into the constant transforms, from the declared base to the
+declared flange, see `identification.robot_frames`. Everything else (compliances, waves of gears,
+temperature) cannot, and is named.
 """
 
 import hashlib
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.corrected import Corrected
-from hilcal.calibration.dh_table import screw, twist_first
-from hilcal.errors import InputError
+from hilcal.calibration.dh_table import twist_first
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.names import escaped
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -28,6 +33,39 @@ from hilcal.types import Floats
 
 UR_JOINTS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
 FULL_TURN = 2 * np.pi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """An arm with what is constant of a calibration.
+
+    Attributes:
+        within: effects that it contains.
+        beyond: effects that it does not contain.
+    """
+
+    arm: Arm
+    within: tuple[str, ...]
+    beyond: tuple[str, ...]
+
+
+def corrected(calibration: Calibration) -> Corrected:
+    """Return the arm with the constant effects of a calibration in its transforms.
+
+    Raises:
+        CannotAnswerError: the calibration is of deflections, which do not show constant errors.
+        InputError: joints of the arm are coupled.
+    """
+    if calibration.mode == "deflection":
+        raise CannotAnswerError(
+            "a calibration of deflections knows nothing of the unloaded arm's geometry; fit "
+            "absolute readings: hilcal identify RUN --readings absolute"
+        )
+    arm = calibration.model.cell.arm
+    if arm.coupling is not None or arm.drive is not None:
+        raise InputError(f"{arm.name}: joints are coupled, which constant transforms cannot hold")
+    found = calibration.frames
+    return Corrected(replace(arm, links=found.links), found.within, found.beyond)
 
 
 def urdf(arm: Arm, note: str = "") -> str:
@@ -69,7 +107,6 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
 
     Args:
         arm: without couplings.
-        name: of the function.
         note: stands in a comment at the top.
     """
     out = [f"function robot = {name}()"]
@@ -118,7 +155,6 @@ def ur_kinematics(
 
     Args:
         nominal: the arm of the catalogue.
-        arm: the corrected one.
         note: stands in a comment at the top.
         digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
             an error where the file has another. One of the file's content where None.
@@ -139,8 +175,8 @@ def ur_kinematics(
     turn, shift[-1] = twist_first(arm.links[-1])  # a turn about the last axis can be made before it
     lines = ["kinematics:"]
     for k, name in enumerate(UR_JOINTS):
-        before = np.eye(4) if k == 0 else _along(-shift[k - 1])
-        after = _along(shift[k]) if k < arm.n - 1 else screw(turn, shift[k])
+        before = np.eye(4) if k == 0 else se3.screw(2, 0.0, -shift[k - 1])
+        after = se3.screw(2, turn if k == arm.n - 1 else 0.0, shift[k])
         xyz, rpy = origin_of(before @ arm.links[k] @ after)
         lines.append(f"  {name}:")
         keys = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -148,7 +184,7 @@ def ur_kinematics(
     own = int.from_bytes(hashlib.sha256("\n".join(lines).encode()).digest()[:8])
     lines.append(f"  hash: {digest or f'calib_{own}'}")
     comment = [f"# {escaped(line)}" for line in note.split("\n")]
-    return "\n".join([*comment, *lines]) + "\n", screw(-turn, -shift[-1]) @ arm.links[-1]
+    return "\n".join([*comment, *lines]) + "\n", se3.screw(2, -turn, -shift[-1]) @ arm.links[-1]
 
 
 def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | None) -> str:
@@ -160,8 +196,6 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
     PolyScope shows them, in mm.
 
     Args:
-        calibration: the calibration.
-        found: its corrected arm.
         beyond_flange: (4, 4) from the last frame of UR's kinematics file to the flange; None where
             that file is not written.
     """
@@ -194,12 +228,6 @@ def _millimetres(pose: Floats) -> list[float]:
     """Position in mm to 0.1 nm and rotation vector in rad, as a person types them."""
     values = se3.six(pose)
     return [round(1e3 * v, 7) for v in values[:3]] + [round(v, 9) for v in values[3:]]
-
-
-def _along(z: float) -> Floats:
-    out = np.eye(4)
-    out[2, 3] = z
-    return out
 
 
 def origin_of(place: Floats) -> tuple[Floats, Floats]:

@@ -329,7 +329,6 @@ def invert_all(
         own: displacements (K, n), twists (K, n + 1, 6) and compliances (K, n) of the points, K
             each its own; the last ones are those of all further points.
         tool: (4, 4) T_flange_tool.
-        reach: of the arm, m.
         most_turn: largest step of a joint, rad.
         tolerance: residual at which a point is solved, m and rad.
         q: (N, n) joint values to begin with, rad.

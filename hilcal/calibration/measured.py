@@ -1,13 +1,23 @@
-"""What a calibration was measured at, and which points lie outside of it."""
+"""What a calibration was measured at, which points lie outside of it, and what they leave untold.
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+A table of points or a program seldom has them. A quantity x that an effect of the model needs is
+then taken as it was on the whole while measuring, x̄, and what it moves there counts as a variance
+of each axis of the tool's position p:
+
+    v = mean over measured states of (|p(x) − p(x̄)|² + |(J(x) − J(x̄)) R|²) / 3
+
+J the derivative of p by the parameters, R Rᵀ their covariance.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from hilcal.identification.extrapolation import FAR
 from hilcal.identification.predictive import Predictive
+from hilcal.model.model import Model
 from hilcal.readings.ranges import (
     Range,
     angle_name,
@@ -53,7 +63,6 @@ class Measured:
         """Return where fitted states lie.
 
         Args:
-            states: of the fitted readings.
             p: what the fit knows of others.
             noise: (D,) trace of the position's covariance of each measurement, by noise and
                 misfit, m².
@@ -93,12 +102,59 @@ class Measured:
         none = np.zeros(states.q.shape[1], dtype=np.bool_)
         return [o for o in self.outside(states, None, none) if o.of.unit == "rad"]
 
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
-        return asdict(self)
 
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Measured":
-        """Return what `to_json` wrote."""
-        ranges = tuple(Range(**r) for r in content["ranges"])
-        return cls(ranges, float(content["most_std_m"]))
+WORDS = {
+    "time": "time",
+    "load_time": "time under load",
+    "air_temperature": "air temperature",
+    "joint_temperature": "joint temperatures",
+    "approach": "sides of approach",
+}
+"""Columns of `States` that a calibration knows a mean of, as people call them."""
+MOST = 200
+"""Measured states that are looked at, evenly spread; a choice."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Condition:
+    """A quantity on the whole while measuring.
+
+    Attributes:
+        mean: x̄: a number, or (n,).
+        variance_m2: v, m².
+    """
+
+    mean: Floats
+    variance_m2: float
+
+
+def needed(model: Model, states: States) -> tuple[str, ...]:
+    """Columns that effects of a model need and states do not have, in the order of `WORDS`."""
+    needs = {n for e in model.effects if not e.computable(states) for n in e.needs}
+    columns = {column for need in needs for column in need.split(" or ")}
+    return tuple(c for c in WORDS if c in columns and getattr(states, c) is None)
+
+
+def conditions_of(
+    model: Model, states: States, moves: Callable[[States], tuple[Floats, Floats]]
+) -> dict[str, Condition]:
+    """Return the conditions that effects of a model need, by column.
+
+    Args:
+        states: that it was fitted to.
+        moves: position (N, 3) of the tool and J R (N, 3, K) at N states.
+    """
+    names = needed(model, States(states.q, states.wrench))
+    some = states[:: -(-len(states) // MOST)]
+    own = moves(some) if names else None
+    out = {}
+    for name in names:
+        column = getattr(states, name)
+        if column is None or own is None:
+            continue
+        mean = column.mean(axis=0)
+        usual: dict[str, Any] = {name: np.broadcast_to(mean, getattr(some, name).shape).copy()}
+        position, spread = moves(replace(some, **usual))
+        moved = np.sum((own[0] - position) ** 2) + np.sum((own[1] - spread) ** 2)
+        out[name] = Condition(np.asarray(mean), float(moved) / (3 * len(some)))
+    return out

@@ -18,19 +18,18 @@ unsure.
 - `air_degC`, `joint1_degC` …, `load_time_s`, `time_s`, `approach1` …: where the model needs them.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.compensation import Pose, invert
+from hilcal.calibration.compensation import invert_nominal, nominal_pose
 from hilcal.errors import InputError
 from hilcal.names import quoted
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate
 from hilcal.tables.columns import (
     OWN_PREFIX,
     POSITION,
@@ -50,7 +49,7 @@ from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import mapped_table
 from hilcal.tables.mapping import FileFormat, PointMapping
 from hilcal.tables.units import LENGTHS
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 NO_LOAD = "none"
 
@@ -72,7 +71,6 @@ class Points:
     """N points.
 
     Attributes:
-        names: of the points.
         q: (N, n) joint values, rad; rows of NaN where only a pose is given.
         wanted: (N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all.
         wrench: (N, 6) force and moment at the load point, base axes; None where none are given.
@@ -102,7 +100,6 @@ def read_points(
 
     Args:
         path: any kind of table that `import` reads.
-        arm: the arm.
         loads: (6,) wrench by the name of the load.
         mapping: what its columns hold, where they are not called as above.
 
@@ -164,8 +161,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     those of the point before it.
 
     Args:
-        points: the points.
-        arm: the arm.
         tool: (4, 4) T_flange_tool.
         near: (n,) joint values that the first point is near to, rad.
 
@@ -175,7 +170,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     if points.wanted is None:
         return points.q
 
-    poses = _poses_of(arm, tool)
     found: list[Floats] = []
     for name, q, goal in zip(points.names, points.q, points.wanted, strict=True):
         start = q if np.isfinite(q).all() else found[-1] if found else near
@@ -186,8 +180,8 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
             )
         if np.isfinite(goal[:3, 3]).all():
             if not np.isfinite(goal).all():  # turned as the nominal arm has it
-                goal = se3.matrix(poses(start[None], np.zeros(1, int))[0][0], goal[:3, 3])
-            start = _nearest(arm, poses, name, start, goal)
+                goal = se3.matrix(nominal_pose(arm, tool, start[None])[0][0], goal[:3, 3])
+            start = _nearest(arm, tool, name, start, goal)
         found.append(start)
     return np.stack(found)
 
@@ -202,10 +196,7 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
         goal: (4, 4) T_base_tool.
     """
     starts = _everywhere(arm) if near is None else near
-    rotation, position = (
-        np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
-    )
-    found = invert(arm, _poses_of(arm, tool), starts, rotation, position)
+    found = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
     q = found.q[found.solved]
     if near is not None:
         return q
@@ -217,17 +208,6 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
     return np.array(kept).reshape(-1, arm.n)
 
 
-def _poses_of(arm: Arm, tool: Floats) -> Callable[[Floats, Ints], Pose]:
-    """Where the nominal arm has a tool."""
-
-    def poses(at: Floats, rows: Ints) -> Pose:
-        chain = evaluate(arm, at)
-        rotation = se3.product(chain.rotation[-1], tool[:3, :3])
-        return rotation, chain.point(tool[:3, 3]), chain
-
-    return poses
-
-
 def _everywhere(arm: Arm) -> Floats:
     """(STARTS, n) joint values all over the range of the joints."""
     low, high = arm.usual_range
@@ -235,23 +215,15 @@ def _everywhere(arm: Arm) -> Floats:
     return arm.complete(low + spread * (high - low))
 
 
-def _nearest(
-    arm: Arm, poses: Callable[[Floats, Ints], Pose], name: str, near: Floats, goal: Floats
-) -> Floats:
+def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> Floats:
     """Return of all joint values (n,) of a pose those nearest to given ones.
 
     The solution that Newton's method finds from there, where it is near; else the nearest of those
     that it finds from everywhere.
-
-    Raises:
-        InputError: the arm does not reach the pose.
     """
     starts = near[None]
     for _ in range(2):
-        rotation, position = (
-            np.broadcast_to(x, (len(starts), *x.shape)) for x in (goal[:3, :3], goal[:3, 3])
-        )
-        solved = invert(arm, poses, starts, rotation, position)
+        solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])
         q = solved.q
         if arm.coupling is None and arm.mimic is None:  # whole turns on it is the same pose
             q = q + 2 * np.pi * np.round((near - q) / (2 * np.pi)) * ~arm.slides
@@ -287,11 +259,7 @@ def _form(path: Path) -> FileFormat:
 
 
 def _guessed(path: Path, arm: Arm) -> tuple[PointMapping, str]:
-    """Return what the columns of a table seem to hold, and that in words.
-
-    Raises:
-        InputError: something is missing, unsure or not understood.
-    """
+    """Return what the columns of a table seem to hold, and that in words."""
     of = propose(path, joints=arm.n)
     found = of.proposal
     understood = [
@@ -363,11 +331,7 @@ def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
 def _checked(
     path: Path, header: Sequence[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
-    """Check a header; returns its text and its number columns.
-
-    Raises:
-        InputError: an unknown or double column, an incomplete group, or one in two units.
-    """
+    """Check a header; returns its text and its number columns."""
     known = [name for names in groups.values() for name in names]
     exchanged = set(known_columns(arm.units))
     ours = {*known, *exchanged} - {"pose", "load", "target"}
@@ -401,11 +365,7 @@ def _checked(
 
 
 def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
-    """(6,) wrench of a named load.
-
-    Raises:
-        InputError: no such load.
-    """
+    """(6,) wrench of a named load."""
     name = table.text["load"][row]
     if name in (NO_LOAD, ""):
         return np.zeros(6)
@@ -416,11 +376,7 @@ def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
 
 
 def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
-    """(N, 4, 4) poses, taken out of what was found; None where there are none.
-
-    Raises:
-        InputError: a position without an orientation or joint values, or an orientation alone.
-    """
+    """(N, 4, 4) poses, taken out of what was found; None where there are none."""
     position, rotation = found.pop("position_m", None), found.pop("rotation_rad", None)
     if "position_mm" in found:
         position = 1e-3 * found.pop("position_mm")

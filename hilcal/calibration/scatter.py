@@ -11,9 +11,8 @@ scatter as much as that. Where C has the arm's scatter already, all of S is take
 repeats it is what the arm's maker states.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Literal
 
 import numpy as np
 
@@ -61,24 +60,6 @@ class Scatter:
         """(N, 3, 3) covariance of points (N, 3) that the flange carries, base axes, m²."""
         j = drive_jacobian(cell.arm, chain, position)[:, :3] * self.joint_std
         return j @ np.swapaxes(j, 1, 2) + self.std_m**2 * np.eye(3)
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
-        return {
-            "joint_std": self.joint_std.tolist(),
-            "std_m": self.std_m,
-            "known": self.known,
-            "source": self.source,
-        }
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> "Scatter":
-        """Return what `to_json` wrote; older programs told whether it was known alone."""
-        joint_std = np.array(content["joint_std"], dtype=float)
-        source = content.get("source", "stated" if content["known"] else "unknown")
-        if source not in get_args(ScatterSource):
-            raise ValueError(f"a scatter from {source!r}")
-        return cls(joint_std, float(content["std_m"]), source)
 
 
 def scatter_of(fit: Fit) -> Scatter:

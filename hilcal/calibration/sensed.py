@@ -6,9 +6,8 @@ load point, and (f, M) what the load adds to its reading, sensor axes:
     force = R f,   moment = R M − (r − p) × R f
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 
@@ -24,12 +23,12 @@ class SensorMount:
     """Where the force sensor stands.
 
     Attributes:
-        origin: (3,) its origin, flange axes, m.
-        rotvec: (3,) its axes in flange axes, a rotation vector, rad.
+        origin_m: (3,) its origin, flange axes, m.
+        rotvec_rad: (3,) its axes in flange axes, a rotation vector, rad.
     """
 
-    origin: Floats
-    rotvec: Floats
+    origin_m: Floats
+    rotvec_rad: Floats
 
     @classmethod
     def of(cls, cell: Cell) -> Self | None:
@@ -45,23 +44,11 @@ class SensorMount:
         As in a campaign, the arm is the nominal one.
 
         Args:
-            cell: the cell.
             q: (N, n) joint values, rad.
             reading: (N, 6) what the load adds to the sensor's reading, sensor axes.
         """
         chain = evaluate(cell.arm, q)
-        axes = se3.product(chain.rotation[-1], se3.rotation(self.rotvec))
+        axes = se3.product(chain.rotation[-1], se3.rotation(self.rotvec_rad))
         turned = [se3.apply(axes, part) for part in (reading[:, :3], reading[:, 3:])]
-        lever = chain.point(cell.load_point) - chain.point(self.origin)
+        lever = chain.point(cell.load_point) - chain.point(self.origin_m)
         return shift(np.concatenate(turned, axis=1), lever)
-
-    def to_json(self) -> dict[str, object]:
-        """Return it as JSON, SI."""
-        return {"origin_m": self.origin.tolist(), "rotvec_rad": self.rotvec.tolist()}
-
-    @classmethod
-    def from_json(cls, content: Mapping[str, Any] | None) -> Self | None:
-        """Return what `to_json` wrote; None for None."""
-        if content is None:
-            return None
-        return cls(np.array(content["origin_m"], float), np.array(content["rotvec_rad"], float))

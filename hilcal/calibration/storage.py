@@ -9,7 +9,7 @@ else is decimal numbers, exactly.
 import base64
 import json
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -24,10 +24,9 @@ from hilcal.calibration.check_stored import (
     check_numbers,
     check_spread,
 )
-from hilcal.calibration.conditions import Condition
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Measured
-from hilcal.calibration.scatter import Scatter
+from hilcal.calibration.measured import Condition, Measured
+from hilcal.calibration.scatter import Scatter, ScatterSource
 from hilcal.calibration.sensed import SensorMount
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
@@ -35,6 +34,7 @@ from hilcal.errors import InputError
 from hilcal.identification.robot_frames import one_of_each
 from hilcal.model.model import Model
 from hilcal.names import check_names
+from hilcal.readings.ranges import Range
 from hilcal.readings.readings import ObserverKind, ObserverName
 from hilcal.readings.whitening import MODES
 from hilcal.robot.arm import Arm
@@ -120,11 +120,11 @@ def to_json(c: Calibration) -> dict[str, object]:
         "std": std.tolist(),
         **known,
         "misfit_m2": c.misfit,
-        "scatter": c.scatter.to_json(),
-        "measured": c.measured.to_json(),
-        "conditions": {name: x.to_json() for name, x in c.conditions.items()},
+        "scatter": {**_plain(asdict(c.scatter)), "known": c.scatter.known},
+        "measured": asdict(c.measured),
+        "conditions": {name: _plain(asdict(x)) for name, x in c.conditions.items()},
         "loads": {name: wrench.tolist() for name, wrench in c.loads.items()},
-        "force_sensor": None if c.sensor is None else c.sensor.to_json(),
+        "force_sensor": None if c.sensor is None else _plain(asdict(c.sensor)),
     }
 
 
@@ -174,19 +174,22 @@ def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) ->
         root = flat.reshape(len(std), -1).astype(float) * std[:, None]
         check_numbers("covariance_root", root, root.shape)
     check_numbers("misfit_m2", float(content["misfit_m2"]), least=0.0)
-    scatter, measured = (
-        Scatter.from_json(content["scatter"]),
-        Measured.from_json(content["measured"]),
-    )
+    of = content["measured"]
+    measured = Measured(tuple(Range(**r) for r in of["ranges"]), float(of["most_std_m"]))
+    scatter = _scatter(content["scatter"])
     check_spread(scatter, measured, arm.n)
-    conditions = {k: Condition.from_json(x) for k, x in content.get("conditions", {}).items()}
+    conditions = {
+        k: Condition(_array(x["mean"]), float(x["variance_m2"]))
+        for k, x in content.get("conditions", {}).items()
+    }
     check_conditions(conditions, arm.n)
     loads = {name: _array(wrench) for name, wrench in content["loads"].items()}
     for name, wrench in loads.items():
         check_numbers(f"load {name}", wrench, (6,))
-    sensor = SensorMount.from_json(content.get("force_sensor"))
-    if sensor is not None:
-        check_numbers("force_sensor", np.array([sensor.origin, sensor.rotvec]), (2, 3))
+    sensor = None
+    if (mount := content.get("force_sensor")) is not None:
+        sensor = SensorMount(_array(mount["origin_m"]), _array(mount["rotvec_rad"]))
+        check_numbers("force_sensor", np.array([sensor.origin_m, sensor.rotvec_rad]), (2, 3))
     return Calibration(
         model=model,
         theta=theta,
@@ -251,6 +254,14 @@ def _cell(content: Mapping[str, Any], arm: Arm) -> Cell:
         cell, targets=_array(content["targets"]), target_names=tuple(content["target_names"])
     )
     return several.with_targets(_array(content["targets"]), content["known_targets"])
+
+
+def _scatter(content: Mapping[str, Any]) -> Scatter:
+    """Return a scatter; older programs told whether it was known alone."""
+    source = content.get("source", "stated" if content["known"] else "unknown")
+    if source not in get_args(ScatterSource):
+        raise ValueError(f"a scatter from {source!r}")
+    return Scatter(_array(content["joint_std"]), float(content["std_m"]), source)
 
 
 def _observer(content: Mapping[str, Any]) -> Observer:

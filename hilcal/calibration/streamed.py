@@ -17,7 +17,6 @@ def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibr
     of the sample, scaled to the number of readings of the stream.
 
     Args:
-        found: the fit.
         source: what it is from, for people.
     """
     of_sample = Calibration.of(found.sample, source)

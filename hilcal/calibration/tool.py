@@ -50,7 +50,6 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
     """Return the tracked target as fitted, or a tool with another pose.
 
     Args:
-        model: the fitted model.
         theta: (P,) its parameters.
         pose: (4, 4) T_flange_tool; the (first) tracked target where None.
     """

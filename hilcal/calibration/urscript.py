@@ -134,7 +134,6 @@ def program_points(
     """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool.
 
     Args:
-        path: of the program.
         leave: keep waypoints that are not understood as they are.
 
     Raises:
@@ -205,11 +204,7 @@ class _Program:
 
     @classmethod
     def of(cls, found: tuple[Statement, ...]) -> "_Program":
-        """Collect names.
-
-        Raises:
-            InputError: one of the language's own is given another meaning.
-        """
+        """Collect names."""
         bound: dict[str, list[tuple[int, ast.expr | None]]] = {}
         functions, elements = set(), set()
         for k, s in enumerate(found):
@@ -317,11 +312,7 @@ class _Program:
 
 
 def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
-    """Go through the statements: motions in the order of the text.
-
-    Raises:
-        InputError: something could change where a corrected waypoint leads.
-    """
+    """Go through the statements: motions in the order of the text."""
     out: list[Waypoint] = []
     stands: tuple[int, ...] | None = None  # blocks of the waypoint at which the arm stands
     begins = True  # it stands where the program found it
@@ -366,11 +357,7 @@ def _waypoints(p: _Program) -> tuple[Waypoint, ...]:
 
 
 def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | None]]]) -> Waypoint:
-    """Return the waypoint of a motion.
-
-    Raises:
-        InputError: the tool or the payload that it has depends on the way to it.
-    """
+    """Return the waypoint of a motion."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name, named = s.called[s.call], {n.arg: n.value for n in s.call.keywords}
@@ -401,11 +388,7 @@ def _waypoint(p: _Program, k: int, setup: Mapping[str, tuple[int, list[Value | N
 def _set_up(
     p: _Program, k: int, setup: dict[str, tuple[int, list[Value | None]]], *, moved: bool
 ) -> None:
-    """Take note of a tool centre point, a payload or gravity.
-
-    Raises:
-        InputError: it is computed, or another one than before.
-    """
+    """Take note of a tool centre point, a payload or gravity."""
     s = p.statements[k]
     assert s.call is not None  # noqa: S101 - see `_check_calls`
     name = s.called[s.call]
@@ -427,11 +410,7 @@ def _set_up(
 
 
 def _check_calls(p: _Program, s: Statement) -> None:
-    """Refuse functions that are not known, and motions within expressions.
-
-    Raises:
-        InputError: names the line and the function.
-    """
+    """Refuse functions that are not known, and motions within expressions."""
     moves = s.call is not None and s.called[s.call] in MOVES
     targets = [*s.call.args[:1], *(n.value for n in s.call.keywords)] if moves and s.call else []
     for call, name in s.called.items():

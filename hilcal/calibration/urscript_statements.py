@@ -137,11 +137,7 @@ def _as_python(body: str, word: str) -> tuple[str, int]:
 
 
 def _parsed(text: str, number: int, word: str) -> ast.stmt:
-    """Parse one line, which begins with a word.
-
-    Raises:
-        InputError: it is not one known statement.
-    """
+    """Parse one line, which begins with a word."""
     for sign in _OTHER_SIGN.findall(_STRING_OR_COMMENT.sub("", text)):
         raise _refused(number, f"the sign {sign!a} outside of a comment")
     what, header = f"'{text[:40]}' is not understood", word in (*_OPENS, "elif")
@@ -159,11 +155,7 @@ def _parsed(text: str, number: int, word: str) -> ast.stmt:
 
 
 def _check_depth(node: ast.AST) -> None:
-    """Refuse an expression in expressions without end: how many Python itself reads varies.
-
-    Raises:
-        ValueError: it is nested too deeply.
-    """
+    """Refuse an expression in expressions without end: how many Python itself reads varies."""
     level: list[ast.AST] = [node]
     for _ in range(limits.NESTED):
         level = [part for one in level for part in ast.iter_child_nodes(one)]
@@ -172,11 +164,7 @@ def _check_depth(node: ast.AST) -> None:
 
 
 def _parts(node: ast.stmt) -> Iterator[ast.AST]:
-    """Yield all nodes of a statement but the `pass` that `_parsed` put into it.
-
-    Raises:
-        ValueError: it is of another kind than the known ones.
-    """
+    """Yield all nodes of a statement but the `pass` that `_parsed` put into it."""
     match node:
         case ast.If(test=test) | ast.While(test=test):
             yield from ast.walk(test)

@@ -76,8 +76,6 @@ class Campaign(Brief):
 
     Attributes:
         file: the SQLite file, open for appending revisions.
-        config: the cell's configuration.
-        cell: the cell.
         readings: all readings, with the covariance of instrument, averaging and repeatability.
         catalogue: the effects that a model of it can have.
         changes: what is different in the cell from what it was told to be when the readings were
@@ -101,7 +99,6 @@ class Campaign(Brief):
         """Open a campaign file; its cell is that of the revision in use.
 
         Args:
-            path: the file.
             catalogue: the effects that a model can have; the installed ones unless given.
             read_only: write nothing to the file, nor beside it.
 
@@ -339,7 +336,6 @@ class Campaign(Brief):
 
         Args:
             number: of its revision; None for a baseline that is not kept.
-            scaling: of the fit.
             what: is to be done with it.
 
         Raises:
@@ -497,9 +493,6 @@ class Campaign(Brief):
         """Store a fit, with what was changed in the model since the revision before.
 
         Args:
-            found: the fit.
-            diagnosis: of it.
-            added: the effect that was added.
             removed: the effect that was taken out.
             parent: number of the revision that was changed; the one before where None.
 
@@ -540,7 +533,6 @@ class Campaign(Brief):
         Nothing is stored; the number is None where the baseline was fitted.
 
         Args:
-            say: takes progress, one line each.
             revision: number of the revision; see `in_use`.
 
         Raises:
@@ -563,7 +555,6 @@ class Campaign(Brief):
         Without any revision it is the baseline, which is not stored.
 
         Args:
-            say: takes progress, one line each.
             revision: number of the revision; see `in_use`.
 
         Raises:

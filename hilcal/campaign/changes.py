@@ -28,10 +28,7 @@ class Changed:
 
     Attributes:
         before_number: number of the revision before.
-        before: its fit.
         number: of the new revision.
-        fit: of it.
-        diagnosis: of that fit.
         added: the effect that was added, with its options where a finer form took its place.
         removed: the effect that was taken out.
         expected: what the fit before promised of an effect that was added, and what was kept of it;
@@ -63,10 +60,6 @@ def add_effect(
         o: the campaign.
         number: of the revision; None where there is none yet: `before` then becomes one, too, when
             the effect could be added.
-        before: its fit.
-        effect: name in the catalogue.
-        options: of the effect.
-        say: takes progress, one line each.
         judged: the diagnosis of `before`, which is kept with it.
 
     Raises:
@@ -131,9 +124,6 @@ def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTH
     arm's scatter. Nothing is stored.
 
     Args:
-        o: the campaign.
-        record: the revision.
-        say: takes progress, one line each.
         history: how its model was reached, where the new revision is made from it.
 
     Raises:
@@ -171,9 +161,7 @@ def change_cell(
     Args:
         o: the campaign, in the cell of the revision.
         number: of the revision; None where there is none yet: `before` then becomes one, too.
-        before: its fit.
         changes: as for `Campaign.with_cell`.
-        say: takes progress, one line each.
         judged: the diagnosis of `before`, which is kept with it.
 
     Returns:

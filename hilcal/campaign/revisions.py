@@ -28,8 +28,7 @@ from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.command_line import COMMAND
 from hilcal.store.records import content_hash
-from hilcal.store.revision import STORED, RevisionRecord, to_text
-from hilcal.store.stored_priors import CARRIED
+from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
 from hilcal.types import Floats
 
 _LARGEST = 1e9
@@ -56,7 +55,6 @@ def to_record(
     """Store a fit: enough to find it again, and what was reported of it.
 
     Args:
-        found: the fit.
         diagnosis: its document, see `present.diagnosis_document`, where it was diagnosed.
         added: the effect that made it from the revision before; without any change a new chain
             starts.
@@ -66,6 +64,7 @@ def to_record(
     """
     effects, cell = found.model.effects, found.model.cell
     scatter, serial = found.readings.arm_scatter, found.readings.serial
+    observers = [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
     result: dict[str, object] = {"identify": fit_document.to_json(found)}
     if diagnosis is not None:
         result["diagnose"] = fit_document.plain(diagnosis)
@@ -90,7 +89,7 @@ def to_record(
             "registration": cell.registration.tolist(),
             "target": cell.target.tolist(),
             **({} if cell.targets is None else {"targets": cell.targets.tolist()}),
-            **({"observers": _observers_json(cell)} if cell.observers else {}),
+            **({"observers": observers} if cell.observers else {}),
             "outliers": np.flatnonzero(found.outlier).tolist(),
             **({} if scatter is None else {"arm_scatter": scatter.to_json()}),
             **({} if serial is None else {SERIAL: serial.to_json()}),
@@ -99,10 +98,6 @@ def to_record(
         },
         result_json=result,
     )
-
-
-def _observers_json(cell: Cell) -> list[dict[str, object]]:
-    return [{"frame": o.frame.tolist(), "offset_m": o.offset} for o in cell.observers]
 
 
 def _placed(cell: Cell, stored: Sequence[Mapping[str, Any]]) -> Cell:
@@ -149,9 +144,7 @@ def restore(
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
     Args:
-        record: the revision.
         cell: the cell of the campaign's configuration.
-        readings: all readings of the campaign.
         catalogue: has its effects; the installed ones unless given.
         stored: hash of the readings as the file stores them, where there is a file.
 
@@ -224,7 +217,6 @@ def restore_model(
     """Model and parameters (P,) of a revision, in the cell as it was registered then.
 
     Args:
-        record: the revision.
         cell: the cell of the campaign's configuration.
         readings: the readings that it was fitted to.
         catalogue: has its effects; the installed ones unless given.
@@ -309,8 +301,6 @@ def restore_predictive(
     """Return what a stored fit knows of readings that it has not seen.
 
     Args:
-        record: the revision.
-        model: its model.
         theta: (P,) its parameters.
         readings: all readings that it was fitted to.
     """
@@ -344,7 +334,6 @@ def chain(
     """Return a revision and those that it was made from, oldest first.
 
     Args:
-        records: all revisions of a campaign.
         last: number of the revision; the latest where None.
     """
     by_number = {r.number: r for r in records}

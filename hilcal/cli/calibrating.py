@@ -58,8 +58,7 @@ from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode
 from hilcal.refinement import Refinement
-from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.new_campaign import may_write
+from hilcal.store.campaign_file import CampaignFile, may_write
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
 from hilcal.tables.units import parse_duration, parse_length

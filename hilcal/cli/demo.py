@@ -36,7 +36,7 @@ from hilcal.diagnosis.doubt import in_doubt as left_open
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
-from hilcal.discovery.agreement import agreement
+from hilcal.discovery.discovery import agreement
 from hilcal.discovery.document import laws_json
 from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.search import SAME
@@ -79,7 +79,7 @@ from hilcal.procedure.state import Files, Settings
 from hilcal.refinement import Refinement
 from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.new_campaign import may_write
+from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.records import content_hash
 

@@ -12,7 +12,7 @@ import tomli_w
 
 from hilcal.calibration import dh_table, handover
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.corrected import Corrected, corrected
+from hilcal.calibration.handover import Corrected, corrected
 from hilcal.calibration.own_files.correct import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, check_new, option

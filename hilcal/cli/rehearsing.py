@@ -26,7 +26,7 @@ from hilcal.cli.planning import make_plan, read_cell
 from hilcal.cli.running import measure
 from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.config import CellConfig
-from hilcal.config.write import to_toml
+from hilcal.config.template import to_toml
 from hilcal.design.checked_plan import refuse
 from hilcal.drivers.simulated.rehearsal import (
     NOTHING,
@@ -48,9 +48,8 @@ from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.readings.readings import Readings
-from hilcal.store.appended import with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, load_plan
+from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog, create_run
 from hilcal.whole_file import replace_file

@@ -40,7 +40,6 @@ def changed(config: CellConfig, changes: Changes) -> CellConfig:
     """Return a configuration with changes.
 
     Args:
-        config: the configuration.
         changes: of some keys of `CHANGEABLE`; None leaves a key out.
 
     Raises:

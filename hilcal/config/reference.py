@@ -47,7 +47,6 @@ class Key:
     """One key.
 
     Attributes:
-        name: of the key.
         unit: of its value; "" for texts, choices and tables.
         default: as it is written in TOML, `REQUIRED` or `NOT_SET`.
         valid: what its value must be.
@@ -69,7 +68,6 @@ class KeyTable:
         name: e.g. "tracker".
         header: as it is written, e.g. "[tracker]" or "[[loads]]".
         about: what it is for, one line.
-        keys: its keys, in order.
     """
 
     name: str

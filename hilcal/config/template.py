@@ -1,9 +1,12 @@
-"""A commented CELL.toml to begin with; its comments are those of the sections themselves."""
+"""A configuration as TOML: a commented CELL.toml to begin with, or one without its defaults."""
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+import tomli_w
+
+from hilcal.config.cell import CellConfig
 from hilcal.config.reference import Key, KeyTable, inline, table, tables
 from hilcal.names import escaped
 
@@ -36,7 +39,6 @@ def cell_text(data: Mapping[str, Any], title: str) -> str:
 
     Args:
         data: the sections and keys that have values, as TOML has them.
-        title: first line.
     """
     lines, known = [_HEAD.format(title=escaped(title))], tables()
     for name, keys in SHOWN.items():
@@ -72,3 +74,8 @@ def _key(key: Key, values: Mapping[str, Any]) -> Iterator[str]:
 
 def _comment(words: str) -> list[str]:
     return [f"# {line}" for line in textwrap.wrap(words, _WIDTH)]
+
+
+def to_toml(config: CellConfig) -> str:
+    """Return CELL.toml's text; `load_config` reads back the same configuration."""
+    return tomli_w.dumps(config.model_dump(exclude_none=True, exclude_defaults=True, mode="json"))

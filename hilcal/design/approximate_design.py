@@ -75,12 +75,10 @@ def relax(
     The bound is of the scan of all units.
 
     Args:
-        units: what can be taken.
         criterion: φ.
         budget: B, in the units of the cost.
         prior: (P, P) M0, what is known before; zero by default.
         most: how often a unit may be taken; any number of times by default.
-        names: of the parameters, for messages.
         tolerance: relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks.
         start: optimum of a similar problem over the same units.
 
@@ -102,7 +100,8 @@ def relax(
         return ApproximateDesign(
             all_of_them, np.full(len(units), cap), value, value, np.ones(len(units)), spread
         )
-    scan = _Scan(units, criterion, min(budget, (1.0 - 1e-9) * cap * _total(units)), cap, prior)
+    most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
+    scan = _Scan(units, criterion, min(budget, most_spent), cap, prior)
     if start is None:
         active, weight = _first(scan, spread)
         order = 0.3
@@ -184,11 +183,6 @@ class _Scan:
         program = BarrierProgram(self.criterion, rows, cost, self.budget, self.cap, self.prior)
         found = interior.solve(program, start, goal, order)
         return replace(found, weight=found.weight[: len(active)])
-
-
-def _total(units: CandidateSet) -> float:
-    """Return the cost of all units."""
-    return float(units.cost.sum())
 
 
 def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats:

@@ -136,7 +136,6 @@ class Optimum:
         smooth: f there, with the matrices of the bound.
         value: φ.
         bound: of φ over these units.
-        order: of the surrogate.
     """
 
     weight: Floats
@@ -159,7 +158,6 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     Methods), μ falling to 0. Criteria with a kink have a surrogate of order μ.
 
     Args:
-        program: the units.
         start: (n,) weights over 0, under `most`, that spend the budget.
         tolerance: relative gap at which to stop.
         order: μ n at the start, about the relative gap of the start.

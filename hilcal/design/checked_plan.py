@@ -19,7 +19,6 @@ class CheckedPlan(Shown, Tabular):
 
     Attributes:
         plan: poses, loads and steps, as a plan file holds them.
-        dry: the dry run.
         summary: cost, predicted precision and efficiency.
     """
 

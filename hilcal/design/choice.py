@@ -1,4 +1,15 @@
-"""Criteria by name, the choice of units, and of the loads that are worth their change."""
+"""Criteria by name, the choice of units, and of the loads that are worth their change.
+
+Potential terms make a plan good at more than its model, and so less good at the model alone. A
+compound criterion is the mean of both: of the logarithms of the two D-efficiencies, so that
+neither optimum is needed, or of the two inefficiencies in the parameters' mean variance,
+
+    φ = det(M)^(1/2P) · det(M_ss)^(1/2s)          1/φ = ½ q(M)/q* + ½ q(M_ss)/q_s*
+
+with q(M) = tr(C M⁻¹), the first s of P parameters those of the model, and q* and q_s* the least
+of both. Source: Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007),
+chapter 21.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -7,10 +18,9 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
 from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criteria import A, D, MeanVariance
+from hilcal.design.criteria import D, E, K, MeanVariance
 from hilcal.design.criterion import Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
-from hilcal.design.eigenvalue_criteria import E, K
 from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import balanced, mixed_design
 from hilcal.design.optimum import Design, best
@@ -52,6 +62,15 @@ class Objective:
     names: tuple[str, ...]
     apart: DiscriminatedPairs | None = None
 
+    def relaxed(
+        self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None
+    ) -> ApproximateDesign:
+        """Return the continuous optimum of so many readings; see `approximate_design.relax`."""
+        return relax(
+            self.units, self.criterion, budget, self.prior, names=self.names,
+            tolerance=tolerance, start=start,
+        )  # fmt: skip
+
 
 def canonical(name: str) -> str:
     """Return the name of a criterion: I-optimality was called "test" before."""
@@ -64,8 +83,6 @@ def objective_of(
     """Return a design problem with a criterion.
 
     Args:
-        problem: the design problem.
-        config: its loads and noise.
         name: one of `CRITERIA`, or "test", the former name of "I".
         work: the prediction poses, for "I".
 
@@ -79,7 +96,7 @@ def objective_of(
     if name == "D":
         return whole
     if name == "A":
-        return replace(whole, criterion=A(np.arange(size)))
+        return replace(whole, criterion=MeanVariance(_mean_of(size, len(names)), "A"))
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
@@ -133,12 +150,7 @@ def choose_poses(
     readings at any number of poses, under any loads.
 
     Args:
-        asked: the question, of all units.
-        problem: the design problem.
         usable: (K,) which units there are to choose from.
-        poses: how many.
-        rng: generator.
-        effort: of the search.
     """
     free, index = only(asked, usable), np.flatnonzero(usable)
     of: dict[int, list[int]] = {}
@@ -165,9 +177,7 @@ def choose_poses(
     for mine, count in zip(members, found.counts.tolist(), strict=True):
         counts[mine] = count
     cost = float(counts @ free.units.cost)
-    relaxed = relax(
-        free.units, asked.criterion, cost, asked.prior, names=asked.names, tolerance=LOOSE
-    )
+    relaxed = free.relaxed(cost)
     bound = max(relaxed.bound, found.value)
     return replace(found, counts=counts, bound=bound, cost=cost, relaxed=relaxed)
 
@@ -175,9 +185,7 @@ def choose_poses(
 def promising(asked: Objective, budget: float) -> tuple[Ints, ApproximateDesign]:
     """Return the units that a plan is likely to be made of, those of the best prices, and why."""
     tolerance = min(KINKED_TOLERANCE, LOOSE) if asked.criterion.kinked else LOOSE
-    found = relax(
-        asked.units, asked.criterion, budget, asked.prior, names=asked.names, tolerance=tolerance
-    )
+    found = asked.relaxed(budget, tolerance)
     count = min(2 * len(found.index), len(asked.units))
     best_first = np.argsort(-found.price / asked.units.cost, kind="stable")
     return np.union1d(found.index, best_first[:count]), found
@@ -192,11 +200,8 @@ def costly_loads(
     instead. Compared are the continuous optima over some of the poses, one load after the other.
 
     Args:
-        asked: the question.
-        problem: the design problem.
         budget: readings of the plan with all loads.
         change: readings that fit into the time of one load change.
-        rng: generator.
     """
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]
@@ -233,9 +238,46 @@ def _value(
     allowed = {*loads, problem.candidates.loads[0]}
     some = only(asked, sample & np.array([set(names) <= allowed for _, names in problem.what]))
     try:
-        found = relax(
-            some.units, some.criterion, budget, some.prior, names=some.names, tolerance=LOOSE
-        )
+        return some.relaxed(budget).value
     except (CannotAnswerError, InputError):
         return 0.0
-    return float(found.value)
+
+
+def _mean_of(size: int, every: int) -> Floats:
+    """(P, P) C of the mean variance of the first s parameters."""
+    return np.diag(np.where(np.arange(every) < size, 1.0 / size, 0.0))
+
+
+def compound_objective(
+    problem: DesignProblem,
+    config: CellConfig,
+    name: str,
+    work: PredictionPoses | None,
+    budget: float,
+    rng: np.random.Generator,
+) -> Objective:
+    """Return a design problem with a criterion; D and A are compound with potential terms.
+
+    Args:
+        work: the prediction poses, for "I".
+        budget: readings, for which the two optima of A are found.
+        rng: generator; they are found among some of the poses.
+
+    Raises:
+        CannotAnswerError: so many readings do not determine the model.
+        InputError: from `objective_of`.
+    """
+    name = canonical(name)
+    asked, size = objective_of(problem, config, name, work), problem.model_size
+    if size == len(problem.terms) or name not in ("A", "D"):
+        return asked
+    if name == "D":
+        return replace(asked, criterion=D(size))
+    c = _mean_of(size, len(problem.terms))
+    whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
+    poses = np.array([pose for pose, _ in problem.what])
+    some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))
+    units = CandidateSet(some.units.rows[:, :, :size], some.units.cost)
+    alone = Objective(own, units, asked.prior[:size, :size], asked.names[:size])
+    a, b = (q.relaxed(budget).value / 2.0 for q in (replace(some, criterion=whole), alone))
+    return replace(asked, criterion=MeanVariance(a * c, name, b * c[:size, :size]))

@@ -6,8 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.design.criterion import Criterion, Smooth, factors, inverse, square
+from hilcal.design.criterion import Criterion, Root, Smooth, factors, inverse, soft_least, square
 from hilcal.errors import InputError
+from hilcal.regression.schur import (
+    SchurComplement,
+    differentiable_schur_complement,
+    schur_complement,
+)
 from hilcal.types import Floats, Ints
 
 
@@ -26,12 +31,25 @@ class SmoothCriterion(Criterion):
         """Return f = log φ; None where M is singular."""
 
 
-class Determinant(SmoothCriterion):
-    """φ(M) = Π det(M_bb)^c over weighted blocks b of parameters."""
+@dataclass(frozen=True, slots=True)
+class D(SmoothCriterion):
+    """φ(M) = det(M)^(1/P), the inverse volume of the confidence ellipsoid.
 
-    @abstractmethod
+    Fedorov (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics
+    Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
+
+    Attributes:
+        model: s of a model whose parameters come first; None where all are taken for unknown.
+    """
+
+    model: int | None = None
+    name = "D"
+
     def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return exponents c and indices b, for M of this size."""
+        """Return exponents and indices of the determinants, for M of this size."""
+        if self.model is None:
+            return ((1.0 / size, np.arange(size)),)
+        return (0.5 / size, np.arange(size)), (0.5 / self.model, np.arange(self.model))
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -40,7 +58,7 @@ class Determinant(SmoothCriterion):
         for c, at in self.blocks(m.shape[-1]):
             factor, regular = factors(flat[:, at[:, None], at])
             log += 2.0 * c * np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(axis=1)
-            good &= regular | (c < 0.0)
+            good &= regular
         found = np.where(good, np.exp(np.where(good, log, 0.0)), 0.0)
         return np.asarray(found.reshape(m.shape[:-2]))
 
@@ -61,42 +79,44 @@ class Determinant(SmoothCriterion):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class D(Determinant):
-    """φ(M) = det(S)^(1/s), the inverse volume of the confidence ellipsoid.
+class MeanVariance(SmoothCriterion):
+    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: A- and I-optimality.
 
-    S is M, or with parameters of interest the Schur complement of the others (D_s). Fedorov
-    (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics Research
-    10(6).
+    With C = 1/s at s parameters it is their mean variance: O5 of Sun & Hollerbach (2008), IEEE
+    ICRA, "Observability index selection for robot calibration". With C the mean of VᵀV over
+    prediction poses, V the Jacobian of the position there, it is that of the predicted position:
+    Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
+    model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
 
     Attributes:
-        interest: indices of the s parameters of interest; all by default.
+        c: (P, P) C, positive semidefinite.
+        name: name by which a configuration calls it.
+        model: (s, s) C_s of a model whose parameters come first; None where all are unknown.
     """
 
-    interest: Ints | None = None
-    name = "D"
+    c: Floats
+    name: str = "I"
+    model: Floats | None = None
 
-    def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
-        """Return M, and by Schur's formula det S = det M / det M_nn the nuisance n."""
-        every = np.arange(size)
-        if self.interest is None:
-            return ((1.0 / size, every),)
-        chosen = _interest(self.interest, size)
-        rest, share = np.setdiff1d(every, chosen), 1.0 / len(chosen)
-        return ((share, every), (-share, rest)) if len(rest) else ((share, every),)
+    def __post_init__(self) -> None:
+        """Refuse a matrix that is no mean of squares."""
+        c = square(self.c, "the matrix of the prediction poses")
+        scale = float(np.trace(c))
+        if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
+            raise InputError(
+                "the matrix of the prediction poses is not positive semidefinite, or zero"
+            )
 
-
-class InverseVariance(SmoothCriterion):
-    """φ(M) = 1 / q with q = Σ tr(C M_bb⁻¹), b the first len(C) parameters."""
-
-    @abstractmethod
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return the matrices C (b, b), for M of this size."""
+    @property
+    def parts(self) -> tuple[Floats, ...]:
+        """The matrices C (b, b) of M_bb⁻¹, b the first parameters."""
+        return (self.c,) if self.model is None else (self.c, self.model)
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices; 0 where singular."""
         flat = m.reshape(-1, *m.shape[-2:])
         q, good = np.zeros(len(flat)), np.ones(len(flat), dtype=np.bool_)
-        for c in self.parts(m.shape[-1]):
+        for c in self.parts:
             factor, regular = factors(flat[:, : len(c), : len(c)])
             found = np.linalg.inv(factor)
             q += np.einsum("nij,nij->n", found @ c, found)
@@ -108,7 +128,7 @@ class InverseVariance(SmoothCriterion):
         """Return f = −log q with gradient Σ M_bb⁻¹ C M_bb⁻¹ / q."""
         found: list[tuple[Floats, Floats]] = []
         q = 0.0
-        for c in self.parts(len(m)):
+        for c in self.parts:
             b = len(c)
             root = inverse(m[:b, :b])
             if root is None:
@@ -125,69 +145,126 @@ class InverseVariance(SmoothCriterion):
         return Smooth(-float(np.log(q)), gradient, products, ((1.0, gradient),), gradient / q)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MeanVariance(InverseVariance):
-    """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: I-optimality.
-
-    With C the mean of VᵀV over prediction poses, V the Jacobian of the position there, tr(C M⁻¹)
-    is the mean variance of the predicted position. Atkinson, Donev and Tobias, *Optimum
-    Experimental Designs, with SAS* (2007), chapter 10.
-
-    Attributes:
-        c: (P, P) positive semidefinite.
-        name: name by which a configuration calls it.
-    """
-
-    c: Floats
-    name: str = "I"
-
-    def __post_init__(self) -> None:
-        """Refuse a matrix that is no mean of squares."""
-        c = square(self.c, "the matrix of the prediction poses")
-        scale = float(np.trace(c))
-        if not scale > 0.0 or np.linalg.eigvalsh(c)[0] < -1e-9 * scale:
-            raise InputError(
-                "the matrix of the prediction poses is not positive semidefinite, or zero"
-            )
-
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return C."""
-        return (self.c,)
+_FLOOR = 1e-14
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class A(InverseVariance):
-    """φ(M) = s / Σ (M⁻¹)_ii over s parameters, the inverse of their mean variance.
+class E(Criterion):
+    """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
 
-    O5 of Sun & Hollerbach (2008), IEEE ICRA, "Observability index selection for robot
-    calibration".
+    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters,
+    M itself where all are of interest. The surrogate is the barrier of the semidefinite program
+    max t, S ⪰ t 1: F = max over t of t + μ log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has
+    trace 1: λ_min(N) ≤ tr(Z N).
 
     Attributes:
-        interest: indices of the parameters; all by default.
+        interest: indices of the parameters of interest; all by default.
     """
 
     interest: Ints | None = None
-    name = "A"
+    name = "E"
+    monotone = True
+    kinked = True
 
-    def parts(self, size: int) -> tuple[Floats, ...]:
-        """Return the diagonal matrix of 1/s at the parameters of interest."""
-        chosen = np.arange(size) if self.interest is None else _interest(self.interest, size)
-        out = np.zeros((size, size))
-        out[chosen, chosen] = 1.0 / len(chosen)
-        return (out,)
+    def value(self, m: Floats) -> Floats:
+        """Return φ of (..., P, P) matrices."""
+        s = m if self.interest is None else schur_complement(m, self.interest)
+        return np.asarray(np.maximum(np.linalg.eigvalsh(s)[..., 0], 0.0))
+
+    def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
+        """Return f = F / λ_min(m) with μ = order · λ_min(m)."""
+        values = np.linalg.eigvalsh(differentiable_schur_complement(m, self.interest).matrix)
+        scale = max(float(values[0]), _FLOOR * float(values[-1]))
+
+        def smooth(m: Floats) -> Smooth | None:
+            part = _least(differentiable_schur_complement(m, self.interest), order * scale)
+            return Smooth(
+                part.value / scale,
+                part.gradient / scale,
+                tuple((c / scale, x, y) for c, x, y in part.products),
+                tuple((c / scale, v) for c, v in part.squares),
+                part.gradient,
+            )
+
+        return smooth
 
 
-def _interest(interest: Ints, size: int) -> Ints:
-    """Return checked indices of parameters.
+@dataclass(frozen=True, slots=True, eq=False)
+class K(Criterion):
+    """φ(M) = λ_min(M) / λ_max(M), the inverse of the condition number.
 
-    Raises:
-        InputError: none, one that is there twice, or one that does not exist.
+    The square of O2 of Driels & Pathre (1990), J. Robotic Systems 7(2). Quasi-concave: the
+    surrogate is F_min − κ F_max with the ratio κ reached so far (Dinkelbach 1967), and with
+    the densities Z and Y of the extreme eigenvalues φ(N) ≤ tr(Z N) / tr(Y N).
     """
-    chosen = np.asarray(interest, dtype=np.int64).reshape(-1)
-    unique = np.unique(chosen)
-    if not len(chosen) or len(unique) < len(chosen) or unique[0] < 0 or unique[-1] >= size:
-        raise InputError(
-            f"parameters of interest {chosen.tolist()}; valid: different indices from 0 to "
-            f"{size - 1}, at least one"
-        )
-    return chosen
+
+    name = "K"
+    monotone = False
+    kinked = True
+
+    def value(self, m: Floats) -> Floats:
+        """Return φ of (..., P, P) matrices."""
+        values = np.linalg.eigvalsh(m)
+        most = values[..., -1]
+        safe = np.where(most > 0, most, 1.0)
+        return np.asarray(np.where(most > 0, np.maximum(values[..., 0], 0.0) / safe, 0.0))
+
+    def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
+        """Return f = (F_min − κ F_max) / λ_min(m), widths in proportion to the eigenvalues."""
+        values = np.linalg.eigvalsh(m)
+        most = float(values[-1])
+        scale = max(float(values[0]), _FLOOR * most)
+        ratio = scale / most
+
+        def smooth(m: Floats) -> Smooth | None:
+            values, vectors = np.linalg.eigh(m)
+            least = _part(values, vectors, order * scale)
+            largest = _part(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
+            return Smooth(
+                (least.value + ratio * largest.value) / scale,
+                (least.gradient - ratio * largest.gradient) / scale,
+                (
+                    *((c / scale, x, y) for c, x, y in least.products),
+                    *((ratio * c / scale, x, y) for c, x, y in largest.products),
+                ),
+                (
+                    *((c / scale, v) for c, v in least.squares),
+                    *((ratio * c / scale, v) for c, v in largest.squares),
+                ),
+                least.gradient,
+                largest.gradient,
+            )
+
+        return smooth
+
+
+def _least(s: SchurComplement, width: float) -> Smooth:
+    """Return the smooth least eigenvalue of S as a function of M."""
+    part = _part(*np.linalg.eigh(s.matrix), width)
+    gradient = s.embed(part.gradient)
+    products = tuple((c, _embedded(s, x), _embedded(s, y)) for c, x, y in part.products)
+    if s.inverse is not None:
+        products = (*products, (-2.0, gradient, s.inverse))
+    squares = tuple((c, s.embed(v)) for c, v in part.squares)
+    return Smooth(part.value, gradient, products, squares, gradient)
+
+
+def _embedded(s: SchurComplement, x: Floats | Root) -> Floats | Root:
+    return Root(s.lift @ x.matrix) if isinstance(x, Root) else s.embed(x)
+
+
+def _part(values: Floats, vectors: Floats, width: float) -> Smooth:
+    """Return the smooth least of the eigenvalues, with S = M − t 1.
+
+    Its second derivative is −μ tr(S⁻¹ H_k S⁻¹ H_l) + μ tr(S⁻² H_k) tr(S⁻² H_l) / tr(S⁻²).
+    """
+    value, p = soft_least(values, width)
+    gradient = (vectors * p) @ vectors.T
+    inner = (vectors * p**2) @ vectors.T
+    return Smooth(
+        value,
+        gradient,
+        ((-1.0 / width, gradient, gradient),),
+        ((1.0 / (width * float(p @ p)), inner),),
+        gradient,
+    )

@@ -15,7 +15,7 @@ what adding the effect would estimate, to first order, and how uncertain it is. 
 scale are those that a diagnosis scores the effect with; see `regression.evidence`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,43 +63,29 @@ class DiscriminatedPairs:
     not_separable: tuple[tuple[str, str], ...] = ()
 
 
-def discriminated_pairs(
-    problem: DesignProblem,
-    suspects: Sequence[str] | None = None,
-    fitted: Mapping[str, Floats] | None = None,
-) -> DiscriminatedPairs:
-    """Return the pairs of suspects, both ways round, that some measurement separates.
+def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
+    """Return the pairs of potential terms, both ways round, that some measurement separates.
 
     None does where the best of all plans of `MANY` readings, with the prior information, has a
-    power below `LEAST_POWER`: for the first of the parameters of the effect that is there.
-
-    Args:
-        problem: with all suspects among its potential terms.
-        suspects: at least two effects; all families of the problem by default.
-        fitted: parameters (D, E) of suspects, SI: D possible values; one vector (E,) will do. By
-            default those that the readings so far support, see `supported_parameters`. Of the
-            others a few directions are drawn (always the same), each of an RMS strength of 1 σ of
-            a measured element over all units.
+    power below `LEAST_POWER`: for the first of the parameters of the effect that is there. These
+    are those that the readings so far support, see `supported_parameters`. Of the others a few
+    directions are drawn (always the same), each of an RMS strength of 1 σ of a measured element
+    over all units.
 
     Raises:
-        InputError: fewer than two suspects, or one that is not among the potential terms.
+        InputError: fewer than two potential terms.
         CannotAnswerError: no pair can be separated.
     """
-    known = tuple(e.name for e in problem.families)
-    names = known if suspects is None else tuple(dict.fromkeys(suspects))
-    for name in names:
-        if name not in known:
-            valid = ", ".join(known) or "none"
-            raise InputError(f"{name} is not among the potential terms; valid: {valid}")
+    names = tuple(e.name for e in problem.families)
     if len(names) < 2:
         raise InputError(f"{len(names)} effects to tell apart; valid: two or more")
-    given = dict(supported_parameters(problem, DRAWS) if fitted is None else fitted)
+    given = supported_parameters(problem, DRAWS)
     pairs, both = [], []
     for e in names:
         where = problem.of_effect(e)
         betas = _directions(problem, e)
         if e in given:
-            betas = [x / problem.scale[where] for x in np.atleast_2d(given[e])]
+            betas = [x / problem.scale[where] for x in given[e]]
         for f in names:
             if f != e:
                 pairs += [pair_of(problem, (e, f), beta) for beta in betas]

@@ -1,11 +1,14 @@
-"""Which states a plan may use: those that the cell allows with margins, and that tell something."""
+"""Which states a plan may use: those that the cell allows with margins; candidates among them."""
 
+from collections import Counter
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN
 from hilcal.measuring.feasibility import STATE, Feasibility, Margins
 from hilcal.measuring.route import beside
@@ -75,7 +78,6 @@ class Space(Feasibility):
 
         Args:
             q: (N, n) joint angles, rad.
-            load: name of a load.
         """
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 
@@ -120,3 +122,165 @@ class Space(Feasibility):
         jacobian[:, :3] /= self.cell.arm.reach
         sigma = np.linalg.svd(jacobian, compute_uv=False)
         return np.asarray(sigma[:, -1] >= least * sigma[:, 0])
+
+
+_CHUNK = 1 << 12
+_VAIN = 1 << 15  # drawn states after which nothing will come
+_MOST = 1 << 19, 64  # drawn at most: so many states, or so many per candidate
+_FUNNEL = (  # cheap ones and those that leave little first
+    "joint limits",
+    "payload",
+    "workspace",
+    "incidence",
+    "torque",
+    "force sensor",
+    "singularity",
+    "self-collision",
+    "obstacle",
+    "sight",
+    "hanging",
+)
+_OF_PAIRS = ("self-collision", "obstacle")
+_LOOK = 64  # states of which is told what touches
+_OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrawnPoses:
+    """K poses that are allowed unloaded, and the loads that each may bear.
+
+    Attributes:
+        q: (K, n) joint angles, rad.
+        loads: 1 + L names, "none" first.
+        allowed: (K, 1 + L) which loads each pose bears.
+        drawn: how many states were looked at.
+        left: by reason, how many of them were left after it, in the order of checking.
+        remarks: what people should know.
+    """
+
+    q: Floats
+    loads: tuple[str, ...]
+    allowed: Bools
+    drawn: int
+    left: dict[str, int]
+    remarks: tuple[str, ...]
+
+
+def draw(
+    space: Space,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    least: int = 1,
+    most: int | None = None,
+) -> DrawnPoses:
+    """Return poses from a Sobol sequence over the joint space, turned by a random shift.
+
+    Args:
+        count: poses wanted; fewer where the cell leaves fewer.
+        rng: shift of the sequence.
+        least: so many have to be found.
+        most: so many states are drawn at most; by default many times `count`.
+
+    Raises:
+        CannotAnswerError: too few poses, or no load that any of them bears; names the
+            constraint that leaves nothing.
+    """
+    low, high = space.low, space.high
+    if np.any(low >= high):
+        j = int(np.argmax(low - high)) + 1
+        raise CannotAnswerError(f"joint_margin_rad leaves joint {j} no range; lower it")
+    from scipy.stats import qmc  # slow to import
+
+    sequence = qmc.Sobol(len(low), scramble=False)
+    shift = rng.random(len(low))
+    left, lost = dict.fromkeys(_FUNNEL, 0), dict[str, Floats]()
+    found = [np.empty((0, len(low)))]
+    drawn = have = 0
+    most = max(_MOST[0], _MOST[1] * count) if most is None else most
+    while have < count and drawn < (most if have else _VAIN):
+        u = (sequence.random(_CHUNK) + shift) % 1.0
+        q = space.cell.arm.complete(low + u * (high - low))
+        found.append(_kept(space, q, left, lost))
+        drawn += _CHUNK
+        have += len(found[-1])
+    if have < least:
+        raise CannotAnswerError(_too_few(space, drawn, left, lost, least))
+    q = np.vstack(found)[:count]
+    allowed = np.ones((len(q), len(space.loads)), dtype=np.bool_)
+    remarks = [*space.remarks]
+    if len(q) < count:
+        remarks.append(f"{drawn:,} drawn states gave {len(q):,} of {count:,} candidates")
+    for k, load in enumerate(space.loads[1:], start=1):
+        allowed[:, k] = space.allowed(q, load, _OF_LOADS)
+        if not allowed[:, k].any():
+            remarks.append(_unusable(space, q, load))
+    if len(space.loads) > 1 and not allowed[:, 1:].any():
+        raise CannotAnswerError("; ".join(remarks[-(len(space.loads) - 1) :]))
+    return DrawnPoses(q, space.loads, allowed, drawn, left, tuple(remarks))
+
+
+def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
+    """Those of the states that are allowed unloaded.
+
+    Counts what each reason leaves, and keeps the last states that each has taken.
+    """
+    for reason in _FUNNEL:
+        if len(q):
+            keeps = space.keeps(reason, q, UNLOADED)
+            if not keeps.all():
+                lost[reason] = q[~keeps][:_LOOK]
+            q = q[keeps]
+        left[reason] += len(q)
+    return q
+
+
+def _too_few(
+    space: Space, drawn: int, left: dict[str, int], lost: dict[str, Floats], least: int
+) -> str:
+    """What leaves too few: the first reason that leaves none, else the one that takes most."""
+    counts = list(left.values())
+    names = list(left)
+    before = [drawn, *counts[:-1]]
+    share = np.array(counts) / np.maximum(before, 1)
+    worst = counts.index(0) if 0 in counts else int(np.argmin(share))
+    told = [
+        f"{n:,} {REASONS[reason][0]}"
+        for reason, n, b in zip(names[: worst + 1], counts, before, strict=False)
+        if n < b
+    ]
+    head = "no pose" if counts[-1] == 0 else f"only {counts[-1]:,} poses, {least:,} are needed"
+    why = _touching(space, names[worst], lost) or REASONS[names[worst]][1]
+    return f"{head}: of {drawn:,} drawn states {', '.join(told)} ({why})"
+
+
+def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
+    """Name the bodies that touch in most of the states that were lost, and what to look at."""
+    if reason not in _OF_PAIRS or reason not in lost:
+        return ""
+    met = Counter(
+        found.of for q in lost[reason] for found in space.findings(q[None], UNLOADED, (reason,))
+    )
+    if not met:
+        return ""
+    (pair, count), look = met.most_common(1)[0], REASONS[reason][1]
+    return f"{pair} touch in {100 * count // len(lost[reason])} % of the others; look at {look}"
+
+
+def _unusable(space: Space, q: Floats, load: str) -> str:
+    """Why no pose bears a load."""
+    if (heavy := space.unbearable(load).get("payload")) is not None:
+        return heavy
+    told = []
+    before = len(q)
+    for reason in _OF_LOADS:
+        q = q[space.keeps(reason, q, load)]
+        if len(q) < before:
+            told.append(f"{len(q):,} {REASONS[reason][0]}")
+        if not len(q):
+            return (
+                f'load "{load}": no pose: of {before:,} feasible poses {", ".join(told)} '
+                f"({REASONS[reason][1]})"
+            )
+        before = len(q)
+    return f'load "{load}": no pose'

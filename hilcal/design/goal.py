@@ -100,7 +100,6 @@ class Goal:
         Args:
             stds: standard uncertainty of each parameter by name, SI; infinite where it is not
                 identifiable.
-            values: the parameters, SI.
             position: standard uncertainty of what is predicted where the robot will work, m;
                 infinite where the readings do not determine it.
             predicted: what that is, e.g. "deflection under 5kg at 100 poses in the work box".

@@ -44,7 +44,6 @@ class GoalRule:
     Fits take at most a tenth of the time (`SHARE`), so that none delays the campaign.
 
     Attributes:
-        goal: the goal.
         status: that of the last fit.
     """
 
@@ -60,7 +59,6 @@ class GoalRule:
 
         Args:
             text: the goal, e.g. "joint std < 2 %".
-            cell: the cell.
             config: `[planning]`, loads, repeatability.
             catalogue: the effects that a model can have; the installed ones unless given.
             now: seconds that pass for people.

@@ -9,7 +9,7 @@ DuMouchel and Jones, *A simple Bayesian modification of D-optimal designs to red
 on an assumed model*, Technometrics 36 (1994) 37-47.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 
@@ -27,9 +27,11 @@ from hilcal.design.candidates import (
     sizes,
 )
 from hilcal.design.nominal_model import NominalModel, build, potential_names, random_columns
-from hilcal.design.prior_information import information_of
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.effect_columns import computable, effect_columns
+from hilcal.identification.gauss_newton import whitened_jacobian
+from hilcal.identification.priors import scales_of
 from hilcal.readings.whitening import Mode
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
@@ -93,11 +95,9 @@ class DesignProblem:
     Attributes:
         nominal: the model that is planned for.
         mode: "deflection" or "absolute".
-        candidates: the states.
         units: K units; their parameters are those of the model, then potential terms.
         what: pose and loads of each unit; "none" is the unloaded reading of absolute positions,
             that of deflections goes without saying.
-        terms: the P parameters.
         families: effects of the potential terms.
         prior: (P, P) what is known before: priors, and what was measured already.
         measured: (P, P) the part of it that was measured already.
@@ -146,7 +146,6 @@ def problem(
     there are few loads. It costs as many readings as it takes, the unloaded one included.
 
     Args:
-        nominal: the model.
         config: loads, noise, and `[planning]`: kind of readings, potential terms.
         q: (N, n) candidate poses, rad.
         allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.
@@ -166,9 +165,9 @@ def problem(
     scale = np.array([t.scale for t in terms])
     layout = _layout(of, mode, nominal.elements, len(terms))
     rows = np.zeros((len(layout.what), layout.height, len(terms)))
-    for part in reading_derivatives(nominal, config, of, against.effects, scale):
-        for place, block in _blocks(part, layout, mode):
-            rows[place, : block.shape[1]] = block
+    parts = reading_derivatives(nominal, config, of, against.effects, scale)
+    for place, block in unit_rows(parts, of.loads, layout.what, mode):
+        rows[place, : block.shape[1]] = block
     measured = information_of(nominal, against.effects, scale)
     count = len(nominal.live)
     precision = np.ones(len(terms))
@@ -203,18 +202,8 @@ def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Layout:
-    """Where the units lie: pose by pose, those of one pose in the order of `subsets`.
+    """The units pose by pose; `height` is that of the one with most rows."""
 
-    Attributes:
-        first: (N,) index of a pose's first unit.
-        pattern: (N,) index into `subsets`.
-        subsets: per pattern, the loads of each unit, as indices from 0.
-        height: most rows of a unit.
-    """
-
-    first: Ints
-    pattern: Ints
-    subsets: tuple[tuple[tuple[int, ...], ...], ...]
     height: int
     what: tuple[tuple[int, tuple[str, ...]], ...]
     cost: Floats
@@ -222,12 +211,7 @@ class _Layout:
 
 
 def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
-    """Decide on the units; fewer kinds of them where memory would not do.
-
-    Raises:
-        CannotAnswerError: no unit is left.
-        InputError: too many candidates.
-    """
+    """Decide on the units; fewer kinds of them where memory would not do."""
     patterns, pattern = np.unique(of.allowed, axis=0, return_inverse=True)
     pattern = pattern.reshape(-1)
     tally = np.bincount(pattern, minlength=len(patterns))
@@ -253,14 +237,13 @@ def _layout(of: Candidates, mode: Mode, m: int, size: int) -> _Layout:
             "no candidate pose may be taken"
             + (" both unloaded and under a load" if mode == "deflection" else "")
         )
-    per_pose = np.array([len(some) for some in subsets])[pattern]
     of_pose = [subsets[k] for k in pattern]
     what = tuple(
         (pose, tuple(of.loads[k] for k in s)) for pose, some in enumerate(of_pose) for s in some
     )
     unloaded = 1.0 if mode == "deflection" else 0.0
     cost = np.array([len(loads) + unloaded for _, loads in what])
-    return _Layout(np.cumsum(per_pose) - per_pose, pattern, subsets, height, what, cost, notes)
+    return _Layout(height, what, cost, notes)
 
 
 def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, ...]]:
@@ -279,17 +262,35 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
         yield tuple(loads)
 
 
-def _blocks(part: ReadingDerivatives, layout: _Layout, mode: Mode) -> Iterator[tuple[Ints, Floats]]:
-    """Yield units of a chunk of poses and their rows."""
-    pattern, first = layout.pattern[part.rows], layout.first[part.rows]
-    single = absolute_rows(part) if mode == "absolute" else np.empty(0)
-    for p in np.unique(pattern):
-        mine = np.flatnonzero(pattern == p)
-        for k, loads in enumerate(layout.subsets[p]):
+def unit_rows(
+    parts: Iterable[ReadingDerivatives],
+    loads: tuple[str, ...],
+    what: Sequence[tuple[int, tuple[str, ...]]],
+    mode: Mode,
+    step: int = 1,
+) -> Iterator[tuple[Ints, Floats]]:
+    """Yield indices of units and their whitened rows (k, R, P), some poses at a time.
+
+    Args:
+        parts: of every `step`-th candidate pose.
+        loads: names of all loads, "none" first.
+        what: pose and loads of each unit.
+    """
+    several: dict[tuple[str, ...], list[int]] = {}
+    for k, (pose, names) in enumerate(what):
+        if pose % step == 0:
+            several.setdefault(names, []).append(k)
+    pose_of = np.array([pose // step for pose, _ in what])
+    for part in parts:
+        single = absolute_rows(part) if mode == "absolute" else np.empty(0)
+        for names, members in several.items():
+            mine, which = np.array(members), tuple(loads.index(name) for name in names)
+            mine = mine[(pose_of[mine] >= part.rows.start) & (pose_of[mine] < part.rows.stop)]
+            at = pose_of[mine] - part.rows.start
             if mode == "absolute":
-                yield first[mine] + k, single[mine, loads[0]]
+                yield mine, single[at, which[0]]
             else:
-                yield first[mine] + k, deflection_rows(part, mine, loads)
+                yield mine, deflection_rows(part, at, which)
 
 
 def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...]:
@@ -357,3 +358,35 @@ def _strengths(
     ends = len(nominal.live) + np.cumsum([0, *(len(e.parameters) for e in families)])
     sums = [float(squares[a:b].sum()) for a, b in pairwise(ends)]
     return [float(np.sqrt(s / max(count, 1))) for s in sums]
+
+
+def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
+    """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
+
+    With the information of a prior that is carried over from another campaign.
+
+    A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
+    equations hold, without its priors.
+
+    Args:
+        nominal: the model, whose live parameters come first.
+        more: effects that are not in the model. Those that cannot be computed from these readings,
+            which lack a column, have no information.
+        scale: (P,) what one unit of each parameter is, SI.
+    """
+    fit, count = nominal.fit, len(nominal.live)
+    known = np.zeros((len(scale), len(scale)))
+    if nominal.carried is not None:
+        known[:count, :count] = nominal.carried * (scale[:count, None] * scale[:count])
+    if fit is None:
+        return known
+    ordinary = [scales_of(fit.model)[nominal.live]]
+    s = fit.solution
+    own = whitened_jacobian(fit.model, s.prediction, s.theta, fit.whitening, nominal.live)
+    columns = [own * ordinary[0]]
+    for e in more:
+        ordinary.append(np.array([p.scale for p in e.parameters]))
+        missing = np.zeros((len(fit.white), len(e.parameters)))
+        columns.append(effect_columns(fit, e).white if computable(fit, e) else missing)
+    a = np.hstack(columns) * (scale / np.concatenate(ordinary))
+    return np.asarray(known + a.T @ a)

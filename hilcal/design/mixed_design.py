@@ -29,16 +29,12 @@ from hilcal.design.bound import total_information
 from hilcal.design.candidate_set import CandidateSet
 from hilcal.design.candidates import (
     Candidates,
-    absolute_rows,
-    deflection_rows,
     reading_derivatives,
 )
 from hilcal.design.criterion import inverse
-from hilcal.design.information import DesignProblem
+from hilcal.design.information import DesignProblem, information_of, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, potential_names
 from hilcal.design.prediction_poses import PredictionPoses, position_derivative
-from hilcal.design.prior_information import information_of
-from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.mixed.families import families_of
@@ -76,7 +72,6 @@ def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -
     Args:
         of: the design problem of the model.
         config: its noise; where it states no repeatability, an ordinary one is assumed.
-        work: where positions are predicted.
     """
     nominal, config = of.nominal, _with_scatter(of.nominal, config)
     more, std = other_effects(nominal, config)
@@ -129,20 +124,17 @@ def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effe
     """
     model, known = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)
-    finest = {"harmonics": HARMONICS}
+    finest = {
+        name: {"harmonics": HARMONICS} for name in names if "harmonics" in known[name].option_help
+    }
     more = tuple(
-        build(known, name, nominal.cell, nominal.m, finest if _in_waves(known, name) else {})
-        for name in names
+        build(known, name, nominal.cell, nominal.m, finest.get(name, {})) for name in names
     )
     alone = replace(model, effects=more, random={}, background=frozenset(), prior=None)
     std = np.zeros(alone.size)
     for f in families_of(alone).random:
         std[f.parameters] = np.exp(f.prior.mean) * f.magnitude
     return more, std
-
-
-def _in_waves(known: Catalogue, name: str) -> bool:
-    return "harmonics" in known[name].option_help
 
 
 def _with_scatter(nominal: NominalModel, config: CellConfig) -> CellConfig:
@@ -170,25 +162,9 @@ class _AllColumns:
 
     def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
         """Yield units and their whitened rows (k, R, P), of every `step`-th candidate pose."""
-        of = self.of
-        pose = np.array([p for p, _ in of.what]) / step
-        loads = np.array([of.candidates.loads.index(names[0]) for _, names in of.what])
-        several: dict[tuple[str, ...], list[int]] = {}
-        for k, (p, names) in enumerate(of.what):
-            if p % step == 0:
-                several.setdefault(names, []).append(k)
-        some = candidates[slice(None, None, step)]
-        for part in reading_derivatives(of.nominal, self.config, some, self.more, self.scale):
-            single = absolute_rows(part) if of.mode == "absolute" else np.empty(0)
-            for names, members in several.items():
-                mine = np.array(members)
-                mine = mine[(pose[mine] >= part.rows.start) & (pose[mine] < part.rows.stop)]
-                at = pose[mine].astype(np.int64) - part.rows.start
-                if of.mode == "absolute":
-                    yield mine, single[at, loads[mine]]
-                else:
-                    which = tuple(of.candidates.loads.index(name) for name in names)
-                    yield mine, deflection_rows(part, at, which)
+        of, some = self.of, candidates[slice(None, None, step)]
+        parts = reading_derivatives(of.nominal, self.config, some, self.more, self.scale)
+        yield from unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

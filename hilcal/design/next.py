@@ -1,4 +1,4 @@
-"""The measurements that separate suspects: a plan for them, and the power it will have."""
+"""The measurements that settle a doubt: a plan that separates suspects, or many poses."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,9 +18,9 @@ from hilcal.design.discriminated_pairs import (
 )
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem, readings_of
-from hilcal.design.planner import Planned, Request, Say, make
+from hilcal.design.planner import Planned, Request, Say, make, ordered
 from hilcal.design.predicted import predicted
-from hilcal.design.run_order import Chosen, Ordering, order_plan
+from hilcal.design.run_order import Ordering
 from hilcal.design.t_optimality import Pair
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
@@ -63,7 +63,6 @@ class Next:
     """The measurements that separate suspects.
 
     Attributes:
-        planned: the plan.
         powers: of each pair, both ways round.
         shares: by load, the share of what separates the weakest pair.
         reach_ratio: horizontal reach of the target, averaged over the planned poses by how much
@@ -94,14 +93,10 @@ def measure_next(
     readings so far tell of each and at others that could be as well; see `discriminated_pairs`.
 
     Args:
-        cell: the cell.
-        config: its limits, loads and noise.
         fit: what has been measured, in scaling gc, of a model without the suspects.
         suspects: two effects or more.
         request: how many readings, or as many as so many poses take under every load: which
             poses and loads tell most of a difference is what the plan chooses.
-        rng: generator.
-        say: takes progress, one line each.
         reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
 
     Raises:
@@ -151,7 +146,6 @@ def expected(
     """Return the power of a pair, the mean over parameters that its effect may have.
 
     Args:
-        problem: the design problem.
         names: effect that is there, rival that is fitted.
         betas: (E,) parameters of the effect, in the problem's units.
         information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
@@ -222,25 +216,10 @@ def reordered(
     """Return a plan with other units of its problem, in an order of its own.
 
     Args:
-        space: what the cell allows.
-        made: the plan.
         counts: (K,) how often each unit is taken.
         reference: (n,) joints of the reference pose, from which all units are reached, rad.
-        rng: generator.
-        how: the order.
     """
-    of, usable, taken = made.problem, np.flatnonzero(made.usable), np.flatnonzero(counts)
-    poses = sorted({of.what[k][0] for k in taken})
-    names = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
-    chosen = [
-        Chosen(names[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k]))
-        for k in taken
-    ]
-    ordered = order_plan(
-        space.cell, space.config, list(names.values()), of.candidates.q[poses], reference, chosen,
-        space.passable, rng, how,
-    )  # fmt: skip
-    asked = made.asked
+    of, usable, asked = made.problem, np.flatnonzero(made.usable), made.asked
     information = asked.prior + asked.units.information(counts.astype(float))
     design = replace(
         made.design,
@@ -250,7 +229,8 @@ def reordered(
         cost=float(counts @ of.units.cost),
     )
     knows = predicted(of, counts.astype(float), work=made.work)
-    return replace(made, ordered=ordered, design=design, predicted=knows)
+    order = ordered(space, of, reference, counts, rng, how)
+    return replace(made, ordered=order, design=design, predicted=knows)
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:
@@ -279,3 +259,57 @@ def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], f
     poses = np.array([of.what[k][0] for k in taken])
     reach = float(at[poses] @ worth) / total
     return shares, reach / float(np.mean(at))
+
+
+CRITERION = "D"
+"""By which the plan's efficiency is stated; its poses are not chosen by it."""
+SPARE = 2
+"""Candidates per pose: some are not reached from the reference. A choice."""
+LEAST = 60
+"""Candidates at least, so that a reference is found; a choice."""
+REPEATED = 10
+"""One pose of so many is arrived at twice, for the arm's repeatability. A choice."""
+
+
+def measure_poses(
+    cell: Cell,
+    config: CellConfig,
+    fit: Fit,
+    poses: int,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+    reference: Floats | None = None,
+) -> Planned:
+    """Plan distinct poses spread evenly over the joint space, each read once without a load.
+
+    An optimal design would take few poses many times, which is best for a model that is known. What
+    errs from pose to pose, finer than the poses so far resolve, needs poses where nothing was read.
+    The candidates' order is that of a Sobol sequence: the first ones that are reached are taken.
+
+    Args:
+        fit: what has been measured, absolute readings.
+        reference: (n,) joints of the campaign's reference pose, rad; a new one where None.
+
+    Raises:
+        CannotAnswerError: the cell leaves no such poses.
+    """
+    count = max(SPARE * poses, LEAST)
+    planning = config.planning.model_copy(update={"readings": fit.mode, "candidates": count})
+    config = config.model_copy(update={"loads": [], "planning": planning})
+    made = make(
+        cell, config, Request(poses, readings=poses, criterion=CRITERION, effort=0), rng, fit, say
+    )
+    say("spreading the poses")
+    of, space = made.problem, Space(cell, config)
+    home = made.ordered.plan.q[0] if reference is None else reference
+    usable = np.flatnonzero(made.usable)
+    q = of.candidates.q[[of.what[k][0] for k in usable]]
+    taken = usable[space.passable(home, q, UNLOADED)][:poses]
+    if not len(taken):
+        raise CannotAnswerError(
+            "no pose is reached from the campaign's reference pose; start another campaign"
+        )
+    counts = np.zeros(len(made.usable), dtype=np.int64)
+    counts[taken] = 1
+    how = Ordering(repeats=max(2, len(taken) // REPEATED))
+    return reordered(space, made, counts, home, rng, how)

@@ -100,8 +100,6 @@ def nominal_model(
     1e-3. Those of the baseline's effects are ordinary, all others zero.
 
     Args:
-        cell: the cell as configured.
-        config: its configuration.
         m: 3 for positions, 6 for poses.
         catalogue: the effects that a model can have; the installed ones unless given.
         prior: what another campaign taught. Its effects are in the model, too, but for families
@@ -116,8 +114,9 @@ def nominal_model(
     notes = []
     cell = _observed(cell, config, place)
     if not given and not (cell.observers and all(o.tied for o in cell.observers)):
+        shown = ", ".join(f"{v:.2g}" for v in place)
         notes.append(
-            f"the tracker's place is not configured: taken to be {_metres(place)} in base axes "
+            f"the tracker's place is not configured: taken to be [{shown}] m in base axes "
             "(give [sight] tracker_m)"
         )
     registered, station = _registered(cell, config, place)
@@ -372,7 +371,3 @@ def _prior_std(model: Model) -> Floats:
     prior, groups = prior_of(model)
     scale = np.array([p.scale for e in model.effects for p in e.parameters])
     return np.asarray(np.where(groups >= 0, scale, prior))
-
-
-def _metres(x: Floats) -> str:
-    return "[" + ", ".join(f"{v:.2g}" for v in x) + "] m"

@@ -9,21 +9,20 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.candidates import reading_covariance
 from hilcal.design.choice import (
     EFFORT,
     Objective,
     canonical,
     choose,
     choose_poses,
+    compound_objective,
     costly_loads,
     only,
     promising,
 )
-from hilcal.design.compound_criteria import compound_objective
-from hilcal.design.draw import DrawnPoses, draw
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.design.information import DesignProblem, problem, readings_of
-from hilcal.design.noise_model import reading_covariance
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.optimum import Design
 from hilcal.design.predicted import PredictedUncertainty, predicted
@@ -80,13 +79,9 @@ class Planned:
         ordered: the plan in order, with what the order costs.
         design: the units that were chosen, with the certificate.
         costly: loads that cost more than they tell, with what leaving each out would gain.
-        problem: the design problem.
         asked: the design problem with its criterion.
         usable: (K,) which units were to choose from.
-        work: the prediction poses.
-        drawn: the candidates.
         budget: readings of the design.
-        criterion: name of the criterion.
         predicted: standard uncertainties that a fit to the readings will have.
         undetermined: parameters of the model that no reading of the cell determines.
         asked_poses: poses that were asked for, see `Request`; None where readings were.
@@ -128,12 +123,9 @@ def make(
     """Return the plan.
 
     Args:
-        cell: the cell.
         config: limits, loads, noise, and `[planning]`: what it is for.
         request: how many readings, and the criterion.
-        rng: generator.
         known: fit of what has been measured already.
-        say: progress callback.
         catalogue: the effects that a model can have; the installed ones unless given, or those
             of `known`.
         prior: what another campaign taught, where nothing has been measured yet.
@@ -203,10 +195,12 @@ def make(
     say("ordering the readings")
     counts = np.zeros(len(usable), dtype=np.int64)
     counts[np.flatnonzero(usable)] = design.counts
-    ordered = _ordered(space, of, home, counts, rng, request.unloaded)
+    repeats = max(2, (visited - 1) // 10)
+    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    order = ordered(space, of, home, counts, rng, how)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
-        ordered, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
+        order, design, costly, of, asked, usable, work, drawn, budget, criterion, knows,
         undetermined, request.poses if whole else None,
     )  # fmt: skip
 
@@ -264,23 +258,26 @@ def _unreachable(space: Space, of: DesignProblem, home: Floats, units: Ints) -> 
     return np.array(sorted(lost), dtype=np.int64)
 
 
-def _ordered(
+def ordered(
     space: Space,
     of: DesignProblem,
     home: Floats,
     counts: Ints,
     rng: np.random.Generator,
-    unloaded: Literal["around", "first"],
+    how: Ordering,
 ) -> Ordered:
-    """Name the chosen poses, and put their readings in order."""
+    """Name the poses of the chosen units p1, p2, ..., and put their readings in order.
+
+    Args:
+        home: (n,) joints of the reference pose, from which all units are reached, rad.
+        counts: (K,) how often each unit is taken.
+    """
     taken = np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})
     name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}
     chosen = [
         Chosen(name[of.what[k][0]], readings_of(of.what[k], of.mode), int(counts[k])) for k in taken
     ]
-    repeats = max(2, len(poses) // 10)
-    how = Ordering(unloaded=unloaded, repeats=repeats, reading_std=_reading_std(space, of))
     q = of.candidates.q[poses]
     return order_plan(
         space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how

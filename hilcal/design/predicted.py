@@ -21,7 +21,6 @@ class PredictedUncertainty:
 
     Attributes:
         names: of the model's live parameters, as identification prints them.
-        units: their units.
         values: at which they are assumed, SI.
         std: with the model complete, SI; infinite where not identifiable.
         std_open: with the potential terms, SI.
@@ -54,10 +53,8 @@ def predicted(
     """Predict the standard uncertainties that a plan reaches.
 
     Args:
-        problem: the design problem.
         counts: (K,) how often each unit is taken.
         information: (P, P) instead, prior included; of the prior alone where neither is given.
-        work: where positions are predicted.
     """
     if information is None:
         information = problem.prior if counts is None else problem.information(counts)
@@ -118,7 +115,6 @@ def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Flo
     """Return (T,) standard deviations of positions, m; infinite where not determined.
 
     Args:
-        work: the poses.
         covariance: (L, L) of the model's live parameters.
         null: (L, U) directions that were left out: a position that one of them moves at an
             ordinary magnitude by a tenth of its standard deviation is not determined.

@@ -61,7 +61,6 @@ def prediction_poses(
     is no deflection, and it is that under each of the loads in turn.
 
     Args:
-        nominal: the model that is planned for.
         config: `[planning] work_*`, loads.
         feasible: (N, n) states that are feasible, rad; test poses are drawn from them.
         may: predicate of feasible states (N, n), for a box that needs more of them.
@@ -99,7 +98,6 @@ def position_derivative(
 
     Args:
         nominal: the model, whose live parameters come first.
-        at: the poses.
         more: effects that are not in the model.
         scale: (P,) what one unit of each parameter is, SI.
     """

@@ -14,8 +14,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design import tour
-from hilcal.design.confounding import Confounding, confounding
-from hilcal.design.timing import Duration, Pace, pace, timeline
+from hilcal.design.timing import Confounding, Duration, Pace, confounding, pace, timeline
 from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
@@ -39,7 +38,6 @@ class PlannedStop:
 
     Attributes:
         pose: index from 1; 0 is the reference.
-        cycle: its cycle.
     """
 
     pose: int
@@ -51,7 +49,6 @@ class LoadBlock:
     """What is measured while one load hangs.
 
     Attributes:
-        load: its name.
         loops: stops of each loop from the reference.
         seconds: what the loops take, s.
     """
@@ -92,7 +89,6 @@ class Chosen:
     """Readings to take at a pose.
 
     Attributes:
-        pose: its name.
         loads: under which loads, "none" among them where it is measured unloaded.
         count: how often all of it; each time is a cycle of its own.
     """
@@ -136,9 +132,7 @@ class Ordered:
 
     Attributes:
         plan: the plan; `about` holds these figures too.
-        duration: of the plan.
         shortest: of the shortest order with the same readings.
-        confounding: of the plan.
         confounding_shortest: of the shortest order.
     """
 
@@ -186,15 +180,9 @@ def order_plan(
       order stays random towards everything that is no regressor, such as temperatures.
 
     Args:
-        cell: the cell.
-        config: its loads, motion and acquisition.
         names: (P) names of poses.
         q: (P, n) their joint angles, rad.
         reference: (n,) joint angles of the reference pose, rad.
-        chosen: what to measure.
-        passable: which motions are clear.
-        rng: generator.
-        how: settings.
 
     Raises:
         InputError: nothing is chosen, or a name is unknown.
@@ -285,12 +273,9 @@ class OrderDraws:
     """Plans of the same readings in different orders: short ones and random ones.
 
     Attributes:
-        cell: the cell.
         config: its loads, motion and acquisition.
         names: (P) names of the poses that are measured.
         q: (P + 1, n) joint angles of the reference and of these, rad.
-        how: settings.
-        rng: generator.
         stops: by load.
         ways: between the stops under each load.
         short: shortest order of the stops under each load, counted from 1.
@@ -343,7 +328,6 @@ class OrderDraws:
         """Return the plan for an order of the stops under each load.
 
         Args:
-            orders: by load.
             half: whether the second half of the unloaded order comes after the loads.
             mixed: whether loops come in random order and direction.
         """
@@ -430,8 +414,6 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR)
     Args:
         q: (P + 1, n) joint angles, rad; the reference first.
         load: name of the load that hangs.
-        passable: which motions are clear.
-        pace: seconds of motions and readings.
         near: neighbours to which motions are tested; the nearest in time.
     """
     legs = pace.legs(q, q)

@@ -9,15 +9,12 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.approximate_design import relax
 from hilcal.design.candidates import reading_derivatives
-from hilcal.design.choice import choose, choose_poses, only, unknown
-from hilcal.design.compound_criteria import compound_objective
-from hilcal.design.confounding import Confounding
+from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
 from hilcal.design.information import DesignProblem
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import PredictedUncertainty, predicted
-from hilcal.design.timing import Duration
+from hilcal.design.timing import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import schur_complement
@@ -31,8 +28,6 @@ SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""
 WORTH = 0.9
 """Efficiency of a plan below which it is said what another one would give; a choice."""
-LOOSE = 3e-3
-"""Relative gap of the continuous optima of the curve. A choice: below what a plot resolves."""
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -47,7 +42,6 @@ class DetectableEffect:
     """Minimum detectable strength of an effect outside of the model.
 
     Attributes:
-        effect: its name.
         least_m: rms displacement of the target, m, whose whitened residual after fitting the
             model is one sigma; None where the model absorbs the effect.
     """
@@ -81,7 +75,6 @@ class CriterionResult:
     the parameters in ordinary magnitudes with the singular values σ.
 
     Attributes:
-        criterion: its name.
         position_std_m: standard uncertainty of the position at the prediction poses, m.
         position_open_m: the same with all potential terms estimated as well.
         joint_share: largest relative standard uncertainty of a joint compliance; None without.
@@ -125,8 +118,6 @@ class PlanSummary:
         poses: number of poses beside the reference.
         readings: of all, those at the reference included.
         loads: readings by load, "none" among them, in the order in which they are hung.
-        duration: of the campaign.
-        criterion: name of the criterion.
         efficiency: certified lower bound of the efficiency; None without a certificate.
         parameters: predicted precision by parameter.
         position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None
@@ -215,10 +206,6 @@ def summarise(
     """Return the summary of a plan.
 
     Args:
-        planned: the plan.
-        config: the cell's configuration.
-        rng: generator, for the designs of the other criteria.
-        say: progress callback.
         compare: whether to compute the criterion comparison.
         curve: whether to compute the sample-size curve.
     """
@@ -393,10 +380,7 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
         if budget < asked.units.cost.max() or poses == before:
             continue
         before = poses
-        last = relax(
-            asked.units, asked.criterion, budget, asked.prior, names=asked.names,
-            tolerance=LOOSE, start=last,
-        )  # fmt: skip
+        last = asked.relaxed(budget, start=last)
         whole = of.prior + of.units.information(last.weight, usable[last.index])
         position = _finite(predicted(of, information=whole, work=planned.work).position)
         if position is not None:

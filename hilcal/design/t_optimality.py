@@ -238,7 +238,6 @@ def condensed(
 
     Args:
         units: what can be taken, by the P parameters.
-        pairs: what is to be separated.
         prior: (P, P) what is known before.
     """
     model = pairs[0].nuisance

@@ -32,8 +32,6 @@ def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list
 
     Args:
         seconds: (m + 1, m + 1), also asymmetric.
-        rng: generator of the double bridges.
-        kicks: number of double bridges.
     """
     count = len(seconds) - 1
     if count <= _EXACT:
@@ -146,10 +144,7 @@ def shaken(
 
     Args:
         seconds: (m + 1, m + 1).
-        order: where the walk begins.
         budget: s.
-        rng: generator.
-        moves: steps of the walk.
     """
     way = [0, *order, 0]
     here, count = length(seconds, order), len(order)
@@ -191,7 +186,6 @@ def loops(
 
     Args:
         direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear.
-        order: stops.
         reading_s: s at each stop and at the reference.
         limit_s: s from leaving the reference to coming back.
 

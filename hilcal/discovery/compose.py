@@ -21,10 +21,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.bends import unit_rows
-from hilcal.discovery.composed import composed
-from hilcal.discovery.screen import LEAST_MOTION, SEEN
+from hilcal.discovery.amplitudes import Amplitude, Factor, composed
+from hilcal.discovery.screen import LEAST_MOTION, SEEN, unit_rows
 from hilcal.discovery.shapes import Shape
 from hilcal.types import Floats
 
@@ -130,11 +128,7 @@ def _better(
 
 
 def composed_terms(beside: Beside) -> list[LawTerm]:
-    """Return terms of functions of composed quantities.
-
-    Args:
-        beside: the candidates beside chosen terms.
-    """
+    """Return terms of functions of composed quantities."""
     found = _screened(beside)
     at = {s: SiteSums(beside, s) for s in {b.s for b in found}}
     sums: list[_Bent] = []
@@ -327,7 +321,7 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
         low, high = 1.0 if elastic else LEAST_POWER, MOST_POWER
 
     def parts(x: Floats) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        now = [_rounded(v) for v in begin + np.asarray(scale) * x]
+        now = [float(f"{v:.{DIGITS}g}") for v in begin + np.asarray(scale) * x]
         return (1.0, *now[:more]), tuple(now[more:])
 
     def objective(x: Floats) -> float:
@@ -349,7 +343,3 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
     recorded = len(terms) == 1 and len(factors) == 1 and factors[0].shape is shapes.LINEAR
     quantity = factors[0].variable if recorded else composed(terms)
     return Amplitude((Factor(quantity, b.shape, own),))
-
-
-def _rounded(x: float) -> float:
-    return float(f"{x:.{DIGITS}g}")

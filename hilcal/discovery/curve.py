@@ -65,8 +65,6 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
 
     Args:
         after: a fit whose last effect is the law.
-        form: the law.
-        most: number of curves at most.
     """
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]

@@ -10,6 +10,9 @@
    predict the poses left out.
 5. Free numbers are refined, and the law is refitted as an effect in the exact model.
 6. What a generic regression predicts of the misfit says how much could be explained at all.
+
+The poses that are left out take no part in the choice of a law, nor in its coefficients. What the
+law then explains of their misfit is what the whole procedure may claim.
 """
 
 from collections.abc import Callable, Hashable
@@ -22,22 +25,24 @@ from scipy.stats import chi2
 from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
-from hilcal.discovery.folds import FoldSearch, found_again, search_by_folds
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
-from hilcal.discovery.law import Coefficient, Form, Law, form_of
+from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import exact, refine
 from hilcal.discovery.screen import Screen, screen
 from hilcal.discovery.search import LEAST, MOST_TERMS, Selection, search
 from hilcal.discovery.structures import Structure, averaged, structure_of, structures
+from hilcal.discovery.terms import LawTerm
 from hilcal.discovery.write_effect import source_of_form
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.fit import Fit
-from hilcal.identification.linearisation import left_out_by_pose, linearise
+from hilcal.identification.folds import random_folds
+from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
 from hilcal.regression.evidence import score_family
+from hilcal.regression.paired_test import improves
 from hilcal.shown import Shown
-from hilcal.types import Floats
+from hilcal.types import Bools, Floats
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """Why there are laws, or none:
@@ -57,6 +62,21 @@ NEAR = 0.7
 
 MOST_RIVALS = 2
 """Alternatives that can be written as effects; a choice: `next` separates few."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FoldSearch:
+    """What the search without each fold came to.
+
+    Attributes:
+        share: of the misfit of the poses left out that its laws explain.
+        sure: whether their error falls by more than it scatters from pose to pose.
+        found: the laws of each fold; empty where it proposes none.
+    """
+
+    share: float
+    sure: bool
+    found: tuple[Selection | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +162,6 @@ def discover(
 
     Args:
         fit: a gc-scaled fit.
-        say: takes progress, one line each.
         name: of the effect that is proposed.
 
     Raises:
@@ -315,3 +334,86 @@ def _law(
         ranges=tuple(ranges),
         again=found_again(problem.screen, folds, s.terms),
     )
+
+
+FOLDS = 5
+"""As in the regression of the residual; a choice."""
+RIDGE = 1e-6
+
+
+def search_by_folds(screen: Screen, most: int) -> FoldSearch:
+    """Repeat the search without each fold of poses."""
+    linear = screen.linear
+    fit = linear.fit
+    fold = fit.whitening.rows_of(random_folds(fit.pose, FOLDS))
+    before, after = np.zeros(len(fold)), np.zeros(len(fold))
+    found: list[Selection | None] = []
+    for f in range(int(fold.max()) + 1):
+        out = fold == f
+        problem = SearchProblem(screen, ~out)
+        selections = search(problem, most, beam=1)
+        chosen = max(selections, key=lambda s: s.total, default=None)
+        found.append(chosen)
+        before[out] = predicted(problem, None, out)
+        after[out] = before[out] if chosen is None else predicted(problem, chosen, out)
+    of_pose = by_pose(fit, before), by_pose(fit, after)
+    rank = fit.whitening.rank
+    misfit = max(float(of_pose[0].sum()) - rank, 3.0 * np.sqrt(2.0 * rank))
+    share = float(np.clip((of_pose[0].sum() - of_pose[1].sum()) / misfit, -1.0, 1.0))
+    return FoldSearch(share, improves(*of_pose), tuple(found))
+
+
+def predicted(problem: SearchProblem, selection: Selection | None, out: Bools) -> Floats:
+    """Residual of rows that are left out, by model and law refitted to the others."""
+    screen = problem.screen
+    linear = screen.linear
+    rows, white = linear.rows, linear.fit.white
+    terms = () if selection is None else selection.terms
+    x = np.hstack([rows, *map(screen.columns_of, terms)])
+    used = problem.rows
+    own = x[used]
+    ridge = np.full(x.shape[1], RIDGE)
+    ridge[: rows.shape[1]] = np.maximum(linear.projection.ridge, RIDGE)
+    step = np.linalg.solve(own.T @ own + np.diag(ridge), own.T @ white[used])
+    return np.asarray(white[out] - x[out] @ step)
+
+
+def found_again(screen: Screen, folds: FoldSearch, terms: tuple[LawTerm, ...]) -> tuple[Again, ...]:
+    """Say of each site and what moves it in how many searches without a fold it was found again."""
+    searches = [_causes(screen, s.terms) for s in folds.found if s is not None]
+    count = max(len(folds.found), 1)
+    return tuple(
+        Again(place, names, sum((place, frozenset(names)) in s for s in searches) / count)
+        for (place, _), names in _causes(screen, terms).items()
+    )
+
+
+def _causes(
+    screen: Screen, terms: tuple[LawTerm, ...]
+) -> dict[tuple[str, frozenset[str]], tuple[str, ...]]:
+    """Sites with the quantities that move them; a constant is not one where others do."""
+    named = [(screen.sites[s].words, screen.grammar.at(f).names) for t in terms for s, f in t.parts]
+    moved = {place for place, names in named if names}
+    return {
+        (place, frozenset(names)): names for place, names in named if names or place not in moved
+    }
+
+
+def agreement(before: Fit, after: Fit, moved: Floats) -> float:
+    """Return the correlation of what was hidden with what the added effects do.
+
+    Both are whitened, and what the model without the effect describes is projected out.
+
+    Args:
+        before: the fit without the added effects.
+        after: the fit with more effects, behind those of the first model.
+        moved: (N, 3) by how much the hidden law moves each reading, sensor axes, m.
+    """
+    linear, w = linearise(before), before.whitening
+    truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
+    known = len(before.model.effects)
+    effects, theta = after.model.effects[known:], after.theta[before.model.size :]
+    jacobian = before.model.jacobian_of(effects, before.solution.prediction, before.theta, w.m)
+    told = linear.project_out(w.whiten(w.raw(jacobian @ theta)).reshape(-1))
+    size = float(np.linalg.norm(truth) * np.linalg.norm(told))
+    return float(truth @ told) / max(size, 1e-300)

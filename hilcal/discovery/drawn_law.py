@@ -35,7 +35,6 @@ class DrawnLaw:
     """An effect of a file in a fitted model.
 
     Attributes:
-        name: of the effect.
         formula: its summary; that of a proposed law is its formula.
         acts_on: where it acts, in words.
         curves: over what it depends on, where a site moves with something recorded.

@@ -30,7 +30,6 @@ def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
     """Return the functions of one quantity, with starting values of their numbers.
 
     Args:
-        v: the quantity.
         x: (N,) it at the readings.
         most: complexity of a product; functions that are to be in none have it.
     """

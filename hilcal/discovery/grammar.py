@@ -14,8 +14,7 @@ from math import comb, log
 import numpy as np
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, different
-from hilcal.discovery.composed import Composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, different
 from hilcal.discovery.functions import FINEST, fine_waves, functions
 from hilcal.discovery.shapes import Numbers
 from hilcal.discovery.variables import Variable
@@ -48,15 +47,12 @@ class Grammar:
     """All amplitudes that are tried, and their values.
 
     Attributes:
-        known: the quantities.
-        amplitudes: the products.
         values: (F, N) their values, single precision, each with root mean square 1.
         size: (F,) what they were divided by.
         cost: (F,) complexities.
         partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
         less: (2, F) the amplitude without the first and without the second factor of a product of
             two; −1 for no product.
-        situation: of the readings.
         singles: the functions of one quantity from which products are made.
     """
 
@@ -219,8 +215,6 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of the functions of the quantities.
 
     Args:
-        known: the quantities.
-        s: the situation of the readings.
         poses: number of poses, which limits the multiples of an angle; see `FINEST`.
     """
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]

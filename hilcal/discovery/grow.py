@@ -42,7 +42,6 @@ def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:
     """Return terms of further factors and other numbers.
 
     Args:
-        beside: the candidates beside chosen terms.
         best: the best of the screening, best first.
     """
     found = list({(x.s, x.f): x for x in best}.values())

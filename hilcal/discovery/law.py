@@ -27,11 +27,7 @@ class LawPart:
 
 @dataclass(frozen=True, slots=True)
 class Form:
-    """A law without its numbers.
-
-    Attributes:
-        parts: its products.
-    """
+    """A law without its numbers."""
 
     parts: tuple[LawPart, ...]
 
@@ -189,7 +185,6 @@ class Again:
     """How often a cause was found again.
 
     Attributes:
-        acts_on: the site.
         variables: the quantities that move it.
         share: share of the searches without some poses that find the same.
     """
@@ -204,7 +199,6 @@ class Resemblance:
     """An effect of the catalogue, and how near a law is to what it can describe.
 
     Attributes:
-        effect: its name.
         cosine: correlation of the law with what the effect predicts of it on poses left out.
     """
 
@@ -219,7 +213,6 @@ class Law:
     Attributes:
         name: of its effect.
         form: where it acts, and how.
-        parameters: its coefficients.
         p_value: of the joint test of its columns, times the number of candidates that were tried.
         odds: logarithm of the odds against no law, the search paid for.
         holdout_share: share of the misfit that it explains on poses left out.

@@ -32,8 +32,6 @@ class LawSearch:
         """Laws are named after the files that they will be: found.py, found_2.py, ….
 
         Args:
-            folder: of the files.
-            name: of the first law.
             replacing: whether files of these names are removed first, as those of a rehearsal
                 that is repeated; else other names are taken.
         """

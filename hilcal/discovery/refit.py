@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.composed import Composed, composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed
 from hilcal.discovery.law import (
     LETTERS,
     Coefficient,
@@ -63,7 +62,7 @@ def refine(screen: Screen, form: Form) -> Form:
     found = minimize(
         objective, np.zeros(len(free)), method="Nelder-Mead",
         options={"maxfev": 60 * len(free), "xatol": 1e-3, "fatol": 1e-3,
-                 "initial_simplex": _simplex(len(free))},
+                 "initial_simplex": np.eye(len(free) + 1, len(free), -1) * 0.3},
     )  # fmt: skip
     values = [float(f"{v:.{DIGITS}g}") for v in at(found.x)]
     refined = with_values(form, free, values)
@@ -71,10 +70,6 @@ def refine(screen: Screen, form: Form) -> Form:
     dof = linear.fit.dof
     gain = 0.5 * dof * np.log(best / max(after, 1e-300))
     return refined if gain > len(free) * (0.5 * np.log(dof)) + WORTH else form
-
-
-def _simplex(count: int) -> Floats:
-    return np.vstack([np.zeros(count), 0.3 * np.eye(count)])
 
 
 def left_by(screen: Screen, form: Form, s: Situation) -> float:
@@ -143,7 +138,6 @@ class FreeNumber:
         places: (part, factor) of each function that has it.
         index: of it among the function's numbers, or among the weights of its quantity.
         weight: whether it is a weight.
-        begin: its value.
         scale: one unit of its change; 0 where it changes by factors instead, eˣ.
         least: value that it has at least.
     """
@@ -180,10 +174,6 @@ def free_numbers(form: Form, s: Situation) -> list[FreeNumber]:
     """Return the free numbers of a law.
 
     The same function of the same quantity in several products has one number.
-
-    Args:
-        form: the law.
-        s: the situation of the readings.
     """
     groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
     for k, p in enumerate(form.parts):

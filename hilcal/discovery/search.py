@@ -11,8 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from hilcal.discovery.gains import SHORT_LIST
-from hilcal.discovery.problem import SearchProblem
+from hilcal.discovery.problem import SHORT_LIST, SearchProblem
 from hilcal.discovery.screen import Screen
 from hilcal.discovery.terms import LawTerm, Scored
 from hilcal.regression.evidence import FamilyScore
@@ -55,11 +54,6 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
     """Return the best selection of each number of terms, from one on; none where chance would do.
 
     A longer one is returned only where odds of 20 : 1 ask for it beside every shorter one.
-
-    Args:
-        problem: the rows to search on.
-        most: terms at most.
-        beam: first terms that are followed.
     """
     found = _ordered(problem)
     if not found or not _sure(found[0], problem):
@@ -83,7 +77,10 @@ def search(problem: SearchProblem, most: int = MOST_TERMS, beam: int = BEAM) -> 
             # What was added last is the best beside the others already.
             s = _exchanged(problem, grown, last=len(grown.terms) - 1)
             _keep(problem, best, s)
-    return [_plainly(problem.screen, s) for s in worth_their_length(best[k] for k in sorted(best))]
+    return [
+        replace(s, terms=tuple(plain(problem.screen, t) for t in s.terms))
+        for s in worth_their_length(best[k] for k in sorted(best))
+    ]
 
 
 def worth_their_length(selections: Iterable[Selection]) -> list[Selection]:
@@ -147,11 +144,6 @@ def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> N
     count = len(s.terms)
     if count not in best or _better(problem, s, best[count]):
         best[count] = s
-
-
-def _plainly(screen: Screen, s: Selection) -> Selection:
-    """Name the simplest of the sites that move all readings alike."""
-    return replace(s, terms=tuple(plain(screen, t) for t in s.terms))
 
 
 def plain(screen: Screen, t: LawTerm) -> LawTerm:

@@ -23,8 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from hilcal.discovery.amplitudes import Factor
-from hilcal.discovery.composed import Composed
+from hilcal.discovery.amplitudes import Composed, Factor
 from hilcal.discovery.law import Coefficient, Form, coefficients, form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine
@@ -58,7 +57,6 @@ class Structure:
 
     Attributes:
         kind: sites and functions; see `structure_of`.
-        form: the law.
         probability: posterior, of all that were met.
         holdout_share: share of the misfit that it explains on poses left out, by algebra.
         step: (P,) posterior mean of its coefficients, in ordinary motions.
@@ -93,12 +91,7 @@ def posterior(odds: Mapping[Hashable, Sequence[float]]) -> dict[Hashable, float]
 
 
 def structures(problem: SearchProblem, selections: Sequence[Selection]) -> tuple[Structure, ...]:
-    """Return the likely structures and the best of each complexity, the likeliest first.
-
-    Args:
-        problem: of all rows, searched.
-        selections: what the search chose.
-    """
+    """Return the likely structures and the best of each complexity, the likeliest first."""
     screen = problem.screen
     met = _met(problem, selections)
     groups: dict[Hashable, list[tuple[float, Terms]]] = {}
@@ -199,7 +192,6 @@ def averaged(fit: Fit, of: Sequence[Structure], readings: Readings) -> tuple[Flo
     """Return what likely laws add to a fit's prediction of D measurements, and its uncertainty.
 
     Args:
-        fit: the fit without the laws.
         of: structures; their probabilities are taken relative to their sum.
         readings: of the same cell, measured or planned.
 

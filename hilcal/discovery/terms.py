@@ -33,7 +33,6 @@ class Scored:
     """A term beside others.
 
     Attributes:
-        term: the term.
         score: its score as a family.
     """
 

@@ -89,11 +89,8 @@ def _compiled(code: str) -> CodeType:
 
 def variables(s: Situation) -> list[Variable]:
     """Return all quantities that vary over the states of a situation."""
-    return [v for v in _all(s) if _varies(v.read(s))]
-
-
-def _varies(x: Floats) -> bool:
-    return bool(np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300))
+    found = ((v, v.read(s)) for v in _all(s))
+    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
 
 
 def _all(s: Situation) -> Iterator[Variable]:

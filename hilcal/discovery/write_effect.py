@@ -94,11 +94,8 @@ def source_of_form(
         InputError: the name is none of an effect.
 
     Args:
-        form: the law.
-        name: of its effect.
         found: its coefficients, for their ordinary magnitudes.
         evidence: what speaks for it, in lines.
-        file: the file's own name.
     """
     if not NAME.fullmatch(name):
         raise InputError(f"effect {escaped(name)!r}; valid: lower-case letters, digits and _")

@@ -26,9 +26,8 @@ from hilcal.effects.load_point import LoadPoint
 from hilcal.effects.observer_frame import ObserverFrame
 from hilcal.effects.options import Options
 from hilcal.effects.periodic_joint_compliance import PeriodicJointCompliance
-from hilcal.effects.protocol import Effect, Role
+from hilcal.effects.protocol import Effect, Role, source_of
 from hilcal.effects.sensor_misalignment import SensorMisalignment
-from hilcal.effects.source import source_of
 from hilcal.effects.target_offset import TargetOffset
 from hilcal.effects.thermal_growth import ThermalGrowth
 from hilcal.effects.thermal_joint_drift import ThermalJointDrift
@@ -111,8 +110,6 @@ class Catalogue:
         """Build an effect by name.
 
         Args:
-            name: of the effect.
-            cell: the cell.
             states: those that it is set up for.
             options: where they are not the usual ones.
             m: 3 for readings of positions, 6 for poses.

@@ -17,7 +17,6 @@ class Directions:
     """Directions of an effect's P parameters that change together.
 
     Attributes:
-        name: of the change.
         parameters: (k,) names of the directions.
         units: (k,) their units.
         scale: (k,) their ordinary magnitudes, SI.

@@ -21,13 +21,13 @@ from hilcal.effects.protocol import (
     Response,
     Role,
     Situation,
+    source_of,
+    total,
 )
-from hilcal.effects.source import source_of
-from hilcal.effects.total import total
 from hilcal.errors import HilcalError, InputError
 from hilcal.names import escaped
 from hilcal.readings.readings import States
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import load_wrench_change, slot_wrenches
 from hilcal.types import Floats
 
@@ -66,7 +66,6 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     used are named in `needs`.
 
     Args:
-        kind: the class.
         cell: of the arm that it is made for; an arm of six joints, or of seven, unless given.
 
     Raises:

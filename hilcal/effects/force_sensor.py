@@ -70,7 +70,6 @@ def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
     """Return the recorded wrench (N, 6) in sensor axes, N and N·m.
 
     Args:
-        s: the situation.
         axes: (3, 3) the sensor's axes in flange axes.
     """
     return _turned(np.swapaxes(_sensor(s, axes), 1, 2), s.states.wrench)

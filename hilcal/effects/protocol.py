@@ -8,7 +8,7 @@ returns `load_change` or `wrench_change`, and their derivative `wrench_columns`.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
 from typing import ClassVar, Literal, Self
@@ -18,12 +18,10 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.changed import Changeable
 from hilcal.effects.options import Options
-from hilcal.effects.source import source_of
-from hilcal.effects.total import total
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.robot.chain import Chain
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.batch import zeros
+from hilcal.robot.chain import Chain, Deviation
 from hilcal.robot.statics import Load
 from hilcal.types import Bools, Floats, Ints
 
@@ -57,8 +55,6 @@ class Situation:
     """N states at their deflected configuration: everything that a law may depend on.
 
     Attributes:
-        cell: arm, tool and target.
-        states: the N states.
         angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
             recorded; those of the drives where joints are coupled, and the phase of its travel
             where a joint slides (`Arm.phases`).
@@ -442,3 +438,38 @@ def _finite(values: Floats) -> bool:
 def _has(states: States, need: str) -> bool:
     """Whether the states have a column, or one of those that an "or" joins."""
     return any(getattr(states, column) is not None for column in need.split(" or "))
+
+
+def total(
+    columns: "tuple[Columns, ...]", theta: Floats, s: "Situation", start: Deviation | None = None
+) -> Deviation:
+    """Return the deviation Σ columns_p θ_p of N states, added to one of them where it is given."""
+    count, n = s.angle.shape
+    width = {"dq": (n,), "twist": (n + 1, 6), "scale": ()}
+    fields: dict[str, Floats] = {}
+    for c in columns:
+        field = fields.get(c.field)
+        if field is None:
+            before = None if start is None else getattr(start, c.field)
+            shape = (count, *width.get(c.field, (6,)))
+            field = zeros(*shape) if before is None else before.copy(order="F")
+            fields[c.field] = field
+        t = theta[c.parameter]
+        if c.field in ("dq", "twist"):
+            for e, mine in c.runs():
+                if mine.stop - mine.start == 1:
+                    field[:, e] += c.values[:, mine.start] * t[mine.start]
+                else:
+                    field[:, e] += np.einsum("np...,p->n...", c.values[:, mine], t[mine])
+        else:
+            field += np.einsum("np...,p->n...", c.values, t)
+    return Deviation(**fields) if start is None else replace(start, **fields)
+
+
+def source_of(kind: type) -> str:
+    """Return the file that a class is defined in; its module where that is unknown."""
+    for member in vars(kind).values():
+        function = getattr(member, "fget", getattr(member, "__func__", member))
+        if code := getattr(function, "__code__", None):
+            return str(code.co_filename)
+    return kind.__module__

@@ -32,7 +32,6 @@ def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, 
     Args:
         text: e.g. "joint_compliance, transmission_error(harmonics=20)".
         where: begins the message, e.g. "--effects".
-        catalogue: has the names.
 
     Returns:
         Options by name of the effect, in order.
@@ -144,11 +143,7 @@ def _single(text: str, where: str) -> object:
 
 
 def _split(text: str, separators: str, where: str, valid: str) -> list[str]:
-    """Split outside of quotes, parentheses and brackets; empty parts are left out.
-
-    Raises:
-        InputError: one of them is not closed, or was not opened.
-    """
+    """Split outside of quotes, parentheses and brackets; empty parts are left out."""
     parts, start = [], 0
     for k in _outside(text, where, valid):
         if text[k] in separators:

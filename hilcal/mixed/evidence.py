@@ -53,8 +53,6 @@ def evidence(
     Several are tested by one multiple of their ordinary standard deviations, the priors' means.
 
     Args:
-        problem: with the families.
-        families: their numbers.
         rng: draws the ratios.
         start: (F + N,) log s and η of the whole problem; without it the priors' means.
     """

@@ -54,7 +54,6 @@ class Family:
 
     Attributes:
         name: the effect's, with what sets the family apart where the effect has several.
-        effect: name of the effect.
         parameters: (q,) indices of the parameters in the model.
         magnitude: (q,) root of D's diagonal: ordinary magnitudes, SI.
         prior: what is known of log s.
@@ -79,7 +78,6 @@ class Families:
 
     Attributes:
         frames: (F,) indices of those without a prior: registration and target, flat effects.
-        random: the families.
     """
 
     frames: Ints

@@ -27,7 +27,6 @@ class Noise:
     """One component of the noise: covariance exp(2 η) R_k.
 
     Attributes:
-        name: of it.
         variance: (R,) diagonal of R_k.
         prior: what is known of η.
     """
@@ -118,7 +117,6 @@ def mixed_problem(
     Args:
         y: (R,) as in `MixedProblem`.
         jacobian: (R, P) whitened derivative by all parameters of the model.
-        families: of the model.
         noise: components, that of the instrument first.
     """
     frames = _frame_basis(jacobian[:, families.frames])

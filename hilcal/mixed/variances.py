@@ -68,7 +68,6 @@ def estimate_variances(
     """Estimate all variances.
 
     Args:
-        problem: rows, columns and noise.
         start: (F + N,) where the iteration starts; the priors' means unless given.
         search: whether other sizes of each family are searched. A size far from that at which the
             problem was linearised is only one to linearise at anew.

@@ -111,7 +111,6 @@ def at_equilibrium(
     Args:
         moves: derivatives of the reading with the wrenches held as they are.
         stiffness: of the chain under its load.
-        blocks: the compliance.
     """
     term = wrench_form(moves, blocks)
     form, whole = dict(term), _norm(term)
@@ -146,8 +145,6 @@ def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m
 
     Args:
         form: derivatives by the wrenches, see `wrench_form`.
-        change: the changes.
-        m: elements of a reading.
     """
     out = zeros(len(change), m, change.shape[1])
     for (slot, moment), rows in form.items():
@@ -163,9 +160,6 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 
     Args:
         form: derivatives by the slot wrenches, see `wrench_form`.
-        chain: the deviated chain.
-        load: where it acts.
-        m: elements of a reading.
     """
     point = chain.point(load.point)
     out = zeros(len(point), m, 6)
@@ -188,7 +182,6 @@ def by_wrenches(
     From those by the deviation; those that are zero are left out.
 
     Args:
-        blocks: the compliance.
         by_joint: (N, m) by the displacement of a joint.
         by_slot: (N, m, E) by a range of the elements of the twist of a slot.
     """

@@ -10,9 +10,8 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.effects.options import typical_compliances
-from hilcal.effects.protocol import Columns, Effect, Situation
+from hilcal.effects.protocol import Columns, Effect, Situation, total
 from hilcal.effects.spec import EffectSpec
-from hilcal.effects.total import total
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.model.equilibrium import SlotResponse, at_equilibrium, compliance
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
@@ -21,8 +20,7 @@ from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
-from hilcal.robot.chain import Chain
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Chain, Deviation
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.shown import Brief
@@ -79,7 +77,6 @@ class Model(Brief):
     """Robot and effects.
 
     Attributes:
-        cell: the cell.
         effects: its effects, each of another name.
         catalogue: the effects that it could have.
         readings: those that effects are set up for when they are added by name; None where the

@@ -16,8 +16,7 @@ import numpy as np
 from hilcal.cell import Cell, Observer
 from hilcal.robot import se3
 from hilcal.robot.batch import empty, zeros
-from hilcal.robot.chain import Chain, joint_jacobian, twist_jacobian
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Chain, Deviation, joint_jacobian, twist_jacobian
 from hilcal.robot.geometric_stiffness import MotionGradient, rows_times
 from hilcal.shown import Brief
 from hilcal.types import Bools, Floats, Ints
@@ -65,9 +64,6 @@ def observe(
     """Read the target of a deviated chain.
 
     Args:
-        cell: registration, targets and observers.
-        chain: the deviated chain.
-        deviation: what it is deviated by.
         target: (N,) number of the target, where there are several.
         observer: (N,) number of what observes it, where there are several.
     """
@@ -174,12 +170,6 @@ class ReadingDerivative:
     (see `equilibrium`).
 
     Attributes:
-        cell: arm and target.
-        observation: the reading.
-        chain: the deviated chain.
-        deviation: the deviation.
-        m: number of rows.
-        frames: of the slots.
         dq: (N, m, n) derivative by displacements of the chain's joints.
         yielding: derivative by motions of the chain of what the arm yields to them.
     """
@@ -292,7 +282,6 @@ class SlotFrames:
     J and Q are the blocks of the right Jacobian (`se3`), R the frame's orientation after ξ.
 
     Attributes:
-        chain: the deviated chain.
         known: R J and R Q (None for zero) of the slots that were asked for.
     """
 
@@ -303,7 +292,6 @@ class SlotFrames:
         """Rows (N, m, E) by the twist, from rows by v (None for zero) and ω (N, m, 3), base axes.
 
         Args:
-            slot: whose twist.
             v: rows by the displacement.
             w: rows by the turn.
             elements: range of the elements of the twist.

@@ -38,9 +38,6 @@ class ReadingColumns:
         """Begin without any.
 
         Args:
-            moves: how the chunk's readings move.
-            blocks: compliance of the arm.
-            load: what pulls at it.
             scale: (L,) units of the parameters; SI unless given.
         """
         self._moves, self._blocks, self._load, self._scale = moves, blocks, load, scale
@@ -52,7 +49,6 @@ class ReadingColumns:
         """Add one block of an effect's columns.
 
         Args:
-            c: the columns.
             place: which of the L each parameter of the effect is; −1 for none.
         """
         c = c.only(place[c.parameter] >= 0)
@@ -195,12 +191,7 @@ def _scaled(c: Columns, by: Floats) -> Columns:
 
 
 def _pieces(element: list[int], to: list[int]) -> Iterator[slice]:
-    """Yield columns with successive places, all of one joint or each of the next joint.
-
-    Args:
-        element: joint of each column.
-        to: its place.
-    """
+    """Yield columns with successive places, all of one joint or each of the next joint."""
     start, count = 0, len(to)
     while start < count:
         stop = start + 1

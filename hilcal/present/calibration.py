@@ -8,11 +8,9 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import Compensation
-from hilcal.calibration.conditions import WORDS
+from hilcal.calibration.compensated import BAND, Compensation
 from hilcal.calibration.improvement import Improved, Improvement
-from hilcal.calibration.measured import Outside
-from hilcal.calibration.poses import BAND
+from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
 from hilcal.identification.acceptance import Acceptance
@@ -310,7 +308,7 @@ def _parts(calibration: Calibration, untold: Sequence[str]) -> list[str]:
     """What the stated error after compensation consists of."""
     parts = ["the parameters"]
     for name in untold:
-        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance)))
+        moved = numbers.length(float(np.sqrt(3 * calibration.conditions[name].variance_m2)))
         parts.append(f"{WORDS[name]}, which the points do not tell ({moved} rms)")
     if calibration.misfit > 0:
         left = numbers.length(float(np.sqrt(3 * calibration.misfit)))

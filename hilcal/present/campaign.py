@@ -28,7 +28,7 @@ def info_report(o: Overview, name: str, covariance: str) -> Iterator[Block]:
     yield ""
     if o.planned is not None:
         yield heading("Instruments")
-        yield pairs([(i.part, _instrument(i.name, i.serial)) for i in o.instruments])
+        yield pairs([(i.device, _instrument(i.name, i.serial_number)) for i in o.instruments])
         yield ""
         yield heading("Checks on the way")
         yield pairs([*_checks(o)])
@@ -104,7 +104,7 @@ def _checks(o: Overview) -> Iterator[tuple[str, str]]:
 def _drift(o: Overview) -> str:
     if not o.returns:
         return "no return to the reference pose"
-    sizes = [float(np.linalg.norm(r.metres)) for r in o.returns]
+    sizes = [float(np.linalg.norm(r.shift_m)) for r in o.returns]
     k, over = int(np.argmax(sizes)), sum(r.over for r in o.returns)
     limit = f"{o.config.acquire.drift_limit_sigma:g} σ"
     several = f"{len(o.returns)} return{'s' * (len(o.returns) > 1)} to the reference pose"

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.poses import band
+from hilcal.calibration.compensated import band
 from hilcal.calibration.tool import tool_of
 from hilcal.cell import Cell
 from hilcal.config import CellConfig

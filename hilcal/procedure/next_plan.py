@@ -8,8 +8,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import CheckedPlan, checked
-from hilcal.design.many_poses import measure_poses
-from hilcal.design.next import Next, PairPower, measure_next
+from hilcal.design.next import Next, PairPower, measure_next, measure_poses
 from hilcal.design.planner import Request
 from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis

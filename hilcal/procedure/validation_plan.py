@@ -9,8 +9,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
-from hilcal.design.draw import draw
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import Space, draw
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError

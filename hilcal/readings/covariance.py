@@ -112,7 +112,6 @@ def tracker_covariance(
 
     Args:
         position: (N, 3) positions in the frame of `station`, m.
-        noise: the instrument's figures.
         station: (3,) where the beam starts, m.
         m: 3 for positions, 6 for poses.
 
@@ -199,7 +198,6 @@ def arrival_factors(
     """Factors F (N, m, n) of the scatter of the joints at the nominal poses of the readings.
 
     Args:
-        arm: the nominal arm.
         readings: N readings.
         offset: (3,) or (N, 3) the target in flange axes, m.
         rotation: (3, 3) R_sensor_base.

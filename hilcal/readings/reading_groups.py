@@ -87,7 +87,6 @@ def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
     """Join groups to runs along `Readings.along`, each in its order.
 
     Args:
-        readings: the readings.
         groups: those that share another error; none is divided.
         most: measurements in a run, but for its last group.
     """
@@ -133,11 +132,7 @@ def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
 
 
 def _refuse_without_unloaded(readings: Readings) -> None:
-    """Refuse a pose and cycle without any unloaded reading.
-
-    Raises:
-        InputError: names it.
-    """
+    """Refuse a pose and cycle without any unloaded reading."""
     has = has_unloaded(readings)
     if not has.all():
         row = int(np.argmin(has))

@@ -76,7 +76,6 @@ class ObserverName:
     Attributes:
         kind: "station" reads positions or poses, "point" the distance from a point, "gauge" the
             height over a plane.
-        name: of it.
     """
 
     kind: ObserverKind
@@ -95,14 +94,12 @@ class Readings(Tabular):
     0 and have no variance, so that whitening leaves them out (`whitening.inverse_root`).
 
     Attributes:
-        states: the N states.
         pose: (N,) index of the commanded pose; equal numbers mean the same pose.
         load: (N,) index into `load_names`; the unloaded state has the name "none".
         cycle: (N,) readings of one pose and one cycle share their unloaded reading.
         value: (N, m) position in m and, for m = 6, rotation vector in rad, sensor axes.
         covariance: (N, m, m) covariance of `value`, m², m·rad, rad²; for the rotations it is
             the covariance of a small rotation about the sensor's axes.
-        load_names: names of the loads.
         pose_names: names of the poses, as in the table.
         target_names: names of the targets that `states.target` numbers; empty where it is None.
         observers: what `states.observer` numbers; empty where it is None.

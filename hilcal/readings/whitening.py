@@ -269,7 +269,6 @@ def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
 
     Args:
         readings: those of the scaling, with any covariance.
-        w: the scaling.
     """
     return [measurement_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
@@ -278,7 +277,6 @@ def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
     """Deflections where every loaded reading has an unloaded one in its pose and cycle.
 
     Args:
-        readings: the readings.
         planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
     """
     if planned == "absolute" or readings.unloaded.all():

@@ -31,8 +31,6 @@ def block_evidence(gram: Floats, g: Floats, rss: float, dof: float, strengths: F
     Args:
         gram: (L, W, W) of the blocks beside the model.
         g: (L, W) their products with the residual.
-        rss: its square.
-        dof: its degrees of freedom.
         strengths: (T,) prior standard deviations that are tried.
     """
     lam, u = np.linalg.eigh(gram)
@@ -103,7 +101,6 @@ class BlockSelection:
         """Return the blocks that the rows without fold f choose, the first one first.
 
         Args:
-            f: the fold.
             most: number of blocks at most.
             least: gain in log evidence that each needs.
             strengths: (T,) prior standard deviations that are tried.

@@ -4,10 +4,6 @@ import numpy as np
 
 from hilcal.types import Floats, Ints
 
-_MOST = 2_000_000
-"""Pairs that are compared one by one; a choice. More are sought cell by cell, by a tree
-that takes as long to load as a thousand poses to group."""
-
 
 def connected(a: Ints, b: Ints, count: int) -> Ints:
     """Return the number (count,) of the group of each of `count` things; a[k], b[k] are joined.
@@ -21,14 +17,16 @@ def connected(a: Ints, b: Ints, count: int) -> Ints:
     return np.asarray(connected_components(joined, directed=False)[1], dtype=np.int64)
 
 
-def _by_cells(points: Floats, distance: float) -> tuple[Ints, Ints]:
-    """Return pairs (K,) and (K,) that join what all near pairs would join, of which there are many.
+def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
+    """Return pairs (K,) and (K,) that join what all near pairs would join.
 
     Points of one cell of half the distance are joined in a row; of two cells that are not yet
     joined one near pair is sought.
     """
     from scipy.spatial import cKDTree  # slow to import
 
+    if not points.size:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
     place = np.floor(points / (distance / 2)) if distance else points
     cells, of = np.unique(place, axis=0, return_inverse=True)
     of = of.reshape(-1)
@@ -80,21 +78,3 @@ def groups_within(points: Floats, distance: float) -> Ints:
     Points are joined that differ by at most `distance` in every coordinate.
     """
     return connected(*_near(points, distance), len(points))
-
-
-def _near(points: Floats, distance: float) -> tuple[Ints, Ints]:
-    """Return pairs (K,) and (K,) of points within `distance`, as many as join all that are."""
-    if not points.size:
-        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    along = points[:, np.argmax(np.ptp(points, axis=0))]
-    order = np.argsort(along, kind="stable")
-    sorted_along = along[order]
-    reach = sorted_along + distance * (1.0 + 1e-9) + np.spacing(np.abs(sorted_along))
-    follow = np.searchsorted(sorted_along, reach, side="right") - np.arange(len(points)) - 1
-    if follow.sum() > _MOST:
-        return _by_cells(points, distance)
-    first = np.repeat(np.arange(len(points)), follow)
-    second = first + 1 + np.arange(len(first)) - np.repeat(np.cumsum(follow) - follow, follow)
-    a, b = order[first], order[second]
-    near = np.all(np.abs(points[a] - points[b]) <= distance, axis=1)
-    return a[near], b[near]

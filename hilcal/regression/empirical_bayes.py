@@ -137,7 +137,6 @@ def spent_by_groups(share: Floats, size: Ints) -> Floats:
 
     Args:
         share: t, the share γ/k of each group that the data determine.
-        size: k, its number of parameters.
     """
     return np.asarray(size + _excess(size) * (1.0 - np.clip(share, 0.0, 1.0)))
 

@@ -22,10 +22,8 @@ The whole family is judged at once:
   stands for rᵀ M⁻¹ r, which is larger by the penalty. t is where the evidence is largest. Of two
   families that explain the same, the smaller one has more evidence.
 
-Diagnosis and planning use this one formula. An earlier form for planning took the stated noise as
-the true one (σ² = 1). That is wrong exactly when it is needed, with a misfit: at a variance factor
-of φ the evidence of each direction is overstated by about the factor φ, whatever the cause of the
-misfit. Where r is noise of the stated size the two agree to O(1/ν).
+Diagnosis and planning use this one formula. With the stated noise taken for the true one (σ² = 1) a
+misfit of variance factor φ would overstate the evidence of each direction by about φ.
 
 Sources: O'Hagan and Forster, *Bayesian Inference* (2004), chapter 11; Goeman, van de Geer and van
 Houwelingen, *Testing against a high dimensional alternative*, J. R. Stat. Soc. B 68 (2006) 477-493.

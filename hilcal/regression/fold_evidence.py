@@ -50,7 +50,6 @@ def solutions(p: FamilyProblem, fold: Ints) -> Floats:
     """Return u (F + P) without each fold (folds, F + P).
 
     Args:
-        p: the problem.
         fold: (R,) fold of each row, from 0.
     """
     flat, count_of = len(p.pull), np.bincount(fold)

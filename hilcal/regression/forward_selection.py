@@ -81,9 +81,7 @@ def families_beside(
     Args:
         information: (P, P) S of all families' columns beside the model.
         residual: (R,) residual r of the model.
-        dof: degrees of freedom of r.
         x: (R, P) whitened columns of all families, in ordinary magnitudes.
-        columns: of each family.
         most: largest plausible strength of each family that has one.
     """
     rss = float(residual @ residual)
@@ -96,7 +94,6 @@ class Addition:
 
     Attributes:
         name: the family with most evidence.
-        score: its score.
         scores: of all families that can be added.
         before: the families beside the model without it.
     """

@@ -108,11 +108,8 @@ def left_out_residual(
     """Return the residual (R,) of each row, predicted without its fold by model and family.
 
     Args:
-        folds: of the model.
-        p: the model's columns.
         white: (R,) residual of the model fitted to all rows.
         x: (R, F) whitened columns of the family; None for the model alone.
-        ridge: of the family's parameters.
     """
     if x is None:
         left = np.zeros(len(white))
@@ -148,7 +145,6 @@ def family_products(
 
     Args:
         folds: of the model; each row is in one.
-        p: the model's columns.
         white: (R,) residual of the model fitted to all rows.
         families: X of each.
     """
@@ -174,10 +170,7 @@ def left_out_of_families(
     """Return `left_out_residual` (R,) of each family, each beside the model by itself.
 
     Args:
-        folds: of the model.
-        p: the model's columns.
         white: (R,) residual of the model fitted to all rows.
-        families: products and ridge of each.
     """
     found = [np.zeros(len(white)) for _ in families]
     small = [_in_all_folds(folds, of, ridge) for of, ridge in families]
@@ -264,7 +257,6 @@ class FamilyFolds:
 
         Args:
             folds: of the model; their right-hand sides are not used.
-            p: the model's columns.
             x: (R, F) whitened columns of the family; None for the model alone.
         """
         self._x = x = np.zeros((len(p.rows), 0)) if x is None else x
@@ -283,7 +275,6 @@ class FamilyFolds:
 
         Args:
             y: (R, K) what remains where all parameters are zero.
-            ridge: of the family's parameters.
         """
         x, p = self._x, self._p
         total, rhs = p.rows.T @ y, x.T @ y

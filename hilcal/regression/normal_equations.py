@@ -163,7 +163,6 @@ class NormalEquations:
     """H z = b in the coordinates of a basis, H = gram + β·diag(prior precision).
 
     Attributes:
-        basis: the coordinates.
         gram: (K, K) Tᵀ AᵀA T.
         rhs: (K,) Tᵀ Aᵀ target; z is a step for flat directions, absolute for those with a prior.
     """
@@ -229,7 +228,6 @@ def normal_equations(
     Args:
         a: A.
         target: (R,) right-hand side.
-        basis: the coordinates.
         gram: AᵀA.
         known: products of the flat coordinates, where they are known.
     """

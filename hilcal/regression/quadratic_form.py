@@ -23,7 +23,6 @@ def ratio_tail(eigenvalues: Floats, dimension: float, c: float) -> float:
     Args:
         eigenvalues: (K,) non-zero eigenvalues λ of the numerator.
         dimension: R, dimension of z, at least K; the other R − K eigenvalues are zero.
-        c: the observed ratio.
     """
     top = float(eigenvalues.max(initial=0.0))
     if c <= 0 or top <= 0:

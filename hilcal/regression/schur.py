@@ -164,7 +164,6 @@ def eliminate(
         gram: (P, P) G.
         rhs: (P,) b.
         square: ‖y‖².
-        out: columns to eliminate.
         ridge: λ, inverse of their prior variance in units of the noise.
 
     Returns:

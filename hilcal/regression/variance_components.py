@@ -72,7 +72,6 @@ def variance_components(blocks: Sequence[BlockRows], ridge: Floats) -> VarianceC
     """Maximise the restricted likelihood.
 
     Args:
-        blocks: all rows.
         ridge: (K,) Λ, zero for a column without a prior.
     """
     count = len(blocks[0].components)

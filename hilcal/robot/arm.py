@@ -29,9 +29,6 @@ def missing(
     """Return what a description lacks, and what that means, a sentence each.
 
     Args:
-        file: its name.
-        weighed: whether it has masses.
-        unlimited: joints without limits.
         weak: joints without a torque or effort.
         forceless: prismatic ones without a force or effort.
     """

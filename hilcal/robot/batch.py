@@ -53,7 +53,6 @@ def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
     """Yield slices that cover `count` states; one empty slice where there is none.
 
     Args:
-        count: number of states.
         numbers: that are computed for each state, where they are many: chunks are smaller then.
     """
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))

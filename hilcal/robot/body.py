@@ -126,7 +126,6 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
     T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
 
     Args:
-        arm: the arm.
         q: (N, n) the controller's joint values, rad.
         chain: the chain at q where it is evaluated already.
 
@@ -154,8 +153,6 @@ def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: floa
     """Return a capsule that the flange carries.
 
     Args:
-        arm: the arm.
-        name: what it is.
         start: (3,) one end, flange axes, m.
         end: (3,) the other end, flange axes, m.
         radius: m.

@@ -4,6 +4,8 @@
 
 with M = Rz of a revolute and Tz of a prismatic joint, evaluated exactly; there is no loop over
 states, only over the n joints.
+
+Deviations add exactly: the chain is evaluated once, on the sum.
 """
 
 from collections.abc import Sequence
@@ -13,9 +15,37 @@ import numpy as np
 
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
-from hilcal.robot.batch import along_states, empty
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.batch import along_states, by_field, empty
 from hilcal.types import Bools, Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deviation:
+    """Departure of N states from the nominal chain; None stands for zero.
+
+    Attributes:
+        dq: (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`).
+        twist: (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes
+            of slot k, m and rad.
+        base: (N, 6) twist of the base relative to its registration, base axes.
+        station: (N, 6) twist of the readings about the sensor's origin, sensor axes.
+        target: (N, 6) displacement of the tracked target, flange axes.
+        scale: (N,) relative scale error of the sensor's ranges.
+        observer: (N, 6) twist of the position in the axes of what observes it, where there are
+            several; of a distance, which no turn changes, element 3 is the offset, m.
+    """
+
+    dq: Floats | None = None
+    twist: Floats | None = None
+    base: Floats | None = None
+    station: Floats | None = None
+    target: Floats | None = None
+    scale: Floats | None = None
+    observer: Floats | None = None
+
+    def __add__(self, other: "Deviation") -> "Deviation":
+        """Add two deviations element by element."""
+        return by_field((self, other), lambda given: np.asarray(sum(given[1:], given[0])))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,12 +187,6 @@ def drive_jacobian(arm: Arm, chain: Chain, x: Floats) -> Floats:
     """Geometric Jacobian (N, 6, n) by displacements of the drives, see `joint_jacobian`."""
     out = joint_jacobian(chain, x)
     return out if arm.drive is None else np.asarray(out @ arm.drive)
-
-
-def slot_jacobian(chain: Chain, slot: int, x: Floats) -> Floats:
-    """Motion (N, 6, 6) of a flange-fixed point at x (N, 3) per change of the twist of a slot."""
-    twist = None if chain.twist is None else chain.twist[slot]
-    return twist_jacobian(chain.rotation[slot], x - chain.position[slot], twist)
 
 
 def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:

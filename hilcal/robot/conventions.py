@@ -13,13 +13,13 @@ mechanical couplings. One that only the controller counts (a forearm counted fro
 with its drive in the elbow) is in θ alone: each drive carries the torque of its joint.
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
 
 from hilcal.config.joints import Conventions
 from hilcal.errors import InputError
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
@@ -78,7 +78,6 @@ def with_conventions(
     Couplings C that the arm has already are applied to the converted values: θ = C (S q + o + K q).
 
     Args:
-        arm: the arm as drawn.
         sign: (n,) s.
         offset: (n,) o, rad; m where a joint slides.
         coupling: (n, n) k, zero on the diagonal.
@@ -88,7 +87,7 @@ def with_conventions(
     own = np.eye(arm.n) if arm.coupling is None else arm.coupling
     for j, zero in enumerate(own @ offset):
         if zero:
-            links[j] = links[j] @ (_along_z(zero) if arm.slides[j] else _about_z(zero))
+            links[j] = links[j] @ se3.screw(2, *((0.0, zero) if arm.slides[j] else (zero,)))
         if sign[j] < 0:
             links[j] = links[j] @ _HALF_TURN
             links[j + 1] = _HALF_TURN @ links[j + 1]
@@ -134,16 +133,3 @@ def may_follow(n: int) -> tuple[tuple[int, int], ...]:
     last but two (a wrist whose three motors stand in the forearm).
     """
     return tuple((j, j - 1) for j in range(2, n + 1)) + (((n, n - 2),) if n > 2 else ())
-
-
-def _along_z(travel: float) -> Floats:
-    shift = np.eye(4)
-    shift[2, 3] = travel
-    return shift
-
-
-def _about_z(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    turn = np.eye(4)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    return turn

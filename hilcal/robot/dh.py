@@ -118,7 +118,8 @@ def arm_from_dh(path: Path) -> Arm:
     table = load_section(path, DhTable)
     rows = table.joints
     offsets = [math.radians(row.offset_deg) for row in rows]
-    shifts, turns = [_shift_z(row) for row in rows], [_across(row) for row in rows]
+    shifts = [se3.screw(2, 0.0, row.d_m) for row in rows]
+    turns = [se3.screw(0, math.radians(row.alpha_deg), row.a_m) for row in rows]
     if table.convention == "modified":
         fixed, after = shifts, [*turns[1:], np.eye(4)]
     else:
@@ -161,29 +162,5 @@ def arm_from_dh(path: Path) -> Arm:
 
 def _links(fixed: Sequence[Floats], offsets: Sequence[float]) -> Floats:
     """(n + 1, 4, 4) transforms L_k from the fixed parts of the rows and the joint offsets."""
-    turns = [_rotation_z(offset) for offset in offsets] + [np.eye(4)]
+    turns = [se3.screw(2, offset) for offset in offsets] + [np.eye(4)]
     return np.array([turns[0], *(part @ turn for part, turn in zip(fixed, turns[1:], strict=True))])
-
-
-def _rotation_z(angle: float) -> Floats:
-    c, s = math.cos(angle), math.sin(angle)
-    turn = np.eye(4)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    return turn
-
-
-def _shift_z(row: JointRow) -> Floats:
-    """(4, 4) Tz(d)."""
-    part = np.eye(4)
-    part[2, 3] = row.d_m
-    return part
-
-
-def _across(row: JointRow) -> Floats:
-    """(4, 4) Tx(a) Rx(alpha), which commute."""
-    alpha = math.radians(row.alpha_deg)
-    c, s = math.cos(alpha), math.sin(alpha)
-    part = np.eye(4)
-    part[1:3, 1:3] = [[c, -s], [s, c]]
-    part[0, 3] = row.a_m
-    return part

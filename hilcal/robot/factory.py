@@ -94,9 +94,8 @@ def of_rows(
     theta, a, d, alpha = rows
     links = np.tile(np.eye(4), (N + 1, 1, 1))
     for k in range(N):
-        links[k] = links[k] @ _screw(theta[k], 0.0)
-        across = _place((a[k], 0.0, 0.0, alpha[k], 0.0, 0.0))
-        links[k + 1] = _screw(0.0, d[k]) @ across
+        links[k] = links[k] @ se3.screw(2, theta[k])
+        links[k + 1] = se3.screw(2, 0.0, d[k]) @ se3.screw(0, alpha[k], a[k])
     return FactoryKinematics(links, rows, status, checksum, source)
 
 
@@ -176,7 +175,7 @@ def with_factory(nominal: Arm, factory: FactoryKinematics) -> Arm:
     for k in range(N):
         # both frames at zero angles: the nominal one's origin and x axis, in the measured frame
         near = se3.inverse(theirs) @ ours
-        move = _screw(float(np.arctan2(near[1, 0], near[0, 0])), float(near[2, 3]))
+        move = se3.screw(2, float(np.arctan2(near[1, 0], near[0, 0])), float(near[2, 3]))
         links[k] = links[k] @ move
         links[k + 1] = se3.inverse(move) @ links[k + 1]
         theirs = theirs @ move @ links[k + 1]
@@ -238,22 +237,8 @@ def _of_yaml(text: str, nominal: Arm, source: str) -> FactoryKinematics:
             places.setdefault(body, {})[key] = float(value)
     links = np.tile(np.eye(4), (N + 1, 1, 1))
     for k, name in enumerate(_BODIES):
-        place = tuple(places[name][key] for key in _PLACE)
+        place = np.array([places[name][key] for key in _PLACE])
         if not np.abs(place).max() < _LARGEST:
             raise ValueError(f"{name} is nowhere")
-        links[k] = _place(place)
+        links[k] = se3.matrix(se3.of_rpy(place[3:]), place[:3])
     return FactoryKinematics(links, None, LINEARISED, (), source)
-
-
-def _screw(angle: float, shift: float) -> Floats:
-    """Rz(angle) Tz(shift)."""
-    return _place((0.0, 0.0, shift, 0.0, 0.0, angle))
-
-
-def _place(place: tuple[float, ...]) -> Floats:
-    """T(x, y, z) Rz(yaw) Ry(pitch) Rx(roll)."""
-    roll, pitch, yaw = np.eye(3) * np.array(place[3:])
-    out = np.eye(4)
-    out[:3, :3] = se3.rotation(yaw) @ se3.rotation(pitch) @ se3.rotation(roll)
-    out[:3, 3] = place[:3]
-    return out

@@ -38,7 +38,6 @@ class GeometricStiffness:
     """The load of a chain as its motions see it; base axes.
 
     Attributes:
-        chain: the deviated chain.
         force: (n + 1,) list of (N, 3) f_k, N.
         dyad: (n + 1,) list of (N, 3, 3) D_k, N·m.
         carried: (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment.
@@ -98,7 +97,6 @@ class MotionGradient:
     """Gradient of a linear form of the slot wrenches by motions of the chain.
 
     Attributes:
-        stiffness: the load.
         rows: N and m.
         still: (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base
             axes; None for zero, here and below.

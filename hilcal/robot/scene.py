@@ -57,13 +57,7 @@ class Scene:
     def __init__(
         self, arm: Arm, carried: Sequence[Capsule] = (), obstacles: Sequence[Obstacle] = ()
     ) -> None:
-        """Build the shapes.
-
-        Args:
-            arm: the arm.
-            carried: what the flange carries.
-            obstacles: what stands around.
-        """
+        """Build the shapes."""
         self.parts = (*capsules(arm), *carried)
         self._arm, self._model = arm, pinocchio_model(arm)
         self._data = self._model.createData()
@@ -270,7 +264,6 @@ def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
     that carries the joint.
 
     Args:
-        arm: the arm.
         body: 0 the base, i what joint i moves.
         points: (K, 3) points in the body's frame, m.
         joint: 1 to n.

@@ -12,7 +12,7 @@ Source of the closed forms: Lynch and Park, *Modern Robotics*, chapter 3; Barfoo
 """
 
 from collections.abc import Sequence
-from math import factorial
+from math import cos, factorial, sin
 
 import numpy as np
 
@@ -131,6 +131,35 @@ def of_six(values: Sequence[float]) -> Floats:
     """Pose (4, 4) of what `six` returns."""
     given = np.asarray(values, dtype=float)
     return matrix(rotation(given[3:]), given[:3])
+
+
+def screw(axis: int, angle: float, along: float = 0.0) -> Floats:
+    """(4, 4) turn by an angle about axis 0, 1 or 2, and shift along it, m."""
+    out, (j, k) = np.eye(4), ((axis + 1) % 3, (axis + 2) % 3)
+    out[j, j] = out[k, k] = cos(angle)
+    out[k, j] = sin(angle)
+    out[j, k] = -out[k, j]
+    out[axis, 3] = along
+    return out
+
+
+def of_rpy(rpy: Floats) -> Floats:
+    """(3, 3) Rz(yaw) Ry(pitch) Rx(roll) of the turns about fixed axes (3,), as in URDF."""
+    turns = [screw(axis, angle)[:3, :3] for axis, angle in enumerate(rpy)]
+    return np.asarray(turns[2] @ turns[1] @ turns[0])
+
+
+def of_quaternion(q: Floats) -> Floats:
+    """(3, 3) of a unit quaternion (4,), its real part first."""
+    k = skew(q[1:])
+    return np.asarray(np.eye(3) + 2 * q[0] * k + 2 * k @ k)
+
+
+def quaternion(r: Floats) -> Floats:
+    """(4,) unit quaternion of a rotation (3, 3), its real part first and not negative."""
+    w = rotation_vector(r)
+    angle = float(np.linalg.norm(w))
+    return np.array([cos(angle / 2), *(sin(angle / 2) * (w / angle if angle > 0 else w))])
 
 
 def adjoint(r: Floats, p: Floats) -> Floats:

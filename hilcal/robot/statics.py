@@ -78,7 +78,6 @@ def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
     """Change (N, P, n + 1, 6) of the slot wrenches by changes of the wrench at the flange.
 
     Args:
-        chain: the deviated chain.
         force: (N, P, 3) change of the force, base axes, N.
         moment: (N, P, 3) change of the moment about the flange's origin, base axes, N·m.
     """

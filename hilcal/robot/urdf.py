@@ -21,6 +21,7 @@ import pinocchio as pin
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.names import check_name
+from hilcal.robot import se3
 from hilcal.robot.arm import Arm, missing
 from hilcal.toml import suggest
 from hilcal.types import Bools, Floats
@@ -43,7 +44,6 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
 
     Args:
-        path: the file.
         base_link: link whose frame is the base; the root link if None.
         tip_link: link whose frame is the flange; the only leaf link if None.
 
@@ -288,7 +288,6 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
     Args:
         arm: the arm with every joint by itself.
         given: what joints of the file follow; those that the arm does not have do not count.
-        where: the file, for messages.
 
     Raises:
         InputError: what is followed is no joint of the arm, or follows another one itself.
@@ -313,11 +312,5 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
         values[j, n] = m.offset
         if arm.slides[i] != arm.slides[j]:
             raise InputError(f"{said}, of which one slides and one turns; valid: two of a kind")
-        turn = np.eye(4)
-        if arm.slides[j]:
-            turn[2, 3] = m.offset
-        else:
-            c, s = math.cos(m.offset), math.sin(m.offset)
-            turn[:2, :2] = [[c, -s], [s, c]]
-        links[j] = links[j] @ turn
+        links[j] = links[j] @ se3.screw(2, *((0.0, m.offset) if arm.slides[j] else (m.offset,)))
     return replace(arm, links=links, coupling=turns, drive=turns, mimic=values)

@@ -22,11 +22,17 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
-from hilcal.store.new_campaign import new_campaign
 from hilcal.store.records import Layout, content_hash, layout_of, read_layout
-from hilcal.store.revision import RevisionRecord, fitted_to, from_text, to_text, utc_now
+from hilcal.store.revision import (
+    RevisionRecord,
+    fitted_to,
+    from_text,
+    join,
+    split,
+    to_text,
+    utc_now,
+)
 from hilcal.store.robot_file import robot_file_of
-from hilcal.store.stored_priors import join, split
 from hilcal.whole_file import replacing
 
 _TARGETS, _OBSERVERS = "targets", "observers"
@@ -75,8 +81,6 @@ class CampaignFile:
         """Make a campaign; the file appears only when it is complete.
 
         Args:
-            path: the file to make.
-            config_json: the cell's configuration.
             base_dir: the directory to which its relative paths refer.
             source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
@@ -104,7 +108,6 @@ class CampaignFile:
         """Open a campaign and check that it is whole.
 
         Args:
-            path: the file.
             read_only: write nothing, see `schema.connect`.
             check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
                 measure on, does not.
@@ -264,7 +267,7 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names, by = self._target_names(), self._observers()
+            names, by = self._names_in(self._read_meta().get(_TARGETS, "[]")), self._observers()
             return rows.fetch_readings(self._connection, self.path, layout, names, by)
 
     def data_hash(self, count: int | None = None) -> str:
@@ -414,9 +417,6 @@ class CampaignFile:
         except ValueError as e:
             raise InputError(f"{self.path}: the campaign file is damaged ({e})") from e
 
-    def _target_names(self) -> list[str]:
-        return self._names_in(self._read_meta().get(_TARGETS, "[]"))
-
     def _names_in(self, text: str) -> list[str]:
         names = rows.stored_json(self.path, text)
         if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -516,3 +516,57 @@ def rescued(connection: sqlite3.Connection, path: Path) -> Path:
     with replacing(place, must_be_new=True) as new, closing(sqlite3.connect(new)) as copy:
         connection.backup(copy)
     return place
+
+
+@contextmanager
+def new_campaign(
+    path: Path, about: Mapping[str, str], overwrite: bool
+) -> Iterator[sqlite3.Connection]:
+    """Give an empty campaign to the block; the file appears when the block has filled it.
+
+    Args:
+        about: texts about the campaign, by name.
+
+    Raises:
+        InputError: as for `may_write`, or it cannot be written.
+        DeviceError: the disk is full or failed.
+    """
+    may_write(path, overwrite)
+    with replacing(path) as new:
+        try:
+            with schema.sqlite_errors(path):
+                connection = schema.connect(new)
+                try:
+                    connection.execute("PRAGMA journal_mode = DELETE")
+                    with schema.transaction(connection):
+                        for statement in schema.statements():
+                            connection.execute(statement)
+                        for key, value in about.items():
+                            rows.insert_meta(connection, key, value)
+                        yield connection
+                finally:
+                    connection.close()
+        except BaseException:
+            _without_sidecars(new)
+            raise
+        _without_sidecars(Path(os.path.realpath(path)))  # another file's journal
+
+
+def may_write(path: Path, overwrite: bool) -> None:
+    """Refuse to replace a file that is no campaign, or any without `overwrite`.
+
+    Raises:
+        InputError: names the file and the reason.
+    """
+    if not path.exists():
+        return
+    if not overwrite:
+        raise InputError(f"{path}: the file exists; choose another name or ask to overwrite it")
+    if not path.is_file() or (path.stat().st_size > 0 and not schema.is_campaign(path)):
+        raise InputError(f"{path}: exists and is not a campaign; it is not overwritten")
+
+
+def _without_sidecars(path: Path) -> None:
+    """Remove what would be rolled back into a new file of this name."""
+    for end in ("-journal", "-wal", "-shm"):
+        path.with_name(path.name + end).unlink(missing_ok=True)

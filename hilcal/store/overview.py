@@ -3,7 +3,7 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -24,18 +24,17 @@ class MeasuringDevice:
     """A device that measured, as it answered when a session began.
 
     Attributes:
-        part: of the cell, e.g. "tracker".
-        driver: name of its driver.
+        device: part of the cell, e.g. "tracker".
         name: as it told it.
-        serial: its serial number; None where it told none.
+        serial_number: None where it told none.
         facts: what else it told, by name.
         utc: when it answered first, ISO 8601.
     """
 
-    part: str
+    device: str
     driver: str
     name: str
-    serial: str | None
+    serial_number: str | None
     facts: Mapping[str, str]
     utc: str
 
@@ -59,13 +58,13 @@ class Return:
 
     Attributes:
         utc: when, ISO 8601.
-        metres: (3,) shift since the first reading there, sensor axes, m.
+        shift_m: (3,) shift since the first reading there, sensor axes, m.
         sigma: its size in standard deviations.
         over: whether it was over the limit of [acquire] drift_limit_sigma.
     """
 
     utc: str
-    metres: Floats
+    shift_m: Floats
     sigma: float
     over: bool
 
@@ -79,20 +78,17 @@ class Overview:
         program_version: of the program that made it.
         source: where the readings come from.
         command: that made the file, as it was typed; empty where it is not kept.
-        config: the cell's configuration.
         readings: all of them, with the covariances as stored; None before the first.
         loads: number of readings by load.
         targets: number of readings by target, where there are several.
         planned: number of planned steps; None for an imported campaign.
         measured: of them those that were measured.
-        plans: number of plans.
         instruments: that were connected, each once.
         tares: of the force sensor, in order.
         returns: to the reference pose, in order.
         tool: as the force sensor found it last: mass_kg, com_m, ...; None where it did not.
         repeatability: as the last session found it; None where it did not.
         events: all that happened, in order: "kind", "utc" and more.
-        revisions: all, in order.
         accepted: number of the accepted revision, if any.
         in_use: number of the revision that commands use, if there is any.
     """
@@ -202,8 +198,6 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
     """Return the document of `info --json`.
 
     Args:
-        o: what the campaign holds.
-        path: of its file.
         covariance: what the covariances consist of, in words.
     """
     return {
@@ -221,24 +215,11 @@ def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
         "plans": o.plans,
         "planned": o.planned,
         "measured": o.measured,
-        "instruments": [
-            {
-                "device": i.part,
-                "driver": i.driver,
-                "name": i.name,
-                "serial_number": i.serial,
-                "facts": dict(i.facts),
-                "utc": i.utc,
-            }
-            for i in o.instruments
-        ],
+        "instruments": [asdict(i) for i in o.instruments],
         "tares": [{"utc": t.utc, "zero": t.wrench.tolist()} for t in o.tares],
         "drift": {
             "limit_sigma": o.config.acquire.drift_limit_sigma,
-            "returns": [
-                {"utc": r.utc, "shift_m": r.metres.tolist(), "sigma": r.sigma, "over": r.over}
-                for r in o.returns
-            ],
+            "returns": [{**asdict(r), "shift_m": r.shift_m.tolist()} for r in o.returns],
         },
         "tool": o.tool,
         "repeatability": o.repeatability,

@@ -54,10 +54,7 @@ class ProcedureLog:
         """Append an entry, together with what it is about, or none of it.
 
         Args:
-            kind: of the entry.
-            content: JSON.
             plan: a further plan of the campaign, with names that it does not have yet.
-            revisions: of the model.
 
         Returns:
             The numbers of the revisions; they are in the entry as "revisions".

@@ -38,7 +38,6 @@ def release(campaign: CampaignFile, why: str) -> None:
     """Release such readings; the file says so from now on.
 
     Args:
-        campaign: the campaign, open for writing.
         why: by what, in words.
 
     Raises:

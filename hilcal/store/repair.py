@@ -21,7 +21,6 @@ class Repaired:
 
     Attributes:
         why: what is wrong with the first of them.
-        revisions: their numbers.
         original: the file as it was.
     """
 

@@ -22,7 +22,6 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
     """Return what to keep of the robot of a configuration; no model for one of the catalogue.
 
     Args:
-        config_json: the cell's configuration.
         base_dir: the directory to which its relative paths refer.
 
     Raises:
@@ -41,8 +40,6 @@ def check_robot(
     """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path.
 
     Args:
-        path: the campaign.
-        config_json: the cell's configuration.
         kept: what the campaign keeps of its robot's file.
         calibration: the same of the file of its kinematics.
 

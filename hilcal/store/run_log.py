@@ -15,9 +15,8 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
-from hilcal.store.appended import joined, with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, Step, read_plan
+from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
 from hilcal.store.robot_file import KEYS, robot_file_of
 from hilcal.store.stored_schema import Detail, check, check_event
@@ -45,11 +44,7 @@ def create_run(
     """Make the empty campaign of a run, its plan inside.
 
     Args:
-        path: the file.
-        config: the cell's configuration.
         base_dir: the directory to which its relative paths refer.
-        plan: what is measured.
-        overwrite: replace an existing campaign.
         source: where the readings come from, in words.
         more: further texts about it; that of the key `COVERS` where readings are stored with
             another covariance than the instrument's.
@@ -67,7 +62,6 @@ def check_same_cell(campaign: CampaignFile, config: CellConfig, base_dir: Path) 
     """Refuse to continue a campaign in another cell.
 
     Args:
-        campaign: what was begun.
         config: the cell as it is told now.
         base_dir: directory to which relative paths in it refer.
 

@@ -137,7 +137,6 @@ def connect(path: Path, read_only: bool = False) -> sqlite3.Connection:
     """Open an existing file, every commit durable before it returns.
 
     Args:
-        path: the file.
         read_only: write nothing, neither to the file nor beside it. A journal beside the file is
             what a killed program left unfinished; SQLite has to undo that before anybody can
             read, and then the file is opened for writing all the same.
@@ -171,9 +170,6 @@ def _journal(path: Path) -> bool:
     One that ends in a name belongs to a transaction over several files, and SQLite deletes the file
     of that name: any file. Through a link it would write elsewhere. Source: SQLite documentation,
     "Database File Format", section 3, "The Rollback Journal", and pager.c, `pager_delsuper`.
-
-    Raises:
-        InputError: it is such a one.
     """
     journal = Path(f"{os.path.realpath(path)}-journal")  # beside a link's file
     try:
@@ -195,11 +191,7 @@ def _ends_in_name(journal: Path) -> bool:
 
 
 def _refuse_log(path: Path) -> None:
-    """Refuse a file with a write-ahead log, before SQLite writes anything beside it.
-
-    Raises:
-        InputError: its header says so.
-    """
+    """Refuse a file with a write-ahead log, before SQLite writes anything beside it."""
     with path.open("rb") as stream:
         if 2 in stream.read(20)[18:]:  # versions of the format, to write and to read
             raise InputError(

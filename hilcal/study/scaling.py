@@ -132,7 +132,6 @@ def scaling_study(
         runs: Monte-Carlo runs; all scalings and units see the same noise.
         correlations: shares ρ of variance that the six elements have in common, each in [0, 1).
         arm: the arm; None for the UR10e.
-        poses: number of random feasible poses.
         engine: what the experiments are computed on.
         advance: told 1 for each experiment that is done.
 

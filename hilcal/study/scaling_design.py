@@ -41,7 +41,6 @@ class StudyDesign:
     """P poses with L wrenches each; SI units.
 
     Attributes:
-        arm: the arm.
         q: (P, n) joint angles, rad.
         wrenches: (L, 6) at the target, base axes, N and N·m.
         observation: (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m).

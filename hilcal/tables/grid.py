@@ -103,7 +103,6 @@ class Grid:
         """(N,) numbers of a column, NaN where a value is missing.
 
         Args:
-            column: its name or number.
             complete: whether no value may be missing.
 
         Raises:
@@ -228,12 +227,9 @@ def number(cell: Cell, how: FileFormat) -> float:
             return float("inf")
         plain = plain.replace(",", ".")
     try:
-        return float("inf") if "_" in plain else _finite(float(plain))
+        value = float("inf") if "_" in plain else float(plain)
     except ValueError:
-        return float("inf")
-
-
-def _finite(value: float) -> float:
+        value = float("inf")
     return value if np.isfinite(value) else float("inf")
 
 

@@ -33,12 +33,10 @@ def import_readings(
     """Read a table into a cell.
 
     Args:
-        path: the table.
         form: "table" (the exchange table), the name of a mapping that comes with the
             program, the path of a mapping file, or a mapping.
         config: the cell: its tracker's noise and place, its gravity, and whether tables include
             the arm's scatter.
-        arm: its arm.
         second: the second file of a mapping that is for two.
 
     Raises:

@@ -155,13 +155,11 @@ def import_mapped(
 
     Args:
         path: text, XLSX, MAT or Parquet.
-        mapping: what its columns hold.
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where neither table nor mapping state them.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
         second: the second file, where the mapping does not name it.
-        targets: names of the cell's targets.
         std: as of `readings_of`.
 
     Returns:
@@ -591,9 +589,6 @@ def _plausible(
     repeat a pose those whose positions disagree by more than what an arm repeats to and
     lever · Σ|dq|, what the joints' difference moves the target by at most: which one is wrong
     cannot be known.
-
-    Raises:
-        InputError: nothing is left.
     """
     from scipy.spatial import cKDTree
 

@@ -517,7 +517,6 @@ def load_mapping(path: Path, kind: type[M]) -> M:
     """Read a mapping file.
 
     Args:
-        path: the file.
         kind: `Mapping` for readings, `PointMapping` for points.
 
     Raises:
@@ -532,11 +531,7 @@ def load_mapping(path: Path, kind: type[M]) -> M:
 
 
 def _beside(path: Path, name: str) -> Path:
-    """Return a file that a mapping names; it may have come from somebody else.
-
-    Raises:
-        InputError: it is outside the mapping's folder, by its name or by a link.
-    """
+    """Return a file that a mapping names; it may have come from somebody else."""
     folder = path.absolute().parent
     if not (folder / name).resolve().is_relative_to(folder.resolve()):
         raise InputError(

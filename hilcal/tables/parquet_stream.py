@@ -39,11 +39,9 @@ class ReadingStream:
     """A Parquet file of readings; nothing of it is held.
 
     Attributes:
-        path: the file.
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        columns: that are read.
         rows: number of rows of each row group.
         covers: what its covariances cover, `INSTRUMENT` or `WHOLE`.
         rounding: (3,) variance of the positions' rounding, m².
@@ -105,8 +103,6 @@ def open_stream(
     """Open a Parquet file of readings; only its description and its first rows are read.
 
     Args:
-        path: the file.
-        arm: the arm that was measured.
         noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
 

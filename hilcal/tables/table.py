@@ -107,7 +107,6 @@ def readings_of(
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
     Args:
-        table: the parsed columns.
         arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where there are none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
@@ -212,11 +211,7 @@ def _index(names: list[str]) -> tuple[Ints, list[str]]:
 
 
 def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
-    """(N,) numbers of the targets by the cell's names; None where there is one target.
-
-    Raises:
-        InputError: table and cell name different targets.
-    """
+    """(N,) numbers of the targets by the cell's names; None where there is one target."""
     given = table.text.get(columns.TARGET)
     if given is None:
         if len(names) > 1:
@@ -251,9 +246,6 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
     """What the table's covariances cover, by its column `covers`, and whether rounding, too.
 
     Without the column it is the instrument.
-
-    Raises:
-        InputError: another word, or not the same one in all rows.
     """
     given = table.text.get(columns.COVERS, [INSTRUMENT])
     for k, word in enumerate(given):
@@ -284,7 +276,6 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
 
     Args:
-        table: the rows.
         arm: its number of joints, their limits and its reach are checked.
         whole: (N,) rows with a position, others are zero; all of them where None.
 
@@ -419,7 +410,6 @@ def write_table(
     """Write an exchange table that `read_table` reads back exactly: CSV, or Parquet by its name.
 
     Args:
-        readings: the readings.
         path: the file; CSV unless it ends in .parquet.
         covers: what their covariances cover, see `covariance` and `with_what_rounding_does`.
         about: further metadata of a Parquet file.

@@ -55,7 +55,6 @@ def mapped_covariance(
         mapping: what they hold.
         position: (N, 3) m.
         angles: (N, k) the orientation's numbers in the file's unit; None for positions.
-        noise: of the instrument.
         station: (3,) where its beam starts.
 
     Returns:
@@ -101,11 +100,7 @@ def mapped_covariance(
 
 
 def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
-    """(N, k) figures of columns; every row has one.
-
-    Raises:
-        InputError: a cell without a value.
-    """
+    """(N, k) figures of columns; every row has one."""
     values = np.stack([grid.numbers(column) for column in columns], axis=1)
     bad = np.isnan(values)
     if bad.any():
@@ -224,7 +219,6 @@ def floored(
     would outweigh all others. Adding to a diagonal element keeps a covariance positive.
 
     Args:
-        table: for messages.
         covariance: (N, m, m), m² and rad².
         instrument: covariances (N, m, m) of the noise in [tracker]; None where it is not known.
 
@@ -340,9 +334,7 @@ def check_joint_rounding(
     Args:
         q: (N, n) in the file's unit.
         unit: radians in that unit.
-        name: of the unit.
         covariance: (N, m, m), m².
-        reach: of the arm, m.
     """
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)
     std = unit * size / np.sqrt(12)

@@ -31,7 +31,6 @@ def parse_length(text: str, what: str) -> float:
 
     Args:
         text: a number over 0 and its unit.
-        what: where it stands, for messages.
 
     Raises:
         InputError: anything else.
@@ -44,7 +43,6 @@ def parse_duration(text: str, what: str) -> float:
 
     Args:
         text: a number over 0 and its unit.
-        what: where it stands, for messages.
 
     Raises:
         InputError: anything else.

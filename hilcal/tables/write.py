@@ -49,7 +49,6 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
 
     Args:
         path: ends in .csv or .parquet.
-        columns: by name.
         about: what the table is about, for the metadata of Parquet; CSV has no place for it.
 
     Raises:
@@ -106,7 +105,6 @@ def revision_table(records: Sequence[RevisionRecord], in_use: int | None) -> dic
     """Return what was fitted in each revision, and how well; SI.
 
     Args:
-        records: all revisions.
         in_use: number of the one that is used.
     """
     rows = [_row(r, r.number == in_use) for r in records]
@@ -156,7 +154,6 @@ def plan_csv(
     imports it.
 
     Args:
-        plan: poses and steps.
         wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
         units: of the joints' values (`Arm.units`); all in rad where None.
 

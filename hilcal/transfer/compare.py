@@ -23,8 +23,7 @@ from hilcal.identification.registration import register
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import never_fitted
-from hilcal.store.revision import RevisionRecord
-from hilcal.store.stored_priors import CARRIED
+from hilcal.store.revision import CARRIED, RevisionRecord
 
 
 def compare(
@@ -45,13 +44,11 @@ def compare(
     (('joint_tilt_compliance',), True)
 
     Args:
-        run: the earlier campaign.
         later: the later one; 15 readings will do.
         revision: of the earlier campaign; the one in use where None, and the baseline without any.
         same_setup: whether tracker and base stand as they did; where None, only if both cells
             configure the same place of the tracker. Else its place is estimated from the later
             readings.
-        say: takes progress, one line each.
 
     Raises:
         InputError: another arm, another scaling than gc, a column or unloaded readings that the

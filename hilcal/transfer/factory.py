@@ -47,7 +47,6 @@ class FactoryCheck(Shown):
         factory_m: rms misfit of the positions with the factory's kinematics alone, m.
         nominal_m: the same with the maker's nominal ones.
         noise_m: rms of the noise that is stated for the readings, m.
-        readings: their number.
     """
 
     changed: bool
@@ -70,9 +69,7 @@ def check_factory(
     """Judge readings by the kinematics that the factory measured.
 
     Args:
-        cell: where they were measured.
         nominal: the arm as its maker designed it, its joints not yet counted as the cell says.
-        factory: kinematics of this arm.
         readings: of a few poses all over the workspace.
         catalogue: the effects; the installed ones where None.
 

@@ -60,7 +60,6 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
 
     Args:
         directory: with campaign files.
-        engine: what they are fitted on.
         counting: shows how far it is, as `present.progress.counting` does.
 
     Raises:
@@ -138,7 +137,6 @@ def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
     """Return a fleet as JSON, SI.
 
     Args:
-        fleet: the fleet.
         priors: file of the prior by type.
     """
     return {

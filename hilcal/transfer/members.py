@@ -36,7 +36,6 @@ class Entry:
     """A campaign file, and what the list beside it says.
 
     Attributes:
-        path: the file.
         name: its path within the directory.
         arm: which arm; empty where that is not stated.
         date: when it was measured, ISO 8601; empty where that is not stated.
@@ -54,13 +53,11 @@ class Member:
 
     Attributes:
         name: its path within the directory.
-        arm: which arm.
         known: how that is known: "list", "serial number", "folder" or "file".
         type: name of the arm's type.
         date: when it was measured, ISO 8601.
         posterior: of the arm's parameters.
         added: effects of the arm that the diagnosis added to the baseline.
-        verdict: of the model.
         rms_m: 3-D position error on poses left out.
         sizes: what it tells of the sizes of effects; None where nothing.
     """
@@ -186,7 +183,9 @@ def _member(entry: Entry, run: Campaign, effects: tuple[str, ...] | None) -> Mem
 
 def _of_fit(entry: Entry, run: Campaign, found: Fit, start: Model, verdict: str) -> Member:
     of = overview(run.file)
-    serial = next((i.serial for i in of.instruments if i.part == "arm" and i.serial), None)
+    serial = next(
+        (i.serial_number for i in of.instruments if i.device == "arm" and i.serial_number), None
+    )
     arm, known = entry.arm, "list"
     if not arm and serial:
         arm, known = serial, "serial number"

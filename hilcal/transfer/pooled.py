@@ -46,11 +46,9 @@ class Odd:
     """A parameter of one arm that is unlike those of the others of its type.
 
     Attributes:
-        arm: which arm.
         campaign: in which campaign, where it is a change of the arm; empty where it is the arm.
         parameter: "effect.parameter".
         off: by how much, SI.
-        unit: its unit.
         sigma: the same in standard deviations of what the other arms let expect.
         p_value: of that among all that were looked at.
     """
@@ -70,7 +68,6 @@ class Spread:
 
     Attributes:
         parameter: "effect.parameter".
-        unit: its unit.
         mean: μ of the type.
         mean_std: its standard uncertainty.
         between: standard deviation from arm to arm.
@@ -97,9 +94,7 @@ class DiagnosedEffect:
     """An effect that diagnoses added.
 
     Attributes:
-        effect: its name.
         arms: the arms that have it.
-        of: number of arms.
         kind: "trait" of the type, "defect" of single arms, or "some".
     """
 
@@ -114,10 +109,6 @@ class Pooled:
     """What is known of arms of one type.
 
     Attributes:
-        type: its name.
-        arms: names of the arms.
-        campaigns: names of the campaigns.
-        parameters: the pooled parameters.
         odd: what is unlike, the arms' first, most certain first.
         seen: effects that diagnoses added, most frequent first.
         wear: parameters whose common drift is certain.

@@ -227,8 +227,8 @@ def test_a_load_as_the_force_sensor_reads_it_is_the_load(capsys, fitted, tmp_pat
     # what a 10 kg weight does to a sensor: its force, and the moment of it about the sensor
     flange = evaluate(c.model.cell.arm, q)
     weight = c.loads["10kg"][:3]
-    to_sensor = flange.rotation[-1] @ rotation(c.sensor.rotvec)
-    lever = flange.rotation[-1] @ (c.model.cell.load_point - c.sensor.origin)
+    to_sensor = flange.rotation[-1] @ rotation(c.sensor.rotvec_rad)
+    lever = flange.rotation[-1] @ (c.model.cell.load_point - c.sensor.origin_m)
     felt = [
         np.concatenate([r.T @ weight, r.T @ np.cross(a, weight)])
         for r, a in zip(to_sensor, lever, strict=True)

@@ -9,7 +9,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.config.write import to_toml
+from hilcal.config.template import to_toml
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery

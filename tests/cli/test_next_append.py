@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.store.appended import joined, with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, Plan, Step, load_plan
+from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
 from hilcal.store.run_log import RunLog
 from hilcal.workbench.session import WorkbenchSession
 from tests.cli.test_until_goal import Site, site

@@ -243,7 +243,7 @@ KINEMATICS = (
     "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
 )
 TAKEN: dict[str, dict[str, str]] = {
-    "calibration/corrected": {
+    "calibration/handover": {
         "hilcal identify RUN --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm"
     },
     "calibration/points": {

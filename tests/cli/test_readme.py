@@ -22,9 +22,8 @@ from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.measuring.connect import ConnectionResult
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
-from hilcal.store.appended import with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, load_plan
+from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.run_log import RunLog, create_run
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.table import write_table

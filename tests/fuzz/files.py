@@ -12,8 +12,7 @@ from random import Random
 import numpy as np
 
 import hilcal as hc
-from hilcal.calibration.corrected import Corrected
-from hilcal.calibration.handover import urdf
+from hilcal.calibration.handover import Corrected, urdf
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.calibration.points import read_points
 from hilcal.calibration.programs.languages import understood

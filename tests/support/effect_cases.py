@@ -9,7 +9,7 @@ from hilcal.effects.protocol import Situation
 from hilcal.model.model import Model
 from hilcal.readings.readings import States
 from hilcal.robot import chain as chains
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats
 from tests.support.arm_cases import RAILS, arm_of

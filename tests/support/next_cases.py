@@ -16,8 +16,7 @@ from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase, case_o
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.readings.readings import Readings, States
-from hilcal.store.appended import with_new_names
-from hilcal.store.plan import Plan
+from hilcal.store.plan import Plan, with_new_names
 from tests.support.cli_cases import CELL
 
 _CONFIG = load_config(CELL)

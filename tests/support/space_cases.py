@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, Obstacle
-from hilcal.design.draw import DrawnPoses, draw
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import DrawnPoses, Space, draw
 from hilcal.measuring.clearance import Clearance
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule

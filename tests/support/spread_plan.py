@@ -4,8 +4,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.design.draw import draw
-from hilcal.design.feasible import Space
+from hilcal.design.feasible import Space, draw
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.store.plan import Plan
 from hilcal.types import Bools, Floats

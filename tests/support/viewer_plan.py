@@ -9,7 +9,6 @@ import rerun as rr
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.design.confounding import Confounding
 from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
@@ -17,7 +16,7 @@ from hilcal.design.summary import (
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.design.timing import Duration
+from hilcal.design.timing import Confounding, Duration
 from hilcal.present.viewer.plan import record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.cli.rehearsing import with_person
-from hilcal.config.write import to_toml
+from hilcal.config.template import to_toml
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
 from tests.support.campaign_site import Site

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilcal.calibration.dh_table import screw
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -81,8 +80,6 @@ def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> R
     Args:
         steps: of the file, base to tip.
         nominal: the arm that the campaign began with.
-        arm: the corrected one.
-        file: its name, for messages.
 
     Raises:
         InputError: the file is of another arm; says which axis lies elsewhere.
@@ -145,7 +142,7 @@ def _frames(
                 break
             rough = max(rough, _off(g)[0])
             turn = np.arctan2(g[1, 0] - g[0, 1], g[0, 0] + g[1, 1])
-            right.append(screw(turn, g[2, 3]))
+            right.append(se3.screw(2, turn, g[2, 3]))
             left.append(right[-1])
         else:
             tip = se3.inverse(old[-1]) @ left[-1] @ drawn[-1]
@@ -180,7 +177,7 @@ def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
     )  # parallel axes: by where they are
     turn = np.arctan2(link[1, column], link[0, column])
     turn -= np.arctan2(seen[1, column], seen[0, column])
-    return screw(float(turn), 0.0) @ before
+    return se3.screw(2, float(turn)) @ before
 
 
 def edits_of(steps: Sequence[ChainPlace], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
@@ -205,11 +202,12 @@ def moved(a: Floats, b: Floats) -> float:
 
 
 def z_to(axis: Floats) -> Floats:
-    """(4, 4) a rotation that takes z to an axis."""
-    z = np.asarray(axis, dtype=float) / np.linalg.norm(axis)
-    x = np.cross(np.eye(3)[int(np.argmin(np.abs(z)))], z)
-    x /= np.linalg.norm(x)
-    return se3.matrix(np.stack([x, np.cross(z, x), z], axis=1), np.zeros(3))
+    """(4, 4) the smallest rotation that takes z to a unit vector; half a turn about x for −z."""
+    about = np.cross([0.0, 0.0, 1.0], axis)
+    size = float(np.linalg.norm(about))
+    if size < 1e-12:
+        return np.eye(4) if axis[2] > 0 else np.diag([1.0, -1.0, -1.0, 1.0])
+    return se3.matrix(se3.rotation(np.arctan2(size, axis[2]) * about / size), np.zeros(3))
 
 
 def numbers(values: Floats) -> str:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.corrected import Corrected
 from hilcal.calibration.dh_table import dh_rows
+from hilcal.calibration.handover import Corrected
 from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, redrawn
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
 from hilcal.calibration.own_files.sdf_text import sdf_chain
@@ -29,7 +29,6 @@ class Correction:
     """A file with another arm in it.
 
     Attributes:
-        content: the whole file.
         said: what was changed, and what the file has no place for.
     """
 
@@ -45,7 +44,6 @@ def correct_file(
     Args:
         path: a file of `KINDS`.
         nominal: the arm that the campaign began with.
-        found: the corrected arm.
         base: name of the link or body that the arm begins at.
         tip: name of the link, body or site that is its flange.
 
@@ -90,9 +88,6 @@ def _ur_conf(path: Path, nominal: Arm, arm: Arm) -> Correction:
 
     The controller adds `delta_theta`, `delta_a`, `delta_d`, `delta_alpha` to the classic rows of
     its model.
-
-    Raises:
-        InputError: it is none, or the arm is none of UR's.
     """
     try:
         text = limits.read_bytes(path, limits.SETTINGS).decode("latin-1")

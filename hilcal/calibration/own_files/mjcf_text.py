@@ -26,7 +26,6 @@ def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base body to a tip, a body or a site.
 
     Args:
-        document: the file.
         base: name of the body; the one that carries the first hinge where None.
         tip: name of a body or a site; the last body with a hinge where None.
 
@@ -119,10 +118,7 @@ def _step(document: Document, node: Node) -> ChainPlace:
 
 def _put_quat(document: Document, node: Node, r: Floats) -> Edits:
     """Edits that give an element an orientation."""
-    w = se3.rotation_vector(r)
-    angle = float(np.linalg.norm(w))
-    axis = w / angle if angle > 0 else w
-    value = numbers(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]))
+    value = numbers(se3.quaternion(r))
     key = next((k for k in _TURNS if k in node.attributes), "quat")
     at = document.attribute(node, key)
     if key == "quat" or at is None:
@@ -142,18 +138,11 @@ def _rotation(document: Document, node: Node) -> Floats:
     radian = bool(compiler) and compiler[-1].attributes["angle"] == "radian"
     unit = 1.0 if radian else np.pi / 180
     if key == "quat":
-        q = document.direction(node, v)
-        k = se3.skew(q[1:])
-        return np.asarray(np.eye(3) + 2 * q[0] * k + 2 * k @ k)
+        return se3.of_quaternion(document.direction(node, v))
     if key == "axisangle":
         return se3.rotation(unit * v[3] * document.direction(node, v[:3]))
     if key == "zaxis":
-        z = document.direction(node, v)
-        about = np.cross([0.0, 0.0, 1.0], z)
-        size = float(np.linalg.norm(about))
-        if size < 1e-12:
-            return np.eye(3) if z[2] > 0 else np.diag([1.0, -1.0, -1.0])
-        return se3.rotation(np.arctan2(size, z[2]) * about / size)
+        return z_to(document.direction(node, v))[:3, :3]
     if key == "xyaxes":
         x = document.direction(node, v[:3])
         y = document.direction(node, v[3:] - (x @ v[3:]) * x)

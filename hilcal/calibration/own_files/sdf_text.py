@@ -30,8 +30,6 @@ class SdfChain:
 
     Attributes:
         steps: from the base link to the tip link; their `write` is that of `edits`.
-        document: the file.
-        joints: of the steps.
     """
 
     steps: list[ChainPlace]
@@ -111,8 +109,7 @@ class _Model:
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
             raise self._refused(pose, "a <pose> in degrees or quaternions; valid: x y z r p y, rad")
         v = self.document.numbers(pose, self.text(pose), 6)
-        turns = [se3.rotation(row) for row in np.diag(v[3:])]
-        return se3.matrix(turns[2] @ turns[1] @ turns[0], v[:3])
+        return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
     def axis(self, joint: Node) -> tuple[Node | None, str]:
         """`<xyz>` of a joint, and the frame that it is written in where that is not the joint's."""
@@ -162,7 +159,6 @@ def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain
     """Return the chain from a base link to a tip link.
 
     Args:
-        document: the file.
         base: name of the link; the first one where None.
         tip: name of the link; the only one behind the turning joints where None.
 

@@ -27,7 +27,6 @@ def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[Ch
     """Return the steps from a base link to a tip link.
 
     Args:
-        document: the file.
         base: name of the link, without what a xacro puts before it; the root link where None.
         tip: the same of the last one; the only leaf behind the last joint where None.
 
@@ -112,11 +111,7 @@ def _leaf(document: Document, parents: dict[str, tuple[str, Node]], links: set[s
 
 
 def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlace:
-    """Return the step of a joint; `turned`: from its child to its parent.
-
-    Raises:
-        InputError: it neither turns nor is fixed, or its place cannot be read.
-    """
+    """Return the step of a joint; `turned`: from its child to its parent."""
     kind, name = joint.attributes.get("type", ""), joint.attributes.get("name", "")
     axis = joint.first("axis")
     if kind not in (*_TURNING, _FIXED) or (turned and kind != _FIXED):
@@ -128,7 +123,7 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
     origin = joint.first("origin")
     given = {} if origin is None else origin.attributes
     xyz, rpy = (_values(document, origin or joint, given.get(k, "0 0 0")) for k in ("xyz", "rpy"))
-    place = se3.matrix(_of_rpy(rpy), xyz)
+    place = se3.matrix(se3.of_rpy(rpy), xyz)
     turn = None
     if kind != _FIXED:
         node = axis or joint
@@ -158,18 +153,8 @@ def _step(document: Document, joint: Node, *, turned: bool = False) -> ChainPlac
     return ChainPlace(name, joint.line, se3.inverse(place) if turned else place, turn, write)
 
 
-def _of_rpy(rpy: Floats) -> Floats:
-    """(3, 3) of fixed-axis roll, pitch, yaw."""
-    turns = [se3.rotation(row) for row in np.diag(rpy)]
-    return np.asarray(turns[2] @ turns[1] @ turns[0])
-
-
 def _values(document: Document, node: Node, text: str) -> Floats:
-    """Return three numbers, of which a xacro may compute some.
-
-    Raises:
-        InputError: an expression of others than numbers.
-    """
+    """Return three numbers, of which a xacro may compute some."""
 
     def computed(m: re.Match[str]) -> str:
         try:
@@ -184,11 +169,7 @@ def _values(document: Document, node: Node, text: str) -> Floats:
 
 
 def _constant(node: ast.expr) -> float:
-    """Value of an expression of numbers, pi and radians().
-
-    Raises:
-        ValueError: it is another one.
-    """
+    """Value of an expression of numbers, pi and radians()."""
     match node:
         case ast.Constant(value=int() | float() as value) if not isinstance(value, bool):
             return float(value)

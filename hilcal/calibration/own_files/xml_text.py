@@ -24,7 +24,6 @@ class Node:
     """An element.
 
     Attributes:
-        tag: its name.
         attributes: by name, as written.
         line: from 1.
         begin: where its start tag begins.
@@ -60,9 +59,7 @@ class Document:
     """A file.
 
     Attributes:
-        name: of the file.
         text: with one character per byte.
-        root: its root element.
     """
 
     name: str

@@ -25,12 +25,12 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    controller_frames,
     frame_of,
     line_of,
     of_wpr,
     read_text,
     to_wpr,
-    toml_frames,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
@@ -75,7 +75,6 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
     """Read a program.
 
     Args:
-        path: of the file.
         frames_file: TOML with tools, user frames and turn axes; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 
@@ -83,7 +82,7 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known = toml_frames(frames_file, LS, tool)
+    known = controller_frames(frames_file, LS, tool)
     if not re.search(r"^/MN\b", text, re.M) or not re.search(r"^/POS\b", text, re.M):
         raise InputError(f"{path.name}: no sections /MN and /POS; valid: a TP program as text")
     begin = re.search(r"^/POS\b", text, re.M)
@@ -124,11 +123,7 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
 
 
 def _instructions(text: str, name: str) -> Iterator[tuple[int, str]]:
-    """Yield line and text of each instruction, without comments.
-
-    Raises:
-        InputError: one changes a frame.
-    """
+    """Yield line and text of each instruction, without comments."""
     start = re.search(r"^/MN\b[^\n]*\n", text, re.M)
     at = start.end() if start else len(text)
     for m in re.finditer(r"[^;]*;", text[at:]):

@@ -23,11 +23,11 @@ from hilcal.calibration.programs.program import (
     Program,
     ProgramPoint,
     Span,
+    controller_frames,
     frame_of,
     of_wpr,
     read_text,
     to_wpr,
-    toml_frames,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
@@ -62,7 +62,6 @@ def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     """Read a job.
 
     Args:
-        path: of the file.
         frames_file: TOML with tools, user frames, pulses per degree; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 
@@ -70,7 +69,7 @@ def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known = toml_frames(frames_file, INFORM, tool)
+    known = controller_frames(frames_file, INFORM, tool)
     if "//POS" not in text or "//INST" not in text:
         raise InputError(f"{path.name}: no sections //POS and //INST; valid: a job as text")
     points: dict[str, ProgramPoint] = {}
@@ -118,11 +117,7 @@ def _instruction(
     found: dict[str, ProgramPoint],
     otherwise: dict[str, int],
 ) -> None:
-    """Take note of an instruction.
-
-    Raises:
-        InputError: it changes what points mean.
-    """
+    """Take note of an instruction."""
     if r := _REFUSED.match(code):
         raise InputError(
             f"{file}: line {line}: {r[1]} changes what points mean; valid: a job without it"

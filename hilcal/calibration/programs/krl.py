@@ -30,10 +30,11 @@ from hilcal.calibration.programs.program import (
     ProgramPoint,
     Span,
     arguments_of,
-    frames_of_toml,
+    controller_frames,
     of_euler,
     read_text,
     to_euler,
+    used_again,
 )
 from hilcal.errors import InputError
 from hilcal.types import Floats, Ints
@@ -128,17 +129,16 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     if encodings.count("latin-1") and len(set(encodings)) > 1:
         texts = tuple(p.read_bytes().decode("latin-1") for p in paths)
     data: dict[str, list[_Value]] = {}
-    if frames_file is not None and frames_file.suffix.lower() == ".dat":
-        _collect(read_text(frames_file)[0], -1, data)
-    known = ControllerFrames()
-    if frames_file is not None and frames_file.suffix.lower() == ".toml":
-        known = frames_of_toml(frames_file, of_euler, len(POSE))
-    elif frames_file is not None and frames_file.suffix.lower() != ".dat":
+    suffix = "" if frames_file is None else frames_file.suffix.lower()
+    if frames_file is not None and suffix not in (".toml", ".dat"):
         raise InputError(f"{frames_file}: valid: a .toml file, or the controller's $config.dat")
+    if frames_file is not None and suffix == ".dat":
+        _collect(read_text(frames_file)[0], -1, data)
+    known = controller_frames(frames_file if suffix == ".toml" else None, KRL, tool)
     for k, text in enumerate(texts):
         _collect(text, k, data)
     names = [p.name for p in paths]
-    points = _KrlReader(names, data, replace(known, tool=tool)).points(texts[0])
+    points = _KrlReader(names, data, known).points(texts[0])
     return Program(
         KRL,
         tuple(p.suffix for p in paths),
@@ -403,17 +403,7 @@ class _KrlReader:
             else:
                 value = _Value(0, line, "", {})
         new = self._point(value, name, line, obeyed, left)
-        old = self.found.get(key)
-        if old is not None and not old.left:
-            if not new.left and not (
-                np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
-            ):
-                new = replace(old, left=f"line {line} has it with another tool or base")
-            elif not new.left:
-                new = replace(old, obeyed=old.obeyed or obeyed)
-        elif old is not None:
-            new = old
-        self.found[key] = new
+        self.found[key] = used_again(self.found.get(key), new, line, "base", obeyed)
 
     def _point(self, value: _Value, name: str, line: int, obeyed: bool, left: str) -> ProgramPoint:
         """Return a point of an aggregate."""
@@ -429,7 +419,11 @@ class _KrlReader:
                 return replace(bare, left="not all of A1 to A6 are written")
             spans = tuple(value.span(k) for k in AXES)
             return replace(
-                bare, numbers=spans, values=numbers, joints=True, tool=self._tool_or_one()
+                bare,
+                numbers=spans,
+                values=numbers,
+                joints=True,
+                tool=np.eye(4) if isinstance(self.state.tool, str) else self.state.tool,
             )
         numbers = value.numbers(POSE)
         if numbers is None:
@@ -453,9 +447,6 @@ class _KrlReader:
             obeyed=obeyed,
         )
 
-    def _tool_or_one(self) -> Floats:
-        return self.state.tool if isinstance(self.state.tool, np.ndarray) else np.eye(4)
-
     def _used_otherwise(self, lines: Sequence[tuple[int, int, str]]) -> dict[str, int]:
         """Names of points that statements use which are no motions to them, with their lines."""
         out: dict[str, int] = {}
@@ -477,11 +468,7 @@ class _KrlReader:
 
 
 def _value(text: str) -> float:
-    """Value of a number: 1.5, 'B010', 'H2A'.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Value of a number: 1.5, 'B010', 'H2A'."""
     if text.startswith("'"):
         return int(text[2:-1], 2 if text[1] in "Bb" else 16)
     return float(text)

@@ -87,18 +87,35 @@ class ProgramPoint:
 UNSTATED = -99
 
 
+def used_again(
+    old: ProgramPoint | None, new: ProgramPoint, line: int, what: str, obeyed: bool = False
+) -> ProgramPoint:
+    """Return a point that a further motion, in a line, moves to: left where its frames differ.
+
+    Args:
+        what: the maker's word for the frame that it counts from.
+        obeyed: whether this motion takes the configuration that is stated.
+    """
+    if old is None or new.left:
+        return new if old is None or not old.left else old
+    if old.left:
+        return old
+    if not np.array_equal(old.tool, new.tool) or not np.array_equal(old.frame, new.frame):
+        return replace(old, left=f"line {line} has it with another tool or {what}")
+    return replace(old, obeyed=old.obeyed or obeyed)
+
+
 @dataclass(frozen=True, slots=True)
 class Language:
     """How a maker writes points.
 
     Attributes:
-        name: of the language.
         pose: T (4, 4) of the numbers of a pose.
         numbers: the numbers of T (4, 4), near to those that were there.
         decimals: of a position in mm, of the orientation, of joint values; at least these.
         axes: (6, 3) directions of the axes of the maker's arms with spherical wrist, all joint
             values zero, in axes of the controller's base.
-        flags: (K, F) configuration at joint values (K, 6), by the `branch.shape` (K, 2) there.
+        flags: (K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there.
         of_shape: (F,) which of these the shape of the arm tells, and not the joint values alone.
         written: what stands at `ProgramPoint.config`, from the flags and the texts that are there.
         padded: whether numbers stand in columns.
@@ -120,11 +137,8 @@ class Program:
     """A program.
 
     Attributes:
-        language: its language.
-        suffixes: of its files.
         texts: of its files, as they are.
         points: in the order of their first use.
-        encoding: of the files.
     """
 
     language: Language
@@ -144,7 +158,6 @@ class Program:
         """Return the files, by suffix, with other points.
 
         Args:
-            arm: the nominal one.
             found: N points of it.
             given: (N, 6) joint values of them as they were, rad.
             q: (N, 6) joint values that they get.
@@ -293,17 +306,22 @@ class ControllerFrames:
     tool: Floats | None = None
 
 
-def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> ControllerFrames:
-    """Read `--frames F.toml`.
+def controller_frames(
+    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
+) -> ControllerFrames:
+    """Read `--frames F.toml`, where there is one.
 
     Args:
-        path: the file.
-        pose: of the maker's numbers.
-        count: how many these are.
+        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
+        count: how many numbers a pose of the maker has.
 
     Raises:
-        InputError: it cannot be used.
+        InputError: it is no TOML file, or cannot be used.
     """
+    if path is None:
+        return ControllerFrames(tool=tool)
+    if path.suffix.lower() != ".toml":
+        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
     found = load_section(path, _FramesFile)
     groups = []
     for key, group in (("tools", found.tools), ("bases", found.bases)):
@@ -314,7 +332,7 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
                     f"{count}, as the controller shows them: mm and degrees"
                     + (", x y z q1 q2 q3 q4" if count > JOINTS else "")
                 )
-        groups.append({name: pose(np.array(numbers)) for name, numbers in group.items()})
+        groups.append({name: language.pose(np.array(given)) for name, given in group.items()})
     pulses = found.pulses_per_degree
     if pulses is not None and (len(pulses) != JOINTS or not all(pulses)):
         raise InputError(f"{path.name}: pulses_per_degree; valid: {JOINTS} numbers other than 0")
@@ -322,22 +340,7 @@ def frames_of_toml(path: Path, pose: Callable[[Floats], Floats], count: int) -> 
     if axes is not None and (len(axes) != 3 or not set(axes) <= set(range(1, JOINTS + 1))):
         raise InputError(f"{path.name}: turn_axes; valid: three axes, such as [1, 4, 6]")
     per_rad = None if pulses is None else np.degrees(1.0) * np.array(pulses)
-    return ControllerFrames(groups[0], groups[1], per_rad, axes)
-
-
-def toml_frames(
-    path: Path | None, language: Language, tool: Floats | None, count: int = JOINTS
-) -> ControllerFrames:
-    """Read `--frames F.toml`, where there is one; raises as `frames_of_toml` does.
-
-    Raises:
-        InputError: it is no TOML file.
-    """
-    if path is None:
-        return ControllerFrames(tool=tool)
-    if path.suffix.lower() != ".toml":
-        raise InputError(f"{path}: frames of {language.name} programs; valid: a .toml file")
-    return replace(frames_of_toml(path, language.pose, count), tool=tool)
+    return ControllerFrames(groups[0], groups[1], per_rad, axes, tool)
 
 
 def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:
@@ -355,16 +358,10 @@ def frame_of(known: ControllerFrames, what: str, number: str) -> Floats | str:
 
 def of_euler(values: Floats) -> Floats:
     """T (4, 4) of x, y, z in mm and turns about z, then y, then x in degrees: Rz(A) Ry(B) Rx(C)."""
-    with np.errstate(invalid="ignore"):  # what is not finite is refused by its line
-        (ca, cb, cc), (sa, sb, sc) = (f(np.radians(values[3:6])) for f in (np.cos, np.sin))
-    r = np.array(
-        [
-            [ca * cb, ca * sb * sc - sa * cc, ca * sb * cc + sa * sc],
-            [sa * cb, sa * sb * sc + ca * cc, sa * sb * cc - ca * sc],
-            [-sb, cb * sc, cb * cc],
-        ]
-    )
-    return se3.matrix(r, 1e-3 * np.asarray(values[:3], dtype=float))
+    if not np.isfinite(values).all():  # refused by its line
+        return np.full((4, 4), np.nan)
+    turn = se3.of_rpy(np.radians(values[5:2:-1]))
+    return se3.matrix(turn, 1e-3 * np.asarray(values[:3], dtype=float))
 
 
 def to_euler(t: Floats, near: Floats) -> Floats:

@@ -29,10 +29,11 @@ from hilcal.calibration.programs.program import (
     ProgramPoint,
     Span,
     arguments_of,
-    frames_of_toml,
+    controller_frames,
     line_of,
     of_euler,
     read_text,
+    used_again,
 )
 from hilcal.errors import InputError
 from hilcal.robot import se3
@@ -76,17 +77,12 @@ def of_quaternion(values: Floats) -> Floats:
     q = np.asarray(values[3:7], dtype=float)
     with np.errstate(all="ignore"):  # what is not finite is refused by its line
         q = q / np.linalg.norm(q)
-    w, v = q[0], q[1:]
-    k = se3.skew(v)
-    return se3.matrix(np.eye(3) + 2 * w * k + 2 * k @ k, 1e-3 * np.asarray(values[:3], dtype=float))
+    return se3.matrix(se3.of_quaternion(q), 1e-3 * np.asarray(values[:3], dtype=float))
 
 
 def to_quaternion(t: Floats, near: Floats) -> Floats:
     """Inverse of `of_quaternion`, of the sign that was there."""
-    w = se3.rotation_vector(t[:3, :3])
-    angle = float(np.linalg.norm(w))
-    axis = w / angle if angle > 0 else w
-    q = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)])
+    q = se3.quaternion(t[:3, :3])
     return np.concatenate([1e3 * t[:3, 3], q if q @ near[3:7] >= 0 else -q])
 
 
@@ -122,7 +118,6 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
     """Read a module.
 
     Args:
-        path: of the module.
         frames_file: TOML, or a module with tooldata and wobjdata; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
 
@@ -130,12 +125,10 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
         InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
-    known, more = ControllerFrames(), ""
-    if frames_file is not None and frames_file.suffix.lower() == ".toml":
-        known = frames_of_toml(frames_file, of_quaternion, POSE)
-    elif frames_file is not None:
-        more = read_text(frames_file)[0]
-    reader = _RapidReader(path.name, text, more, replace(known, tool=tool))
+    module = frames_file is not None and frames_file.suffix.lower() != ".toml"
+    known = controller_frames(None if module else frames_file, RAPID, tool, POSE)
+    more = read_text(frames_file)[0] if frames_file is not None and module else ""
+    reader = _RapidReader(path.name, text, more, known)
     return Program(RAPID, (path.suffix,), (text,), reader.points(), encoding)
 
 
@@ -314,13 +307,7 @@ class _RapidReader:
             new = replace(new, tool=tool, frame=frame, obeyed=obeyed)
             if made:
                 new = self._moved(new, made)
-        old = self.found.get(key)
-        if old is not None and not old.left and not new.left:
-            same = np.array_equal(old.tool, new.tool) and np.array_equal(old.frame, new.frame)
-            new = (
-                old if same else replace(old, left=f"line {line} has it with another tool or frame")
-            )
-        self.found[key] = old if old is not None and old.left else new
+        self.found[key] = used_again(self.found.get(key), new, line, "frame")
 
     def _value(self, text: str, at: int, name: str, joints: bool) -> ProgramPoint:
         """Return a point of an aggregate."""

@@ -399,7 +399,7 @@ def _instruments(m: ReportContent) -> Iterator[Block]:
         rows = []
         for i in o.instruments:
             more = "; ".join(f"{k}: {v}" for k, v in i.facts.items() if k != "serial number")
-            rows.append((i.part, i.name, i.serial or "not told", utc(i.utc), more))
+            rows.append((i.device, i.name, i.serial_number or "not told", utc(i.utc), more))
         heads = ("part", "instrument", "serial number", "answered first (UTC)", "further")
         yield table(*heads, caption="Instruments", rows=rows)
     else:

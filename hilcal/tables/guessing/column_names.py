@@ -122,7 +122,6 @@ def parse(name: str, unit_cell: str = "") -> ColumnName:
     """Take a column's name apart.
 
     Args:
-        name: as the file has it.
         unit_cell: what the row of units says about it.
     """
     rest, unit = _unit(name)

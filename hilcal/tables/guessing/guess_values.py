@@ -1,4 +1,4 @@
-"""What the values of columns tell where their names do not."""
+"""Positions, orientations, forces and uncertainties by names and axes; what else values tell."""
 
 from datetime import datetime
 from typing import Any
@@ -7,7 +7,16 @@ import numpy as np
 
 from hilcal.tables.grid import Grid
 from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.proposal import FAR, TURN, Guesser, angle_unit, length_unit
+from hilcal.tables.guessing.column_names import ColumnName, parse
+from hilcal.tables.guessing.proposal import (
+    FAR,
+    SHOWN,
+    SIDE_BY_SIDE,
+    TURN,
+    Guesser,
+    angle_unit,
+    length_unit,
+)
 from hilcal.tables.mapped import nines
 from hilcal.types import Floats
 
@@ -174,3 +183,250 @@ def _orientation_by_values(g: Guesser, free: list[str]) -> None:
             g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
             g.proposal.open_convention = True
             return
+
+
+def _kind(c: ColumnName) -> str:
+    if c.has(words.STD):
+        return "std_angle" if c.has(words.ROTATION) else "std"
+    for kind, known in (
+        ("quaternion", words.QUATERNION),
+        ("angle", words.ROTATION),
+        ("force", words.FORCE),
+        ("moment", words.MOMENT),
+    ):
+        if c.has(known):
+            return kind
+    return "position"
+
+
+Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
+"""Names of columns by kind, by the words and numbers of their names, by axis."""
+_KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
+
+
+LARGE = 1e-6
+"""m²; a larger variance, of more than 1 mm, is in mm²."""
+
+
+def guess_axes(g: Guesser) -> None:
+    """Positions, orientations, forces and standard deviations, which come by axes."""
+    sets: dict[str, dict[tuple[object, ...], dict[str, str]]] = {}
+    _covariance(g)
+    for c in g.columns:
+        if c.axis and c.name in g.free and g.number(c.name) and not c.has({"cov", "kov"}):
+            stem = (*(w for w in c.words if w not in _KINDS | {"pos", "position", "p"}), *c.numbers)
+            sets.setdefault(_kind(c), {}).setdefault(stem, {})[c.axis] = c.name
+    if "force" not in sets and "moment" in sets:  # tx, ty, tz are then translations
+        for stem, axes in sets.pop("moment").items():
+            sets.setdefault("position", {}).setdefault(stem, axes)
+    whole = {
+        kind: {stem: axes for stem, axes in found.items() if set("xyz") <= set(axes)}
+        for kind, found in sets.items()
+    }
+    positions = whole.get("position", {})
+    if not positions:
+        return
+    ranked = sorted(positions, key=lambda stem: _rank(stem))
+    stem = ranked[0]
+    names = [positions[stem][axis] for axis in "xyz"]
+    side_by_side = _several(positions, stem)
+    if side_by_side:
+        names = [positions[s][axis] for s in side_by_side for axis in "xyz"]
+        unit = length_unit(g, "position", names)
+        targets = [str(s[-1]) for s in side_by_side]
+        meaning = f"{unit}, {len(targets)} targets"
+        g.take("position", names, meaning, unit=unit, targets=targets)
+        g.unsure("position", SIDE_BY_SIDE)
+    else:
+        unit = length_unit(g, "position", names)
+        g.take("position", names, unit, unit=unit)
+    ranked = [s for s in ranked if s not in side_by_side]
+    others = [
+        positions[s]["x"] for s in ranked if s != stem and not set(map(str, s)) & words.NOMINAL
+    ]
+    if others:
+        listed = ", ".join(f"'{name}' ..." for name in others[:SHOWN])
+        g.unsure("position", f"'{names[0]}' ... are used, not {listed}")
+    marks = sentinels(g.block(names))
+    if marks:
+        g.proposal.sections["file"] = {"missing": marks}
+        g.unsure("file", f"{', '.join(map('{:g}'.format, marks))} stands for a missing point")
+    _orientation(g, whole, stem)
+    _forces(g, whole)
+    _std(g, whole, stem, unit)
+
+
+def _several(
+    positions: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
+) -> list[tuple[object, ...]]:
+    """Positions whose names differ by a number alone, which are those of several targets."""
+    if not stem or not isinstance(stem[-1], int):
+        return []
+    alike = [s for s in positions if s[:-1] == stem[:-1] and s and isinstance(s[-1], int)]
+    return sorted(alike, key=str) if len(alike) > 1 else []
+
+
+def _rank(stem: tuple[object, ...]) -> tuple[int, int]:
+    names = {str(w) for w in stem}
+    order = 2 if names & words.NOMINAL else (0 if names & words.MEASURED else 1)
+    order = 3 if names & words.DIFFERENCE else order
+    return order, len(stem)
+
+
+def _covariance(g: Guesser) -> None:
+    """Covariances "cov_x_y" ...: the upper triangle or all nine."""
+    by_axes: dict[str, str] = {}
+    for name in g.grid.names:
+        plain = "".join(ch for ch in name.lower().split("[")[0] if ch.isalpha())
+        if plain.startswith(("cov", "kov")) and plain[3:5].strip("xyz") == "":
+            by_axes[plain[3:5]] = name
+    upper = ["xx", "xy", "xz", "yy", "yz", "zz"]
+    if all(axes in by_axes for axes in upper):
+        names = [by_axes[axes] for axes in upper]
+        unit = "mm" if np.nanmedian(g.block(names[:1])) > LARGE else "m"
+        g.unsure("covariance", f"in {unit}², by their size")
+        g.take("covariance", names, f"upper triangle, {unit}²", unit=unit)
+
+
+def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
+    quaternions = {s: a for s, a in whole.get("quaternion", {}).items() if "w" in a}
+    best = _like(quaternions, stem)
+    if best is not None:
+        names = [best[axis] for axis in "wxyz"]
+        g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+        return
+    if _four_numbers(g) or _matrix(g):
+        return
+    angles = whole.get("angle", {})
+    if stem in angles:
+        _by_axes(g, [angles[stem][axis] for axis in "xyz"])
+        return
+    for letters, convention in (
+        ("wpr", "fanuc"),
+        ("abc", "kuka"),
+        ("oat", "kawasaki"),
+    ):
+        by_letter = {c.name.strip().lower(): c.name for c in g.columns if c.name in g.free}
+        plain = {key.split("[")[0].split("(")[0].strip(): name for key, name in by_letter.items()}
+        if all(letter in plain and g.number(plain[letter]) for letter in letters):
+            names = [plain[letter] for letter in letters]
+            _angles(g, names, convention)
+            return
+    usable = [c for c in g.columns if c.name in g.free and not c.has(words.NOMINAL)]
+    turns = {c.words[-1]: c.name for c in usable if c.words}
+    if {"roll", "pitch", "yaw"} <= set(turns):
+        _angles(g, [turns[w] for w in ("roll", "pitch", "yaw")], "roll-pitch-yaw")
+        return
+    axes = _like(angles, stem)
+    if axes is not None:
+        _by_axes(g, [axes[axis] for axis in "xyz"])
+
+
+def _by_axes(g: Guesser, names: list[str]) -> None:
+    """Angles named by axes: a rotation vector where none is longer than π, else fixed angles."""
+    length = np.linalg.norm(g.block(names), axis=1)
+    vector = np.nanmax(length) <= np.pi + 1e-3
+    _angles(g, names, "rotation-vector" if vector else "fixed-xyz")
+
+
+def _like(
+    found: dict[tuple[object, ...], dict[str, str]], stem: tuple[object, ...]
+) -> dict[str, str] | None:
+    """Return the columns whose name agrees with that of the position, else measured ones."""
+    if stem in found:
+        return found[stem]
+    usable = [s for s in found if not {str(w) for w in s} & words.NOMINAL]
+    return found[min(usable, key=_rank)] if usable else None
+
+
+def _angles(g: Guesser, names: list[str], convention: str) -> None:
+    unit = angle_unit(g, "orientation", names)
+    g.take("orientation", names, f"{convention}, {unit}", convention=convention, unit=unit)
+    g.proposal.open_convention = True
+
+
+def _four_numbers(g: Guesser) -> bool:
+    """Quaternions q1 ... q4 (ABB) or q0 ... q3, told from joints by their length."""
+    groups: dict[tuple[str, ...], dict[int, str]] = {}
+    for c in g.columns:
+        if c.numbers and not c.axis and c.has(words.QUATERNION | {"e"}) and c.name in g.free:
+            groups.setdefault(c.words, {})[c.numbers[-1]] = c.name
+    for by_number in groups.values():
+        names = [by_number[k] for k in sorted(by_number)]
+        if len(names) == 4 and is_quaternion(g.block(names)):
+            g.take("orientation", names, "quaternion, w first", convention="quaternion-wxyz")
+            g.proposal.open_convention = True
+            return True
+    return False
+
+
+def _matrix(g: Guesser) -> bool:
+    """Rotation matrices r11 ... r33, R(1,1) ..., and poses T(1,1) ... T(4,4)."""
+    for word in ("r", "rot", "t", "m"):
+        by_place: dict[tuple[int, int], str] = {}
+        for c in g.columns:
+            if c.words[:1] == (word,) and c.axis is None and c.name in g.free:
+                at = c.numbers if len(c.numbers) == 2 else tuple(divmod(sum(c.numbers), 10))
+                by_place[int(at[0]), int(at[1])] = c.name
+        for base in (0, 1):
+            places = [(i + base, j + base) for i in range(3) for j in range(3)]
+            if all(place in by_place for place in places):
+                names = [by_place[place] for place in places]
+                g.take("orientation", names, "rotation matrix", convention="matrix")
+                return True
+    return False
+
+
+def _forces(g: Guesser, whole: Group) -> None:
+    force = next(iter(whole.get("force", {}).values()), None)
+    if force is None:
+        return
+    names = [force[axis] for axis in "xyz"]
+    unit = g.unit(names)
+    section: dict[str, object] = {"unit": unit if unit in ("N", "kN", "kgf", "lbf") else "N"}
+    moment = next(iter(whole.get("moment", {}).values()), None)
+    if moment is not None:
+        turning = [moment[axis] for axis in "xyz"]
+        stated = g.unit(turning)
+        section["moment_unit"] = stated if stated in ("Nm", "Nmm", "kNm") else "Nm"
+        names += turning
+    g.unsure("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
+    g.take("wrench", names, ", ".join(map(str, section.values())), **section)
+
+
+def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str) -> None:
+    axes = _like(whole.get("std", {}), stem)
+    one = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
+    single = [
+        c.name
+        for c in one
+        if g.number(c.name) and not c.numbers and not c.has(words.DISTANCE | words.GAUGE)
+    ]
+    if axes is None and not single:
+        return
+    names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
+    first = parse(names[0])
+    stated = g.unit(names)
+    section: dict[str, object] = {
+        "unit": stated if stated in ("m", "mm", "um", "in") else position_unit
+    }
+    turned = _like(whole.get("std_angle", {}), stem)
+    orientation = g.proposal.sections.get("orientation")
+    if axes is not None and turned is not None and orientation is not None:
+        names += [turned[axis] for axis in "xyz"]
+        stated = g.unit(names[3:])
+        section["angle_unit"] = stated or orientation.get("unit", "rad")
+    kind = "std"
+    if first.has(words.EXPANDED):
+        kind, section["k"] = "expanded", 2.0
+        g.unsure("std", "expanded uncertainty: is k = 2 right?")
+    elif first.has(words.VARIANCE):
+        kind = "variance"
+    elif first.has({"u", "unc", "uncertainty", "unsicherheit", "incertitude"}):
+        g.unsure("std", 'a standard deviation, or kind = "expanded" with its k?')
+    section["kind"] = kind
+    if axes is None:
+        g.unsure("std", 'one figure: of = "axis", or "point" (3-D length)?')
+    g.unsure("std", "scatter of samples only? Then set add_instrument = true")
+    g.take("std", names, f"{kind}, {', '.join(str(v) for v in section.values() if v != kind)}",
+           **section)  # fmt: skip

@@ -32,7 +32,6 @@ class UnderstoodColumn:
 
     Attributes:
         what: section of the mapping.
-        columns: names of its columns.
         meaning: unit and convention.
         example: the cells of the first reading.
     """
@@ -112,7 +111,6 @@ class Guesser:
         """Take the table apart.
 
         Args:
-            grid: the table.
             joints: of the arm, where the cell is known.
         """
         self.grid = grid
@@ -135,11 +133,9 @@ class Guesser:
 
     def block(self, names: Iterable[str]) -> Floats:
         """(N, k) numbers of columns."""
-        return np.stack([self._known(name) for name in names], axis=1)
-
-    def _known(self, name: str) -> Floats:
-        values = self.values[name]
-        return np.full(len(self.grid.rows), np.nan) if values is None else values
+        nothing = np.full(len(self.grid.rows), np.nan)
+        given = (self.values[name] for name in names)
+        return np.stack([nothing if v is None else v for v in given], axis=1)
 
     def take(self, what: str, names: Sequence[str], meaning: str, **section: object) -> None:
         """Give columns a meaning."""

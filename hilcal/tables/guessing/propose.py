@@ -15,8 +15,12 @@ from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
 from hilcal.tables.guessing import column_names as words
 from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.guess_axes import guess_axes
-from hilcal.tables.guessing.guess_values import guess_by_values, is_quaternion, time_unit
+from hilcal.tables.guessing.guess_values import (
+    guess_axes,
+    guess_by_values,
+    is_quaternion,
+    time_unit,
+)
 from hilcal.tables.guessing.proposal import (
     FEWEST_JOINTS,
     GUESSED,
@@ -46,7 +50,6 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
     """Look at a table and propose a mapping.
 
     Args:
-        path: the table.
         second: a second file that holds the other columns of the same readings.
         joints: number of the arm's joints, where it is known.
 
@@ -78,11 +81,7 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
 
 
 def _match(first: Grid, second: Grid) -> tuple[str, str] | None:
-    """Columns that name the rows of two tables; None where they belong together row by row.
-
-    Raises:
-        InputError: tables of different length without such columns.
-    """
+    """Columns that name the rows of two tables; None where they belong together row by row."""
     best: tuple[int, str, str] | None = None
     for here in first.names:
         texts = first.text(here)
@@ -119,7 +118,6 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
     """Propose a mapping for a table.
 
     Args:
-        grid: the table.
         joints: number of the arm's joints, where it is known.
     """
     g = Guesser(grid, joints)

@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.tables.files import content_of, kind_of, open_grid, sheet_names, sheet_rows
+from hilcal.tables.files import (
+    BYTE_ORDER_MARKS,
+    content_of,
+    decoded,
+    grid_of_rows,
+    kind_of,
+    open_grid,
+    records,
+    sheet_names,
+    sheet_rows,
+)
 from hilcal.tables.grid import Cell, Grid, number
 from hilcal.tables.mapping import FileFormat
-from hilcal.tables.text import BYTE_ORDER_MARKS, decoded, grid_of_rows, records
 
 HEAD = 400
 """Lines that the dialect is guessed from."""
@@ -34,7 +43,6 @@ class Sniffed:
 
     Attributes:
         how: keys of [file] that differ from a plain CSV file.
-        grid: the table.
         doubts: sentences on what is unsure.
     """
 

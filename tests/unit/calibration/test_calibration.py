@@ -10,9 +10,9 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensated import band
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
-from hilcal.calibration.poses import band
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json
 from hilcal.calibration.tool import tool_poses

@@ -6,13 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.corrected import corrected
-from hilcal.calibration.handover import UR_JOINTS, ur_kinematics
+from hilcal.calibration.handover import UR_JOINTS, corrected, ur_kinematics
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot import se3
 from hilcal.robot.catalogue import load_arm, robot_names
-from hilcal.robot.chain import evaluate
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate
 from hilcal.types import Floats
 from tests.unit.calibration.test_calibration import calibrated, fresh
 

@@ -11,8 +11,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilcal.calibration.corrected import Corrected
-from hilcal.calibration.handover import matlab
+from hilcal.calibration.handover import Corrected, matlab
 from hilcal.calibration.own_files.correct import Correction, correct_file
 from hilcal.errors import InputError
 from hilcal.robot import se3

@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import cell_from_config, tracker_place
 from hilcal.config import CellConfig
-from hilcal.design.draw import draw
-from hilcal.design.feasible import REASONS, Space
+from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
@@ -163,19 +162,6 @@ def test_enough_candidates_under_every_load_the_same_again_from_the_seed() -> No
     assert left[-1] >= 300
     spread = drawn.q.std(axis=0) / (drawn.q.max(axis=0) - drawn.q.min(axis=0))
     assert np.all(spread > 0.1)
-
-
-def test_states_that_are_given_come_first() -> None:
-    config = cell(obstacles=[TABLE])
-    some = drawn_of(config, 5).q
-    bad = np.array([[0.0, 0.4, 0.3, -1.5, -1.5, 0.0]])
-    again = drawn_of(config, 20, seed=4, also=np.vstack([some, bad]))
-    np.testing.assert_array_equal(again.q[:5], some)
-    assert not np.any(np.all(again.q == bad, axis=1))
-    turned = some + 2 * np.pi * np.eye(6)[5]  # within the arm's range, beyond the half turn
-    assert not np.any(again.q[:, 5] > np.pi)
-    assert len(drawn_of(config, 5, also=turned).q) == 5
-    assert not np.any(drawn_of(config, 5, also=turned).q[:, 5] > np.pi)
 
 
 def test_reasons_are_told_one_by_one_in_order() -> None:

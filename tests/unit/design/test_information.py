@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hilcal.design.candidates import reading_covariance
 from hilcal.design.information import problem
-from hilcal.design.noise_model import reading_covariance
 from hilcal.design.nominal_model import after, nominal_model, nominal_states
 from hilcal.design.predicted import predicted
 from hilcal.design.prediction_poses import prediction_poses

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.design.many_poses import measure_poses
+from hilcal.design.next import measure_poses
 from hilcal.diagnosis.more_poses import pose_powers
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.drivers.simulated.rehearsal import planned_states, simulate

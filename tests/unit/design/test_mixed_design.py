@@ -11,7 +11,7 @@ from hilcal.design.approximate_design import relax
 from hilcal.design.candidates import absolute_rows, deflection_rows, reading_derivatives
 from hilcal.design.choice import choose, objective_of
 from hilcal.design.criteria import MeanVariance
-from hilcal.design.information import DesignProblem, problem
+from hilcal.design.information import DesignProblem, information_of, problem
 from hilcal.design.mixed_design import MixedDesign, balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
 from hilcal.design.prediction_poses import (
@@ -19,7 +19,6 @@ from hilcal.design.prediction_poses import (
     position_derivative,
     prediction_poses,
 )
-from hilcal.design.prior_information import information_of
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.readings.whitening import Mode

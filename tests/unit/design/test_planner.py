@@ -11,7 +11,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.write import to_toml
+from hilcal.config.template import to_toml
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem
@@ -20,9 +20,8 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.measuring.dry_run import dry_run
 from hilcal.readings.covariance import WHOLE
-from hilcal.store.appended import with_new_names
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan
+from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
 from hilcal.store.run_log import PLAN
 from hilcal.tables.table import write_table
 from hilcal.types import Floats, Ints

@@ -45,7 +45,7 @@ def columns(of: DesignProblem, found: Fit) -> dict[str, Floats]:
 def test_information_beside_the_model_and_power_beside_model_and_rival(mode: Mode) -> None:
     found, of = case(mode)
     linear, x = linearise(found), columns(of, found)
-    so_far = discriminated_pairs(of, (TILT, LINK)).prior
+    so_far = discriminated_pairs(of).prior
     model = np.arange(of.model_size)
     for name, white in x.items():
         planned = schur_complement(so_far, of.of_effect(name), model)

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.agreement import agreement
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.composed import Composed, composed
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, composed
 from hilcal.discovery.curve import curves
-from hilcal.discovery.discovery import Discovery, discover
+from hilcal.discovery.discovery import Discovery, agreement, discover
 from hilcal.discovery.law import Form, LawPart
 from hilcal.discovery.refit import exact, left_by, refine
 from hilcal.discovery.screen import screen

@@ -296,7 +296,7 @@ def test_a_law_whose_refit_fails_is_named_with_the_reason(monkeypatch: pytest.Mo
         raise CannotAnswerError("it finds no equilibrium")
 
     module = sys.modules[discover.__module__]
-    monkeypatch.setattr(module, "search", lambda _: searched())
+    monkeypatch.setattr(module, "search", lambda *_, **__: searched())
     monkeypatch.setattr(module, "exact", fails)
     d = discover(campaign(LAW), name="bent")
     assert d.reason == "no_law"

@@ -23,7 +23,7 @@ from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.robot import batch
 from hilcal.robot.arm import Arm
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation
 from hilcal.robot.statics import Load, slot_wrenches
 from hilcal.types import Floats
 from tests.support.arm_cases import ODD, arm_of, cell_of, displacement

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
-from hilcal.robot.chain import evaluate
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.statics import Load
 from tests.support.arm_cases import arm_of, cell_of, displacement, slots_of, twisted
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from hilcal.design.confounding import Confounding
 from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
@@ -16,7 +15,7 @@ from hilcal.design.summary import (
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.design.timing import Duration
+from hilcal.design.timing import Confounding, Duration
 from hilcal.present.plan import certified, enough, order_remark, plan_report
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm

@@ -1,7 +1,6 @@
 """Groups of what is connected."""
 
 import numpy as np
-import pytest
 from scipy.sparse.csgraph import connected_components
 
 from hilcal.regression.connected import connected, groups_within
@@ -20,11 +19,7 @@ def test_points_are_joined_where_no_coordinate_differs_by_more() -> None:
     assert len(set(group)) == 3
 
 
-@pytest.mark.parametrize("most", [2_000_000, 0])
-def test_groups_and_their_numbers_are_those_of_a_graph(
-    most: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hilcal.regression.connected._MOST", most)
+def test_groups_and_their_numbers_are_those_of_a_graph() -> None:
     rng = np.random.default_rng(3)
     for _ in range(60):
         count, size = int(rng.integers(1, 80)), int(rng.integers(1, 7))

@@ -7,8 +7,7 @@ import pytest
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.body import body_poses
-from hilcal.robot.chain import evaluate, joint_jacobian, slot_jacobian
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate, joint_jacobian, twist_jacobian
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, slope, twisted
@@ -121,7 +120,8 @@ def test_jacobians_are_slopes(name: str, size: float) -> None:
         expected = motion_by(arm, q, d, Deviation(dq=change), OFFSET)
         assert_close_relative(by_joint[:, :, j], expected)
     for k in range(arm.n + 1):
-        by_slot = slot_jacobian(chain, k, x)
+        own = None if chain.twist is None else chain.twist[k]
+        by_slot = twist_jacobian(chain.rotation[k], x - chain.position[k], own)
         for axis in range(6):
             twist = np.zeros((count, arm.n + 1, 6))
             twist[:, k, axis] = 1.0
@@ -139,7 +139,6 @@ def test_no_states() -> None:
     chain = evaluate(arm, np.zeros((0, 6)), Deviation(twist=np.zeros((0, 7, 6))))
     assert chain.position.shape == (7, 0, 3)
     assert joint_jacobian(chain, chain.position[-1]).shape == (0, 6, 6)
-    assert slot_jacobian(chain, 2, chain.position[-1]).shape == (0, 6, 6)
 
 
 @pytest.mark.parametrize("name", ARMS)

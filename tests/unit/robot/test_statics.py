@@ -9,8 +9,7 @@ import pytest
 
 from hilcal.robot import chain as chains
 from hilcal.robot.arm import Arm
-from hilcal.robot.chain import evaluate, twist_jacobian
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate, twist_jacobian
 from hilcal.robot.geometric_stiffness import geometric_stiffness
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.robot.statics import Load, slot_wrench_change, slot_wrenches

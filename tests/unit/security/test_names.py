@@ -63,11 +63,10 @@ from hilcal.robot.catalogue import load_arm
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.rows import text_crc
-from hilcal.tables.files import open_grid
+from hilcal.tables.files import open_grid, read_text
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.tables.mapping import FileFormat
 from hilcal.tables.table import read_table, write_table
-from hilcal.tables.text import read_text
 from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
 from tests.support.paths import ROOT

@@ -12,8 +12,7 @@ from scipy import stats
 from hilcal.engine.engine import Engine, open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot.catalogue import load_arm
-from hilcal.robot.chain import evaluate
-from hilcal.robot.deviation import Deviation
+from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.se3 import rotation_vector
 from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, experiments, scaling_study
 from hilcal.study.scaling_design import TARGET, WRENCHES, StudyDesign, bound, make_design
