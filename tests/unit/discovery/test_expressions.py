@@ -5,10 +5,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hilcal.discovery.composed import composed
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
+from hilcal.discovery.amplitudes import Amplitude, Factor, composed
 from hilcal.discovery.law import Coefficient, Form, Law, LawPart
 from hilcal.discovery.sites import Site, sites
 from hilcal.discovery.variables import Variable, variables
