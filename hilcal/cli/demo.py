@@ -206,7 +206,7 @@ def doubted(
 
 
 CELL = "demo_ur10e.toml"
-POSES = 15
+POSES = 20
 """Of the plan; a choice: with validation and corrected run all of it takes three minutes."""
 VALIDATION = 10
 """Poses of the validation campaign; a choice for the same reason."""
