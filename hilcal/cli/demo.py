@@ -207,7 +207,7 @@ def doubted(
 
 CELL = "demo_ur10e.toml"
 POSES = 20
-"""Of the plan; a choice: with validation and corrected run all of it takes three and a half minutes."""
+"""Of the plan; a choice: with validation and corrected run it takes three and a half minutes."""
 VALIDATION = 10
 """Poses of the validation campaign; a choice for the same reason."""
 
