@@ -409,7 +409,7 @@ class Path:
         return True
 
     def pool_lines(self) -> None:
-        """Fit effects of many lines anew, the sizes of these about those of their pools.
+        """Fit effects of many lines anew, the size of each line near that of its pool.
 
         The fit takes the place of the last step's. Not where the error on poses left out rises by
         more than it scatters from pose to pose, nor where nothing was changed.

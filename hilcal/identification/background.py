@@ -146,7 +146,7 @@ def with_background(of: Fit, named: Collection[str]) -> Fit | None:
 
 
 def with_pooled_lines(of: Fit) -> Fit | None:
-    """Fit shrunk effects anew, the sizes of their lines about those of their pools.
+    """Fit shrunk effects anew, the size of each line near that of its pool.
 
     A fit chooses the variance of each line (`Effect.groups`), as a wave of one gear, of its few
     parameters alone: it drops true ones by chance, and keeps false ones. With what the lines of a

@@ -91,9 +91,9 @@ def type_lines(t: "Pooled") -> Iterator[str]:
 
 
 def size_lines(sizes: Sequence["TypeSize"]) -> Iterator[str]:
-    """Yield the section of a cell for effects of another size than on other arms."""
-    if other := [s for s in sizes if s.other]:
-        yield "Effects of another size than on other arms; for the cell of one more of this type:"
+    """Yield the section of a cell for effects whose size differs from that on other arms."""
+    if other := [s for s in sizes if s.differs]:
+        yield "Effects whose size differs from that on other arms, for another arm of this type:"
         yield "  [ordinary]"
         yield from (f"  {_size(s)}" for s in other)
 

@@ -50,7 +50,7 @@ class SizeEvidence:
 
 @dataclass(frozen=True, slots=True)
 class TypeSize:
-    """The size of an effect on arms of a type, in that on other arms.
+    """The size of an effect on arms of a type, divided by that on other arms.
 
     Attributes:
         effect: its name.
@@ -65,8 +65,8 @@ class TypeSize:
     high: float
 
     @property
-    def other(self) -> bool:
-        """Whether it is surely another one than on other arms."""
+    def differs(self) -> bool:
+        """Whether its 95 % interval excludes 1, the size on other arms."""
         return self.low > 1.0 or self.high < 1.0
 
 
