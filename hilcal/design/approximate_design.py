@@ -13,8 +13,7 @@ from hilcal.design.criterion import Criterion, Smooth, square
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
-TOLERANCE = 1e-7
-"""Relative gap between the continuous optimum and its bound."""
+TOLERANCE = 1e-7  # Relative gap between the continuous optimum and its bound
 KINKED_TOLERANCE = 1e-3
 """The same for criteria with kinks. A choice: the bound closes slowly there."""
 
@@ -26,23 +25,14 @@ _WARM = 12  # multiplicative steps that find where the weight goes
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ApproximateDesign:
-    """A continuous optimum with its certificate.
+    """A continuous optimum with its certificate."""
 
-    Attributes:
-        index: (S,) ascending indices of the units that have weight.
-        weight: (S,) their weights w; Σ w c ≤ B.
-        value: φ of these weights.
-        bound: φ of no plan within the budget exceeds it.
-        price: (K,) marginal value of each unit, ∂f/∂w_k: units with little are never taken.
-        information: (P, P) M0 + Σ w_k A_kᵀA_k.
-    """
-
-    index: Ints
-    weight: Floats
-    value: float
-    bound: float
-    price: Floats
-    information: Floats
+    index: Ints  # (S,) ascending indices of the units that have weight
+    weight: Floats  # (S,) their weights w; Σ w c ≤ B
+    value: float  # φ of these weights
+    bound: float  # φ of no plan within the budget exceeds it
+    price: Floats  # (K,) marginal value of each unit, ∂f/∂w_k: units with little are never taken
+    information: Floats  # (P, P) M0 + Σ w_k A_kᵀA_k
 
     @property
     def gap(self) -> float:
@@ -59,32 +49,21 @@ class ApproximateDesign:
 
 def relax(
     units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None = None,
+    criterion: Criterion,  # φ
+    budget: float,  # B, in the units of the cost
+    prior: Floats | None = None,  # (P, P) M0, what is known before; zero by default
     *,
-    most: int | None = None,
+    most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
+    # relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks
     tolerance: float | None = None,
-    start: ApproximateDesign | None = None,
+    start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
     Column generation: the optimum over few units by an interior-point method, then a scan of
     all for units whose price exceeds those in use, until none is left (equivalence theorem).
     The bound is of the scan of all units.
-
-    Args:
-        criterion: φ.
-        budget: B, in the units of the cost.
-        prior: (P, P) M0, what is known before; zero by default.
-        most: how often a unit may be taken; any number of times by default.
-        tolerance: relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks.
-        start: optimum of a similar problem over the same units.
-
-    Raises:
-        InputError: a budget that takes no unit, or arrays that do not fit.
-        CannotAnswerError: parameters that no candidate determines.
     """
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
@@ -129,11 +108,7 @@ def relax(
 
 
 def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int | None) -> Floats:
-    """Return the prior information after a check of what a plan is made of.
-
-    Raises:
-        InputError: what cannot be.
-    """
+    """Return the prior information after a check of what a plan is made of."""
     rows, cost = units.rows, units.cost
     if rows.ndim != 3 or cost.shape != (len(rows),) or not len(rows) or not rows.shape[2]:
         raise InputError(f"rows of shape {rows.shape} with costs of shape {cost.shape}")

@@ -21,23 +21,14 @@ _CLAMP = 1e4  # how far a dual may be from μ / w
 
 @dataclass(frozen=True, eq=False)
 class BarrierProgram:
-    """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
+    """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most."""
 
-    Attributes:
-        criterion: φ.
-        rows: (n, R, P) A.
-        cost: (n,) c.
-        budget: B.
-        most: bound of each weight; infinity for none.
-        prior: (P, P) M0.
-    """
-
-    criterion: Criterion
-    rows: Floats
-    cost: Floats
-    budget: float
-    most: float
-    prior: Floats
+    criterion: Criterion  # φ
+    rows: Floats  # (n, R, P) A
+    cost: Floats  # (n,) c
+    budget: float  # B
+    most: float  # bound of each weight; infinity for none
+    prior: Floats  # (P, P) M0
 
     def information(self, weight: Floats) -> Floats:
         """Return (P, P) M."""
@@ -129,19 +120,12 @@ def _root(x: Floats | Root) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Optimum:
-    """A continuous optimum.
+    """A continuous optimum."""
 
-    Attributes:
-        weight: (n,) w.
-        smooth: f there, with the matrices of the bound.
-        value: φ.
-        bound: of φ over these units.
-    """
-
-    weight: Floats
-    smooth: Smooth
-    value: float
-    bound: float
+    weight: Floats  # (n,) w
+    smooth: Smooth  # f there, with the matrices of the bound
+    value: float  # φ
+    bound: float  # of φ over these units
     order: float
 
     @property
@@ -157,10 +141,8 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
     duals z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point
     Methods), μ falling to 0. Criteria with a kink have a surrogate of order μ.
 
-    Args:
-        start: (n,) weights over 0, under `most`, that spend the budget.
-        tolerance: relative gap at which to stop.
-        order: μ n at the start, about the relative gap of the start.
+    start: (n,) weights over 0, under `most`, that spend the budget; tolerance: relative gap at
+    which to stop; order: μ n at the start, about the relative gap of the start.
     """
     w, n = start, len(start)
     capped = np.isfinite(program.most)

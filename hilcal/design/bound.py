@@ -44,13 +44,13 @@ def total_information(units: CandidateSet, weight: Floats) -> Floats:
 
 
 def upper_bound(
-    smooth: Smooth,
-    prior: Floats,
-    gains: Floats,
-    cost: Floats,
-    budget: float,
-    most: float,
-    below: Floats | None = None,
+    smooth: Smooth,  # with Z and Y
+    prior: Floats,  # (P, P) M0
+    gains: Floats,  # (K,) tr(Z H_k)
+    cost: Floats,  # (K,) c
+    budget: float,  # B
+    most: float,  # how often a unit may be taken
+    below: Floats | None = None,  # (K,) tr(Y H_k)
 ) -> float:
     """Return what φ of no plan within the budget exceeds, whole or not.
 
@@ -59,15 +59,6 @@ def upper_bound(
     Canadian J. Math. 12; Pukelsheim (1993), Optimal Design of Experiments, ch. 7. Of a ratio
     tr(Z N)/tr(Y N) of eigenvalues, the largest value over the same plans (Dinkelbach 1967), at
     most 1.
-
-    Args:
-        smooth: with Z and Y.
-        prior: (P, P) M0.
-        gains: (K,) tr(Z H_k).
-        cost: (K,) c.
-        budget: B.
-        most: how often a unit may be taken.
-        below: (K,) tr(Y H_k).
     """
     known = float(np.sum(smooth.above * prior))
     if below is None or smooth.below is None:

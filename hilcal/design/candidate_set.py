@@ -16,15 +16,12 @@ class CandidateSet:
     information of a plan that takes unit k n_k times is
 
         M = M0 + Σ n_k A_kᵀ A_k,    cost = Σ n_k c_k
-
-    Attributes:
-        rows: (K, R, P) whitened Jacobians A_k by the parameters in ordinary magnitudes (pure
-            numbers); units with fewer rows are filled up with zeros.
-        cost: (K,) what taking the unit once costs, over 0: readings, or seconds.
     """
 
+    # (K, R, P) whitened Jacobians A_k by the parameters in ordinary magnitudes (pure numbers);
+    # units with fewer rows are filled up with zeros
     rows: Floats
-    cost: Floats
+    cost: Floats  # (K,) what taking the unit once costs, over 0: readings, or seconds
 
     def __len__(self) -> int:
         """Return the number of units K."""
@@ -38,9 +35,8 @@ class CandidateSet:
     def information(self, weight: Floats, which: Ints | None = None) -> Floats:
         """Return (P, P) Σ w_k A_kᵀ A_k.
 
-        Args:
-            weight: (K,) weights, or of the chosen units.
-            which: indices of the units that the weights belong to; all by default.
+        weight: (K,) weights, or of the chosen units; which: indices of the units that the weights
+        belong to; all by default.
         """
         rows = self.rows if which is None else self.rows[which]
         root = (rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.size)

@@ -21,25 +21,17 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-CHUNK = 4096
-"""States that are evaluated at once. A choice, of memory."""
+CHUNK = 4096  # States that are evaluated at once. A choice, of memory.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidates:
-    """N poses, each of them unloaded and under those of the L loads that it can bear.
+    """N poses, each of them unloaded and under those of the L loads that it can bear."""
 
-    Attributes:
-        q: (N, n) joint angles, rad.
-        loads: 1 + L names, "none" first.
-        wrench: (1 + L, 6) at the load point, base axes, N and N·m.
-        allowed: (N, 1 + L) which states may be taken.
-    """
-
-    q: Floats
-    loads: tuple[str, ...]
-    wrench: Floats
-    allowed: Bools
+    q: Floats  # (N, n) joint angles, rad
+    loads: tuple[str, ...]  # 1 + L names, "none" first
+    wrench: Floats  # (1 + L, 6) at the load point, base axes, N and N·m
+    allowed: Bools  # (N, 1 + L) which states may be taken
 
     def __len__(self) -> int:
         """Return the number of poses N."""
@@ -59,17 +51,13 @@ class Candidates:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingDerivatives:
-    """What would be read of a chunk of N poses under 1 + L loads.
-
-    Attributes:
-        jacobian: (N, 1 + L, m, P) derivative by the parameters, in their scales; m are the elements
-            of all targets that are read in one arrival.
-        covariance: (N, 1 + L, m, m) of them.
-    """
+    """What would be read of a chunk of N poses under 1 + L loads."""
 
     rows: slice
+    # (N, 1 + L, m, P) derivative by the parameters, in their scales; m are the elements of all
+    # targets that are read in one arrival
     jacobian: Floats
-    covariance: Floats
+    covariance: Floats  # (N, 1 + L, m, m) of them
 
 
 def candidates(
@@ -77,9 +65,8 @@ def candidates(
 ) -> Candidates:
     """Return the states of poses under the loads of a configuration.
 
-    Args:
-        q: (N, n) joint angles, rad.
-        allowed: (N, 1 + L) which states may be taken, unloaded first; all by default.
+    q: (N, n) joint angles, rad; allowed: (N, 1 + L) which states may be taken, unloaded first; all
+    by default.
     """
     gravity = nominal.cell.gravity
     names = (UNLOADED, *(load.name for load in config.loads))
@@ -90,19 +77,13 @@ def candidates(
 
 
 def reading_derivatives(
-    nominal: NominalModel,
+    nominal: NominalModel,  # the model, whose live parameters come first
     config: CellConfig,
     of: Candidates,
-    more: tuple[Effect, ...],
-    scale: Floats,
+    more: tuple[Effect, ...],  # effects that are not in the model
+    scale: Floats,  # (P,) what one unit of each parameter is, SI
 ) -> Iterator[ReadingDerivatives]:
-    """Yield derivatives and covariances of candidates, some poses at a time.
-
-    Args:
-        nominal: the model, whose live parameters come first.
-        more: effects that are not in the model.
-        scale: (P,) what one unit of each parameter is, SI.
-    """
+    """Yield derivatives and covariances of candidates, some poses at a time."""
     model, m, loads = nominal.model, nominal.elements, len(of.loads)
     states, each = nominal.arrivals(of.states()), nominal.each
     live = np.concatenate([nominal.live, np.arange(model.size, model.size + sizes(more))])
@@ -136,9 +117,7 @@ def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...])
 
     Block (i, j) of their covariance is δ_ij V_i + V_u: the unloaded reading's error is in all.
 
-    Args:
-        which: poses, of those in `of`.
-        loads: S indices of loads, 1 to L.
+    which: poses, of those in `of`; loads: S indices of loads, 1 to L.
     """
     jacobian, v = of.jacobian[which], of.covariance[which]
     count, _, m, size = jacobian.shape
@@ -158,10 +137,8 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with
     F = R J Σ_q^½ (see `reading_covariance`).
 
-    Args:
-        nominal: the model, with the tracker in its place.
-        config: `[tracker]`, `[acquire]` and `[repeatability]`.
-        predicted: N·T states, the T readings of one arrival in succession.
+    nominal: the model, with the tracker in its place; config: `[tracker]`, `[acquire]` and
+    `[repeatability]`; predicted: N·T states, the T readings of one arrival in succession.
 
     Returns:
         (N, T·m, T·m) covariances.
@@ -190,10 +167,8 @@ def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
     reading (the expectation of what a run computes from its samples), and the arm's
     repeatability as identification adds it.
 
-    Args:
-        nominal: the model, with the tracker in its place.
-        config: `[tracker]`, `[acquire]` and `[repeatability]`.
-        predicted: N states.
+    nominal: the model, with the tracker in its place; config: `[tracker]`, `[acquire]` and
+    `[repeatability]`; predicted: N states.
 
     Returns:
         (N, m, m) covariances in sensor axes; m², m·rad, rad².

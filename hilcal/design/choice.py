@@ -30,13 +30,11 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
-LOOSE = 3e-3
-"""Relative gap at which sets of loads are compared. A choice."""
+LOOSE = 3e-3  # Relative gap at which sets of loads are compared. A choice.
 EFFORT = 200
 """Of the exchange search. Read from the demo's plan: 98 % of the bound in a second; more effort
 gains a part per thousand."""
-SAMPLE = 150
-"""Poses by which sets of loads are compared. A choice."""
+SAMPLE = 150  # Poses by which sets of loads are compared. A choice.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,19 +45,13 @@ class Objective:
     nuisance parameters. I is of predictions with all effects; see `mixed_design`. E and K are of
     the model's parameters alone, as the observability indices of the literature are, without those
     that have a prior.
-
-    Attributes:
-        criterion: φ.
-        units: the units by the parameters that φ is of.
-        prior: (P, P) prior information of these.
-        names: of the parameters; none where they are combinations.
-        apart: the pairs of effects that "separate" is of; None of other criteria.
     """
 
-    criterion: Criterion
-    units: CandidateSet
-    prior: Floats
-    names: tuple[str, ...]
+    criterion: Criterion  # φ
+    units: CandidateSet  # the units by the parameters that φ is of
+    prior: Floats  # (P, P) prior information of these
+    names: tuple[str, ...]  # of the parameters; none where they are combinations
+    # the pairs of effects that "separate" is of; None of other criteria
     apart: DiscriminatedPairs | None = None
 
     def relaxed(
@@ -82,12 +74,7 @@ def objective_of(
 ) -> Objective:
     """Return a design problem with a criterion.
 
-    Args:
-        name: one of `CRITERIA`, or "test", the former name of "I".
-        work: the prediction poses, for "I".
-
-    Raises:
-        InputError: an unknown name, or "I" without prediction poses.
+    name: one of `CRITERIA`, or "test", the former name of "I"; work: the prediction poses, for "I".
     """
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
@@ -139,7 +126,7 @@ def choose(
 def choose_poses(
     asked: Objective,
     problem: DesignProblem,
-    usable: Bools,
+    usable: Bools,  # (K,) which units there are to choose from
     poses: int,
     rng: np.random.Generator,
     effort: int = EFFORT,
@@ -148,9 +135,6 @@ def choose_poses(
 
     Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
     readings at any number of poses, under any loads.
-
-    Args:
-        usable: (K,) which units there are to choose from.
     """
     free, index = only(asked, usable), np.flatnonzero(usable)
     of: dict[int, list[int]] = {}
@@ -199,9 +183,8 @@ def costly_loads(
     Hanging a load costs as much time as so many readings; a plan without it takes these
     instead. Compared are the continuous optima over some of the poses, one load after the other.
 
-    Args:
-        budget: readings of the plan with all loads.
-        change: readings that fit into the time of one load change.
+    budget: readings of the plan with all loads; change: readings that fit into the time of one load
+    change.
     """
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]
@@ -252,21 +235,11 @@ def compound_objective(
     problem: DesignProblem,
     config: CellConfig,
     name: str,
-    work: PredictionPoses | None,
-    budget: float,
-    rng: np.random.Generator,
+    work: PredictionPoses | None,  # the prediction poses, for "I"
+    budget: float,  # readings, for which the two optima of A are found
+    rng: np.random.Generator,  # generator; they are found among some of the poses
 ) -> Objective:
-    """Return a design problem with a criterion; D and A are compound with potential terms.
-
-    Args:
-        work: the prediction poses, for "I".
-        budget: readings, for which the two optima of A are found.
-        rng: generator; they are found among some of the poses.
-
-    Raises:
-        CannotAnswerError: so many readings do not determine the model.
-        InputError: from `objective_of`.
-    """
+    """Return a design problem with a criterion; D and A are compound with potential terms."""
     name = canonical(name)
     asked, size = objective_of(problem, config, name, work), problem.model_size
     if size == len(problem.terms) or name not in ("A", "D"):

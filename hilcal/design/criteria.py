@@ -37,11 +37,9 @@ class D(SmoothCriterion):
 
     Fedorov (1972), Theory of Optimal Experiments; O1 of Borm & Menq (1991), Int. J. Robotics
     Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
-
-    Attributes:
-        model: s of a model whose parameters come first; None where all are taken for unknown.
     """
 
+    # s of a model whose parameters come first; None where all are taken for unknown
     model: int | None = None
     name = "D"
 
@@ -87,15 +85,11 @@ class MeanVariance(SmoothCriterion):
     prediction poses, V the Jacobian of the position there, it is that of the predicted position:
     Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
     model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
-
-    Attributes:
-        c: (P, P) C, positive semidefinite.
-        name: name by which a configuration calls it.
-        model: (s, s) C_s of a model whose parameters come first; None where all are unknown.
     """
 
-    c: Floats
-    name: str = "I"
+    c: Floats  # (P, P) C, positive semidefinite
+    name: str = "I"  # name by which a configuration calls it
+    # (s, s) C_s of a model whose parameters come first; None where all are unknown
     model: Floats | None = None
 
     def __post_init__(self) -> None:
@@ -156,12 +150,9 @@ class E(Criterion):
     M itself where all are of interest. The surrogate is the barrier of the semidefinite program
     max t, S ⪰ t 1: F = max over t of t + μ log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has
     trace 1: λ_min(N) ≤ tr(Z N).
-
-    Attributes:
-        interest: indices of the parameters of interest; all by default.
     """
 
-    interest: Ints | None = None
+    interest: Ints | None = None  # indices of the parameters of interest; all by default
     name = "E"
     monotone = True
     kinked = True

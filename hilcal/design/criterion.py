@@ -14,13 +14,9 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Root:
-    """A semidefinite matrix L Lᵀ (P, P), where its root is known.
+    """A semidefinite matrix L Lᵀ (P, P), where its root is known."""
 
-    Attributes:
-        matrix: (P, r) L.
-    """
-
-    matrix: Floats
+    matrix: Floats  # (P, r) L
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,23 +26,16 @@ class Smooth:
     With H_k = A_kᵀ A_k, the second derivative by the weights of units k and l is
 
         Σ c · tr(X H_k Y H_l) over products (c, X, Y) + Σ c · tr(V H_k) tr(V H_l) over squares
-
-    Attributes:
-        value: f(M).
-        gradient: (P, P) of f.
-        products: terms of its curvature.
-        squares: terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a
-            stands for Σ C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l).
-        above: (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
-        below: or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N).
     """
 
-    value: float
-    gradient: Floats
-    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]
+    value: float  # f(M)
+    gradient: Floats  # (P, P) of f
+    products: tuple[tuple[float, Floats | Root, Floats | Root], ...]  # terms of its curvature
+    # terms of its curvature; (C, V) with matrices C (r, r) and V (P, r) of columns v_a stands for Σ
+    # C_ab tr(v_a v_aᵀ H_k) tr(v_b v_bᵀ H_l)
     squares: tuple[tuple[float | Floats, Floats], ...]
-    above: Floats
-    below: Floats | None = None
+    above: Floats  # (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
+    below: Floats | None = None  # or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N)
 
 
 class Criterion(Protocol):
@@ -83,23 +72,15 @@ class Criterion(Protocol):
         return self
 
     def require(self, m: Floats, names: Sequence[str] | None) -> None:
-        """Refuse an M, the information of all candidates, that does not determine φ.
-
-        Raises:
-            CannotAnswerError: names the parameters that no candidate determines.
-        """
+        """Refuse an M, the information of all candidates, that does not determine φ."""
         require_determined(m, names)
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
     """Refuse a singular information matrix, and name what is not determined.
 
-    Args:
-        m: (P, P) of all candidates, and of what is known before.
-        names: of the P parameters; numbers from 1 by default.
-
-    Raises:
-        CannotAnswerError: a direction of parameters that no candidate determines.
+    m: (P, P) of all candidates, and of what is known before; names: of the P parameters; numbers
+    from 1 by default.
     """
     label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
     diagonal = np.diag(m)
@@ -186,11 +167,7 @@ def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
 
 
 def square(m: Floats, what: str, size: int | None = None) -> Floats:
-    """Return a finite symmetric (P, P) matrix.
-
-    Raises:
-        InputError: it is not one.
-    """
+    """Return a finite symmetric (P, P) matrix."""
     m = np.asarray(m, dtype=float)
     p = m.shape[-1] if size is None and m.ndim else size
     if m.shape != (p, p) or not np.isfinite(m).all():

@@ -32,34 +32,25 @@ from hilcal.regression.schur import schur_complement
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-LEVEL = 0.01
-"""Chance of a false alarm of the test."""
+LEVEL = 0.01  # Chance of a false alarm of the test
 DRAWS = 3
-MANY = 100
-"""Readings by which a pair counts as not separable ..."""
-LEAST_POWER = 0.2
-"""... where the best plan of so many has less power than this. Guesses, both."""
+MANY = 100  # Readings by which a pair counts as not separable ...
+LEAST_POWER = 0.2  # ... where the best plan of so many has less power than this. Guesses, both.
 _LOOSE = 0.05
 _SEED = 20240609
-SUPPORTED = 3.0
-"""Log evidence from which the readings support an effect: odds of 20 : 1, e³."""
+SUPPORTED = 3.0  # Log evidence from which the readings support an effect: odds of 20 : 1, e³
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DiscriminatedPairs:
-    """Pairs of effects to discriminate.
+    """Pairs of effects to discriminate."""
 
-    Attributes:
-        pairs: as the criterion takes them.
-        names: (effect that is there, rival that is fitted) of each pair.
-        prior: (P, P) information before, without the priors of potential terms: neither must
-            an effect be found by what was supposed of it, nor a rival be held small.
-        not_separable: names of the pairs that no measurement separates; they are left out.
-    """
-
-    pairs: tuple[Pair, ...]
-    names: tuple[tuple[str, str], ...]
+    pairs: tuple[Pair, ...]  # as the criterion takes them
+    names: tuple[tuple[str, str], ...]  # (effect that is there, rival that is fitted) of each pair
+    # (P, P) information before, without the priors of potential terms: neither must an effect be
+    # found by what was supposed of it, nor a rival be held small
     prior: Floats
+    # names of the pairs that no measurement separates; they are left out
     not_separable: tuple[tuple[str, str], ...] = ()
 
 
@@ -71,10 +62,6 @@ def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     are those that the readings so far support, see `supported_parameters`. Of the others a few
     directions are drawn (always the same), each of an RMS strength of 1 σ of a measured element
     over all units.
-
-    Raises:
-        InputError: fewer than two potential terms.
-        CannotAnswerError: no pair can be separated.
     """
     names = tuple(e.name for e in problem.families)
     if len(names) < 2:
@@ -169,9 +156,8 @@ def _best_power(problem: DesignProblem, of: DiscriminatedPairs, pair: Pair) -> f
 def power(pair: Pair, information: Floats) -> float:
     """Return the power of the test at 1 % of the effect beyond model and rival.
 
-    Args:
-        pair: the effect, and what is fitted.
-        information: (P, P) of a plan, with `DiscriminatedPairs.prior`.
+    pair: the effect, and what is fitted; information: (P, P) of a plan, with
+    `DiscriminatedPairs.prior`.
     """
     s = schur_complement(information, pair.effect, pair.nuisance)
     return family_power(s, pair.beta, LEVEL)
@@ -194,17 +180,11 @@ def _directions(problem: DesignProblem, effect: str) -> list[Floats]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectEstimate:
-    """Posterior of the P parameters of an effect that is not in the model.
+    """Posterior of the P parameters of an effect that is not in the model."""
 
-    Attributes:
-        mean: (P,) SI.
-        root: (P, P) root of their scale matrix, SI.
-        log_evidence: gain in log evidence by adding the effect.
-    """
-
-    mean: Floats
-    root: Floats
-    log_evidence: float
+    mean: Floats  # (P,) SI
+    root: Floats  # (P, P) root of their scale matrix, SI
+    log_evidence: float  # gain in log evidence by adding the effect
 
     @property
     def supported(self) -> bool:
@@ -223,9 +203,7 @@ def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
 
     None where these readings lack a column that it needs, or cannot show any direction of it.
 
-    Args:
-        linear: of a fit in scaling gc, of a model without the effect.
-        effect: built for any states.
+    linear: of a fit in scaling gc, of a model without the effect; effect: built for any states.
     """
     if not computable(linear.fit, effect):
         return None

@@ -76,8 +76,7 @@ class Space(Feasibility):
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
         """Return by reason (N,) which states keep it; in the order of `REASONS`.
 
-        Args:
-            q: (N, n) joint angles, rad.
+        q: (N, n) joint angles, rad.
         """
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 
@@ -147,45 +146,25 @@ _OF_LOADS = ("payload", "torque", "force sensor", "hanging", "sight")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnPoses:
-    """K poses that are allowed unloaded, and the loads that each may bear.
+    """K poses that are allowed unloaded, and the loads that each may bear."""
 
-    Attributes:
-        q: (K, n) joint angles, rad.
-        loads: 1 + L names, "none" first.
-        allowed: (K, 1 + L) which loads each pose bears.
-        drawn: how many states were looked at.
-        left: by reason, how many of them were left after it, in the order of checking.
-        remarks: what people should know.
-    """
-
-    q: Floats
-    loads: tuple[str, ...]
-    allowed: Bools
-    drawn: int
-    left: dict[str, int]
-    remarks: tuple[str, ...]
+    q: Floats  # (K, n) joint angles, rad
+    loads: tuple[str, ...]  # 1 + L names, "none" first
+    allowed: Bools  # (K, 1 + L) which loads each pose bears
+    drawn: int  # how many states were looked at
+    left: dict[str, int]  # by reason, how many of them were left after it, in the order of checking
+    remarks: tuple[str, ...]  # what people should know
 
 
 def draw(
     space: Space,
-    count: int,
-    rng: np.random.Generator,
+    count: int,  # poses wanted; fewer where the cell leaves fewer
+    rng: np.random.Generator,  # shift of the sequence
     *,
-    least: int = 1,
-    most: int | None = None,
+    least: int = 1,  # so many have to be found
+    most: int | None = None,  # so many states are drawn at most; by default many times `count`
 ) -> DrawnPoses:
-    """Return poses from a Sobol sequence over the joint space, turned by a random shift.
-
-    Args:
-        count: poses wanted; fewer where the cell leaves fewer.
-        rng: shift of the sequence.
-        least: so many have to be found.
-        most: so many states are drawn at most; by default many times `count`.
-
-    Raises:
-        CannotAnswerError: too few poses, or no load that any of them bears; names the
-            constraint that leaves nothing.
-    """
+    """Return poses from a Sobol sequence over the joint space, turned by a random shift."""
     low, high = space.low, space.high
     if np.any(low >= high):
         j = int(np.argmax(low - high)) + 1

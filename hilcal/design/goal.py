@@ -12,8 +12,7 @@ from hilcal.identification.fit import Fit
 from hilcal.measuring.progress import GoalStatus
 from hilcal.tables.units import METRIC
 
-JOINTS = JointCompliance.name
-"""The effect that "joint" and "j3" are short for."""
+JOINTS = JointCompliance.name  # The effect that "joint" and "j3" are short for
 FORMS = (
     '"joint std < 2 %"',
     '"j3 std < 3 %"',
@@ -33,21 +32,13 @@ _SHAPE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """Standard uncertainties to be reached.
+    """Standard uncertainties to be reached."""
 
-    Attributes:
-        text: as it was given.
-        what: "position" or "deflection", or a parameter or an effect by name.
-        limit: largest standard uncertainty: a share of the value, or SI.
-        relative: whether it is a share of the parameter's value.
-        unit: SI unit that the limit was given in; "" for a share.
-    """
-
-    text: str
-    what: str
-    limit: float
-    relative: bool
-    unit: str
+    text: str  # as it was given
+    what: str  # "position" or "deflection", or a parameter or an effect by name
+    limit: float  # largest standard uncertainty: a share of the value, or SI
+    relative: bool  # whether it is a share of the parameter's value
+    unit: str  # SI unit that the limit was given in; "" for a share
 
     @property
     def of_position(self) -> bool:
@@ -55,11 +46,7 @@ class Goal:
         return self.what in POSITIONS
 
     def names(self, known: Mapping[str, float]) -> tuple[str, ...]:
-        """Return the parameters that the goal is about, of those that are known.
-
-        Raises:
-            InputError: none; lists what a goal could be about.
-        """
+        """Return the parameters that the goal is about, of those that are known."""
         found = tuple(n for n in known if n == self.what or n.split(".")[0] == self.what)
         if not found:
             effects = dict.fromkeys(name.split(".")[0] for name in known)
@@ -72,11 +59,7 @@ class Goal:
     def check(self, units: Mapping[str, str]) -> None:
         """Refuse a goal that does not fit the parameters of a model.
 
-        Args:
-            units: SI unit of each parameter by name.
-
-        Raises:
-            InputError: no such parameter, or another unit.
+        units: SI unit of each parameter by name.
         """
         if self.of_position or self.relative:
             if not self.of_position:
@@ -90,23 +73,16 @@ class Goal:
 
     def met(
         self,
+        # standard uncertainty of each parameter by name, SI; infinite where it is not identifiable
         stds: Mapping[str, float],
         values: Mapping[str, float],
+        # standard uncertainty of what is predicted where the robot will work, m; infinite where the
+        # readings do not determine it
         position: float | None = None,
+        # what that is, e.g. "deflection under 5kg at 100 poses in the work box".
         predicted: str = "",
     ) -> GoalStatus:
-        """Judge standard uncertainties.
-
-        Args:
-            stds: standard uncertainty of each parameter by name, SI; infinite where it is not
-                identifiable.
-            position: standard uncertainty of what is predicted where the robot will work, m;
-                infinite where the readings do not determine it.
-            predicted: what that is, e.g. "deflection under 5kg at 100 poses in the work box".
-
-        Raises:
-            InputError: a goal for positions without any, or for a parameter that is not there.
-        """
+        """Judge standard uncertainties."""
         if self.of_position:
             if position is None:
                 raise InputError(
@@ -135,11 +111,7 @@ class Goal:
 
 
 def parse_goal(text: str) -> Goal:
-    """Read a goal, e.g. "joint std < 2 %"; `joint` are all joint compliances, `j3` is one.
-
-    Raises:
-        InputError: anything else; lists the valid forms.
-    """
+    """Read a goal, e.g. "joint std < 2 %"; `joint` are all joint compliances, `j3` is one."""
     match = _SHAPE.fullmatch(text)
     if match is None:
         raise _wrong(text, "not understood")

@@ -25,8 +25,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
-SHARE = 0.1
-"""Share of the time that may be spent on fits while measuring."""
+SHARE = 0.1  # Share of the time that may be spent on fits while measuring
 
 
 class GoalRule:
@@ -49,23 +48,14 @@ class GoalRule:
 
     def __init__(
         self,
-        text: str,
+        text: str,  # the goal, e.g. "joint std < 2 %".
         cell: Cell,
-        config: CellConfig,
+        config: CellConfig,  # `[planning]`, loads, repeatability
+        # the effects that a model can have; the installed ones unless given
         catalogue: Catalogue | None = None,
-        now: Callable[[], float] = time.monotonic,
+        now: Callable[[], float] = time.monotonic,  # seconds that pass for people
     ) -> None:
-        """Read a goal, and check it against the cell's model.
-
-        Args:
-            text: the goal, e.g. "joint std < 2 %".
-            config: `[planning]`, loads, repeatability.
-            catalogue: the effects that a model can have; the installed ones unless given.
-            now: seconds that pass for people.
-
-        Raises:
-            InputError: not a goal (lists the valid forms), or not one for this cell.
-        """
+        """Read a goal, and check it against the cell's model."""
         self.goal: Goal = parse_goal(text)
         self.status = GoalStatus(text)
         self._cell, self._config, self._now = cell, config, now

@@ -38,11 +38,9 @@ from hilcal.types import Bools, Floats, Ints
 
 PAIRS_UP_TO = 4
 """Pairs of loads are units of their own where there are no more loads than this. A choice."""
-MOST_BYTES = 600_000_000
-"""Memory that the rows of all units may take. A choice."""
+MOST_BYTES = 600_000_000  # Memory that the rows of all units may take. A choice.
 MOST_PARAMETERS = 200
-SAMPLE = 300
-"""Candidate poses by which strengths are judged. A choice."""
+SAMPLE = 300  # Candidate poses by which strengths are judged. A choice.
 MOST_ORDINARY = 5.0
 """A family that reaches one σ only with more than so many ordinary magnitudes is left out.
 A choice."""
@@ -68,52 +66,34 @@ class Potential:
 
 @dataclass(frozen=True, slots=True)
 class DesignTerm:
-    """A parameter of the problem.
+    """A parameter of the problem."""
 
-    Attributes:
-        effect: canonical name of its effect.
-        name: as identification prints it, e.g. "joint_compliance.j1".
-        unit: physical unit, SI.
-        scale: what one unit of the problem's parameter is, SI: an ordinary magnitude, or τ of
-            a potential term.
-        value: at which it is assumed, SI.
-        potential: whether it belongs to an effect that is not in the model.
-    """
-
-    effect: str
-    name: str
-    unit: str
+    effect: str  # canonical name of its effect
+    name: str  # as identification prints it, e.g. "joint_compliance.j1".
+    unit: str  # physical unit, SI
+    # what one unit of the problem's parameter is, SI: an ordinary magnitude, or τ of a potential
+    # term
     scale: float
-    value: float
-    potential: bool
+    value: float  # at which it is assumed, SI
+    potential: bool  # whether it belongs to an effect that is not in the model
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DesignProblem:
-    """Everything that a plan is chosen by.
+    """Everything that a plan is chosen by."""
 
-    Attributes:
-        nominal: the model that is planned for.
-        mode: "deflection" or "absolute".
-        units: K units; their parameters are those of the model, then potential terms.
-        what: pose and loads of each unit; "none" is the unloaded reading of absolute positions,
-            that of deflections goes without saying.
-        families: effects of the potential terms.
-        prior: (P, P) what is known before: priors, and what was measured already.
-        measured: (P, P) the part of it that was measured already.
-        notes: what was assumed and left out, one line each.
-    """
-
-    nominal: NominalModel
-    mode: Mode
+    nominal: NominalModel  # the model that is planned for
+    mode: Mode  # "deflection" or "absolute"
     candidates: Candidates
-    units: CandidateSet
+    units: CandidateSet  # K units; their parameters are those of the model, then potential terms
+    # pose and loads of each unit; "none" is the unloaded reading of absolute positions, that of
+    # deflections goes without saying
     what: tuple[tuple[int, tuple[str, ...]], ...]
     terms: tuple[DesignTerm, ...]
-    families: tuple[Effect, ...]
-    prior: Floats
-    measured: Floats
-    notes: tuple[str, ...]
+    families: tuple[Effect, ...]  # effects of the potential terms
+    prior: Floats  # (P, P) what is known before: priors, and what was measured already
+    measured: Floats  # (P, P) the part of it that was measured already
+    notes: tuple[str, ...]  # what was assumed and left out, one line each
 
     @property
     def model_size(self) -> int:
@@ -145,14 +125,9 @@ def problem(
     unloaded reading and some loads: each by itself, all that the pose bears, and pairs where
     there are few loads. It costs as many readings as it takes, the unloaded one included.
 
-    Args:
-        config: loads, noise, and `[planning]`: kind of readings, potential terms.
-        q: (N, n) candidate poses, rad.
-        allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by default.
-
-    Raises:
-        InputError: an unknown effect; deflections without any load; too many candidates.
-        CannotAnswerError: no state is allowed.
+    config: loads, noise, and `[planning]`: kind of readings, potential terms; q: (N, n) candidate
+    poses, rad; allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by
+    default.
     """
     mode = config.planning.readings
     if mode == "deflection" and not config.loads:
@@ -263,19 +238,13 @@ def _subsets(allowed: Ints, mode: Mode, kinds: set[str]) -> Iterator[tuple[int, 
 
 
 def unit_rows(
-    parts: Iterable[ReadingDerivatives],
-    loads: tuple[str, ...],
-    what: Sequence[tuple[int, tuple[str, ...]]],
+    parts: Iterable[ReadingDerivatives],  # of every `step`-th candidate pose
+    loads: tuple[str, ...],  # names of all loads, "none" first
+    what: Sequence[tuple[int, tuple[str, ...]]],  # pose and loads of each unit
     mode: Mode,
     step: int = 1,
 ) -> Iterator[tuple[Ints, Floats]]:
-    """Yield indices of units and their whitened rows (k, R, P), some poses at a time.
-
-    Args:
-        parts: of every `step`-th candidate pose.
-        loads: names of all loads, "none" first.
-        what: pose and loads of each unit.
-    """
+    """Yield indices of units and their whitened rows (k, R, P), some poses at a time."""
     several: dict[tuple[str, ...], list[int]] = {}
     for k, (pose, names) in enumerate(what):
         if pose % step == 0:
@@ -299,11 +268,7 @@ def readings_of(what: tuple[int, tuple[str, ...]], mode: Mode) -> tuple[str, ...
 
 
 def potential(nominal: NominalModel, config: CellConfig, of: Candidates) -> Potential:
-    """Choose the families of `[planning] against` and how strong they could be.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
-    """
+    """Choose the families of `[planning] against` and how strong they could be."""
     names = potential_names(config, nominal.model)
     known = nominal.model.catalogue
     families = tuple(build(known, name, nominal.cell, nominal.m) for name in names)
@@ -368,11 +333,9 @@ def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Float
     A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
     equations hold, without its priors.
 
-    Args:
-        nominal: the model, whose live parameters come first.
-        more: effects that are not in the model. Those that cannot be computed from these readings,
-            which lack a column, have no information.
-        scale: (P,) what one unit of each parameter is, SI.
+    nominal: the model, whose live parameters come first; more: effects that are not in the model.
+    Those that cannot be computed from these readings, which lack a column, have no information.;
+    scale: (P,) what one unit of each parameter is, SI.
     """
     fit, count = nominal.fit, len(nominal.live)
     known = np.zeros((len(scale), len(scale)))

@@ -43,35 +43,26 @@ from hilcal.types import Bools, Floats, Ints
 DIRECTIONS = 150
 """Most directions Q. A choice: at the poses of a real UR10 (920 parameters) the others together
 move a reading by 0.5 of its noise (rms)."""
-SAMPLE = 300
-"""Candidate poses by which they are found. A choice."""
+SAMPLE = 300  # Candidate poses by which they are found. A choice.
 LEAST = 1e-3
 """Directions that move the units by less than this in units of the noise (rms) are left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MixedDesign:
-    """A design problem in the coordinates (b, Qᵀ v).
+    """A design problem in the coordinates (b, Qᵀ v)."""
 
-    Attributes:
-        units: the units of the problem.
-        prior: (P, P) what is known before.
-        c: (P, P) C, m².
-        names: of b, then of Qᵀ v by number; by number alone of `balanced`.
-    """
-
-    units: CandidateSet
-    prior: Floats
-    c: Floats
-    names: tuple[str, ...]
+    units: CandidateSet  # the units of the problem
+    prior: Floats  # (P, P) what is known before
+    c: Floats  # (P, P) C, m²
+    names: tuple[str, ...]  # of b, then of Qᵀ v by number; by number alone of `balanced`
 
 
 def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
     """Return the design problem of predictions with all effects.
 
-    Args:
-        of: the design problem of the model.
-        config: its noise; where it states no repeatability, an ordinary one is assumed.
+    of: the design problem of the model; config: its noise; where it states no repeatability, an
+    ordinary one is assumed.
     """
     nominal, config = of.nominal, _with_scatter(of.nominal, config)
     more, std = other_effects(nominal, config)
@@ -169,19 +160,12 @@ class _AllColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Coordinates:
-    """The change of coordinates.
+    """The change of coordinates."""
 
-    Attributes:
-        flat: (P, b) columns of A' by those of all parameters.
-        random: (P, r) columns Z H^−½ Q.
-        root: (P, u) columns Z H^−½.
-        prior: (b, b) F − G H⁻¹ Gᵀ.
-    """
-
-    flat: Floats
-    random: Floats
-    root: Floats
-    prior: Floats
+    flat: Floats  # (P, b) columns of A' by those of all parameters
+    random: Floats  # (P, r) columns Z H^−½ Q
+    root: Floats  # (P, u) columns Z H^−½
+    prior: Floats  # (b, b) F − G H⁻¹ Gᵀ
 
     def columns(self, rows: Floats) -> Floats:
         """(..., b + r) of rows (..., P)."""

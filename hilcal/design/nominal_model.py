@@ -21,43 +21,30 @@ from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
-DISTANCE = 2.0
-"""Reaches from the base to a tracker whose place is not given. A choice."""
+DISTANCE = 2.0  # Reaches from the base to a tracker whose place is not given. A choice.
 FRAME_PRIOR = {"prior_m": 3e-3, "prior_rad": 6e-3}
 """In deflections the frames act only by turning them; they are known from the positions, about
 as well as the arm's elastic sag lets them be."""
 DURATION_S = 3600.0
 LOAD_TIMES_S = (5.0, 100.0)
-TEMPERATURES = (25.0, 35.0)
-"""Of joints that warm up while they are measured, °C."""
+TEMPERATURES = (25.0, 35.0)  # Of joints that warm up while they are measured, °C
 _SEED = 20240607
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NominalModel:
-    """The model that is planned for.
+    """The model that is planned for."""
 
-    Attributes:
-        model: frames where unknown, and effects; its cell has a tracker in its place.
-        theta: (P,) parameters, SI.
-        live: (L,) indices of the parameters that are not held at zero.
-        prior_std: (P,) prior standard deviations, infinite where nothing is known, SI.
-        station: (3,) where the beam starts, sensor axes, m.
-        m: elements of a reading: 3 or 6.
-        fit: of what has been measured already; None at first.
-        notes: what was assumed, one line each.
-        carried: (L, L) information of a prior that is carried over from another campaign, 1/SI²;
-            None without one. Those parameters have no other prior.
-    """
-
-    model: Model
-    theta: Floats
-    live: Ints
-    prior_std: Floats
-    station: Floats
-    m: int
-    fit: Fit | None
-    notes: tuple[str, ...]
+    model: Model  # frames where unknown, and effects; its cell has a tracker in its place
+    theta: Floats  # (P,) parameters, SI
+    live: Ints  # (L,) indices of the parameters that are not held at zero
+    prior_std: Floats  # (P,) prior standard deviations, infinite where nothing is known, SI
+    station: Floats  # (3,) where the beam starts, sensor axes, m
+    m: int  # elements of a reading: 3 or 6
+    fit: Fit | None  # of what has been measured already; None at first
+    notes: tuple[str, ...]  # what was assumed, one line each
+    # (L, L) information of a prior that is carried over from another campaign, 1/SI²; None without
+    # one. Those parameters have no other prior.
     carried: Floats | None = None
 
     @property
@@ -90,24 +77,18 @@ class NominalModel:
 def nominal_model(
     cell: Cell,
     config: CellConfig,
-    m: int = 3,
+    m: int = 3,  # 3 for positions, 6 for poses
+    # the effects that a model can have; the installed ones unless given
     catalogue: Catalogue | None = None,
+    # what another campaign taught. Its effects are in the model, too, but for families that share a
+    # prior, which a plan is not made for unless they are named, and those that need what a plan
+    # does not fix.
     prior: CarriedPrior | None = None,
 ) -> NominalModel:
     """Return the model of `[planning]` with ordinary parameters.
 
     What is planned hardly depends on the parameters: deflections are linear in them to about
     1e-3. Those of the baseline's effects are ordinary, all others zero.
-
-    Args:
-        m: 3 for positions, 6 for poses.
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught. Its effects are in the model, too, but for families
-            that share a prior, which a plan is not made for unless they are named, and those that
-            need what a plan does not fix.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones), or a prior of another arm.
     """
     known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
@@ -175,13 +156,8 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
 def after(fit: Fit, config: CellConfig) -> NominalModel:
     """Return the model and the parameters of what has been measured already.
 
-    Args:
-        fit: the newest revision of the campaign.
-        config: the configuration of the cell that is planned for.
-
-    Raises:
-        InputError: a fit whose residual is not whitened, or an effect that needs what a plan
-            does not determine, as a temperature.
+    fit: the newest revision of the campaign; config: the configuration of the cell that is planned
+    for.
     """
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
@@ -212,11 +188,7 @@ def build(
 
 
 def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
-    """Say of which effects a plan has to guess what they need, one line each.
-
-    Raises:
-        InputError: an effect that needs what a plan does not determine, as a temperature.
-    """
+    """Say of which effects a plan has to guess what they need, one line each."""
     known = nominal_states(np.zeros((1, 1)), np.zeros((1, 6)))
     for e in effects:
         if e.role not in FRAME_ROLES and not type(e).computable(known):
@@ -236,9 +208,6 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
     """Return the effects of `[planning] model`, by name, with the options written behind them.
 
     Each is written as for `identify --effects`, e.g. "joint_compliance(joints=2-6)".
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones), or options that cannot be read.
     """
     try:
         return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
@@ -247,11 +216,7 @@ def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[
 
 
 def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str, ...]:
-    """Return the names of effects, each once.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
-    """
+    """Return the names of effects, each once."""
     for name in names:
         try:
             catalogue[name]
@@ -261,13 +226,7 @@ def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str
 
 
 def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
-    """Refuse effects of a configuration that cannot be planned with, before anything is done.
-
-    Raises:
-        InputError: an unknown effect in `[planning] model` or `against`, in `[plausible]` or
-            `[ordinary]` (lists the valid ones), options that cannot be read, or an effect that
-            needs what a plan does not fix.
-    """
+    """Refuse effects of a configuration that cannot be planned with, before anything is done."""
     try:
         model = nominal_model(cell, config, catalogue=catalogue).model
     except InputError as error:
@@ -288,9 +247,6 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
 
     Of the whole catalogue those are left out that need what only the order of a plan determines, as
     the time or the side of approach.
-
-    Raises:
-        InputError: an unknown effect (lists the valid ones).
     """
     asked = config.planning.against
     if asked == "catalogue":
@@ -315,9 +271,7 @@ def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]
 def nominal_states(q: Floats, wrench: Floats) -> States:
     """Return states (N) with times, temperatures and sides, as a shuffled order would have them.
 
-    Args:
-        q: (N, n) joint angles, rad.
-        wrench: (N, 6) at the load point, base axes, N and N·m.
+    q: (N, n) joint angles, rad; wrench: (N, 6) at the load point, base axes, N and N·m.
     """
     rng = np.random.default_rng(_SEED)
     time = rng.uniform(0.0, DURATION_S, len(q))

@@ -21,21 +21,13 @@ plan and the benchmark's 40 of 100,000 states keep their certified efficiency to
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """What is taken, and how good it is.
+    """What is taken, and how good it is."""
 
-    Attributes:
-        counts: (K,) how often each unit is taken.
-        value: φ of it.
-        bound: φ of no plan within the budget exceeds it.
-        information: (P, P) of it, with what was known before.
-        cost: Σ n_k c_k.
-    """
-
-    counts: Ints
-    value: float
-    bound: float
-    information: Floats
-    cost: float
+    counts: Ints  # (K,) how often each unit is taken
+    value: float  # φ of it
+    bound: float  # φ of no plan within the budget exceeds it
+    information: Floats  # (P, P) of it, with what was known before
+    cost: float  # Σ n_k c_k
     relaxed: ApproximateDesign
 
     @property
@@ -46,33 +38,21 @@ class Design:
 
 def best(
     units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
+    criterion: Criterion,  # φ
+    budget: float,  # B, in the units of the cost
+    # (P, P) M0: what is known before, and units that are in the plan in any case
     prior: Floats | None = None,
+    # generator; the plan depends on nothing else that is random
     rng: np.random.Generator | None = None,
     *,
-    most: int | None = None,
+    most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
+    # relative gap of the continuous optimum; `TOLERANCE` by default
     tolerance: float | None = None,
-    effort: int | None = None,
-    relaxed: ApproximateDesign | None = None,
+    effort: int | None = None,  # of the search for whole numbers; see `exact`
+    relaxed: ApproximateDesign | None = None,  # the continuous optimum, where it is known
 ) -> Design:
-    """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest.
-
-    Args:
-        criterion: φ.
-        budget: B, in the units of the cost.
-        prior: (P, P) M0: what is known before, and units that are in the plan in any case.
-        rng: generator; the plan depends on nothing else that is random.
-        most: how often a unit may be taken; any number of times by default.
-        tolerance: relative gap of the continuous optimum; `TOLERANCE` by default.
-        effort: of the search for whole numbers; see `exact`.
-        relaxed: the continuous optimum, where it is known.
-
-    Raises:
-        InputError: a budget that takes no unit, or arrays that do not fit.
-        CannotAnswerError: parameters that no candidate determines, or not within the budget.
-    """
+    """Return a plan with Σ n_k c_k ≤ B whose φ(M0 + Σ n_k A_kᵀA_k) is nearly the largest."""
     rng = np.random.default_rng(0) if rng is None else rng
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
@@ -103,8 +83,7 @@ def best(
 EFFORT = 6000
 """Units that are put into a plan before the search ends, at most; fewer of small plans.
 A choice: the 40 of 100,000 states of the benchmark are certified at 98 % within it."""
-KINKED_EFFORT = 1500
-"""The same for criteria with kinks, whose values cost more."""
+KINKED_EFFORT = 1500  # The same for criteria with kinks, whose values cost more
 ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99
 """Share of the bound at which the search ends; for criteria with kinks. A choice: a percent of what
 separates two effects is a percent of the readings, and to find it takes as long as the rest."""
@@ -123,14 +102,14 @@ _WORSE = 0.12  # of the distance to the bound, by which a plan may be worse and 
 
 def exact(
     units: CandidateSet,
-    criterion: Criterion,
-    budget: float,
-    prior: Floats | None,
+    criterion: Criterion,  # φ
+    budget: float,  # B
+    prior: Floats | None,  # (P, P) what is known before, and units that are in any case in the plan
     relaxed: ApproximateDesign,
     rng: np.random.Generator,
     *,
-    most: int | None = None,
-    effort: int | None = None,
+    most: int | None = None,  # how often a unit may be taken; any number of times by default
+    effort: int | None = None,  # units put into a plan before the search ends; `EFFORT` by default
 ) -> Ints:
     """Return (K,) whole numbers n of units with Σ n_k c_k ≤ B that nearly maximise φ.
 
@@ -139,13 +118,6 @@ def exact(
     taken out in turn and its budget spent anew (Fedorov 1972; with units of different cost a
     unit may give way to several); where this no longer helps, a few random ones are taken out at
     once, and what is a little worse is gone on from for a while.
-
-    Args:
-        criterion: φ.
-        budget: B.
-        prior: (P, P) what is known before, and units that are in any case in the plan.
-        most: how often a unit may be taken; any number of times by default.
-        effort: units put into a plan before the search ends; `EFFORT` by default.
     """
     prior = checked(units, budget, prior, most)
     if effort is None:
@@ -175,37 +147,23 @@ class _Plan:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """The pool of units in which a plan is sought.
+    """The pool of units in which a plan is sought."""
 
-    Attributes:
-        criterion: φ.
-        index: (S,) the pool's units among all.
-        rows: (S, R, P) of the pool.
-        cost: (S,) of the pool.
-        budget: B.
-        most: how often a unit may be taken.
-        prior: (P, P) M0.
-        ideal: (P, P) information per cost of the continuous optimum, without M0.
-        ideal_weight: (S,) its weights.
-        root: (P, P) L with L Lᵀ the information of the continuous optimum.
-        table: (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off the diagonal doubled:
-            tr(G A_kᵀA_k) of all units is one product with the triangle of Lᵀ G L. In these
-            coordinates single precision is enough for an order of prices.
-        triangle: indices of the upper triangle.
-    """
-
-    criterion: Criterion
-    index: Ints
-    rows: Floats
-    cost: Floats
-    budget: float
-    most: int
-    prior: Floats
-    ideal: Floats
-    ideal_weight: Floats
+    criterion: Criterion  # φ
+    index: Ints  # (S,) the pool's units among all
+    rows: Floats  # (S, R, P) of the pool
+    cost: Floats  # (S,) of the pool
+    budget: float  # B
+    most: int  # how often a unit may be taken
+    prior: Floats  # (P, P) M0
+    ideal: Floats  # (P, P) information per cost of the continuous optimum, without M0
+    ideal_weight: Floats  # (S,) its weights
+    # (S, P (P + 1) / 2) upper triangles of L⁻¹ A_kᵀA_k L⁻ᵀ, off the diagonal doubled: tr(G A_kᵀA_k)
+    # of all units is one product with the triangle of Lᵀ G L. In these coordinates single precision
+    # is enough for an order of prices.
     table: NDArray[np.float32]
-    triangle: tuple[Ints, Ints]
-    root: Floats
+    triangle: tuple[Ints, Ints]  # indices of the upper triangle
+    root: Floats  # (P, P) L with L Lᵀ the information of the continuous optimum
 
     def _information(self, counts: Ints) -> Floats:
         """Return (P, P) M of whole numbers."""
@@ -230,10 +188,8 @@ class _Search:
     ) -> _Plan:
         """Return the plan after its free budget is spent, one unit after another.
 
-        Args:
-            counts: (S,) of the plan.
-            banned: a unit not to be taken first.
-            rng: passes over some units at random; the best is always taken by default.
+        counts: (S,) of the plan; banned: a unit not to be taken first; rng: passes over some units
+        at random; the best is always taken by default.
         """
         counts = counts.copy()
         m = self._information(counts)

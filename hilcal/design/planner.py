@@ -38,68 +38,48 @@ from hilcal.identification.registration import MIN_POSES
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-HOMES = 4
-"""Central poses of which one becomes the reference. A choice."""
-PROBES = 60
-"""Poses by which the reference is judged. A choice."""
-SAMPLE = 50
-"""Poses by which the noise of a reading is judged. A choice."""
-ROUNDS = 6
-"""How often poses that are not reached from the reference may be replaced. A choice."""
+HOMES = 4  # Central poses of which one becomes the reference. A choice.
+PROBES = 60  # Poses by which the reference is judged. A choice.
+SAMPLE = 50  # Poses by which the noise of a reading is judged. A choice.
+ROUNDS = 6  # How often poses that are not reached from the reference may be replaced. A choice.
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """Size and criterion of a plan.
+    """Size and criterion of a plan."""
 
-    Attributes:
-        poses: just so many, each read once unloaded and under every load that it bears.
-        readings: or this many readings, those at the reference and repeats not counted, spread
-            over as many poses, and under those loads, as determine most.
-        criterion: of `[planning]` where None; that has I for absolute readings and D for
-            deflections unless it states one.
-        effort: of the search for whole numbers.
-        unloaded: "around" or "first", see `Ordering`.
-    """
-
-    poses: int = 20
+    poses: int = 20  # just so many, each read once unloaded and under every load that it bears
+    # or this many readings, those at the reference and repeats not counted, spread over as many
+    # poses, and under those loads, as determine most
     readings: int | None = None
+    # of `[planning]` where None; that has I for absolute readings and D for deflections unless it
+    # states one
     criterion: str | None = None
-    effort: int = EFFORT
-    unloaded: Literal["around", "first"] = "around"
+    effort: int = EFFORT  # of the search for whole numbers
+    unloaded: Literal["around", "first"] = "around"  # "around" or "first", see `Ordering`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned:
-    """A plan with its design problem.
+    """A plan with its design problem."""
 
-    Attributes:
-        ordered: the plan in order, with what the order costs.
-        design: the units that were chosen, with the certificate.
-        costly: loads that cost more than they tell, with what leaving each out would gain.
-        asked: the design problem with its criterion.
-        usable: (K,) which units were to choose from.
-        budget: readings of the design.
-        predicted: standard uncertainties that a fit to the readings will have.
-        undetermined: parameters of the model that no reading of the cell determines.
-        asked_poses: poses that were asked for, see `Request`; None where readings were.
-    """
-
-    ordered: Ordered
-    design: Design
+    ordered: Ordered  # the plan in order, with what the order costs
+    design: Design  # the units that were chosen, with the certificate
+    # loads that cost more than they tell, with what leaving each out would gain
     costly: tuple[tuple[str, float], ...]
     problem: DesignProblem
-    asked: Objective
-    usable: Bools
+    asked: Objective  # the design problem with its criterion
+    usable: Bools  # (K,) which units were to choose from
     work: PredictionPoses
     drawn: DrawnPoses
-    budget: float
+    budget: float  # readings of the design
     criterion: str
-    predicted: PredictedUncertainty
+    predicted: PredictedUncertainty  # standard uncertainties that a fit to the readings will have
+    # parameters of the model that no reading of the cell determines
     undetermined: tuple[UndeterminedParameter, ...]
-    asked_poses: int | None
+    asked_poses: int | None  # poses that were asked for, see `Request`; None where readings were
 
     @property
     def counts(self) -> Floats:
@@ -111,32 +91,20 @@ class Planned:
 
 def make(
     cell: Cell,
-    config: CellConfig,
-    request: Request,
+    config: CellConfig,  # limits, loads, noise, and `[planning]`: what it is for
+    request: Request,  # how many readings, and the criterion
     rng: np.random.Generator,
-    known: Fit | None = None,
+    known: Fit | None = None,  # fit of what has been measured already
     say: Say = lambda words: None,
+    # the effects that a model can have; the installed ones unless given, or those of `known`
     catalogue: Catalogue | None = None,
+    # what another campaign taught, where nothing has been measured yet
     prior: CarriedPrior | None = None,
+    # (n,) joints of the reference pose of the campaign that the plan is appended to, rad; a new one
+    # where None
     reference: Floats | None = None,
 ) -> Planned:
-    """Return the plan.
-
-    Args:
-        config: limits, loads, noise, and `[planning]`: what it is for.
-        request: how many readings, and the criterion.
-        known: fit of what has been measured already.
-        catalogue: the effects that a model can have; the installed ones unless given, or those
-            of `known`.
-        prior: what another campaign taught, where nothing has been measured yet.
-        reference: (n,) joints of the reference pose of the campaign that the plan is appended to,
-            rad; a new one where None.
-
-    Raises:
-        InputError: numbers or names that cannot be.
-        CannotAnswerError: the cell leaves too few states, its readings determine nothing of the
-            model, or they are too few; names the constraint or the parameter.
-    """
+    """Return the plan."""
     usual = "I" if config.planning.readings == "absolute" else "D"
     criterion = canonical(request.criterion or config.planning.criterion or usual)
     say("drawing candidate poses")
@@ -261,17 +229,12 @@ def _unreachable(space: Space, of: DesignProblem, home: Floats, units: Ints) -> 
 def ordered(
     space: Space,
     of: DesignProblem,
-    home: Floats,
-    counts: Ints,
+    home: Floats,  # (n,) joints of the reference pose, from which all units are reached, rad
+    counts: Ints,  # (K,) how often each unit is taken
     rng: np.random.Generator,
     how: Ordering,
 ) -> Ordered:
-    """Name the poses of the chosen units p1, p2, ..., and put their readings in order.
-
-    Args:
-        home: (n,) joints of the reference pose, from which all units are reached, rad.
-        counts: (K,) how often each unit is taken.
-    """
+    """Name the poses of the chosen units p1, p2, ..., and put their readings in order."""
     taken = np.flatnonzero(counts)
     poses = sorted({of.what[k][0] for k in taken})
     name = {pose: f"p{k}" for k, pose in enumerate(poses, start=1)}

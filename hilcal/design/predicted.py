@@ -18,25 +18,17 @@ class PredictedUncertainty:
 
     Twice: with the model complete, as identification will state them, and with the potential
     terms, as they are where any of those effects is there and has to be estimated as well.
-
-    Attributes:
-        names: of the model's live parameters, as identification prints them.
-        values: at which they are assumed, SI.
-        std: with the model complete, SI; infinite where not identifiable.
-        std_open: with the potential terms, SI.
-        position: with the model complete, RMS where the robot will work, m; None without any.
-        position_open: the same with the potential terms.
-        positions: (T,) per such pose, with the model complete.
     """
 
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the model's live parameters, as identification prints them
     units: tuple[str, ...]
-    values: Floats
-    std: Floats
-    std_open: Floats
+    values: Floats  # at which they are assumed, SI
+    std: Floats  # with the model complete, SI; infinite where not identifiable
+    std_open: Floats  # with the potential terms, SI
+    # with the model complete, RMS where the robot will work, m; None without any
     position: float | None
-    position_open: float | None
-    positions: Floats
+    position_open: float | None  # the same with the potential terms
+    positions: Floats  # (T,) per such pose, with the model complete
 
     def by_name(self) -> dict[str, float]:
         """Standard uncertainties with the model complete, SI."""
@@ -45,17 +37,13 @@ class PredictedUncertainty:
 
 def predicted(
     problem: DesignProblem,
-    counts: Floats | None = None,
+    counts: Floats | None = None,  # (K,) how often each unit is taken
     *,
+    # (P, P) instead, prior included; of the prior alone where neither is given
     information: Floats | None = None,
     work: PredictionPoses | None = None,
 ) -> PredictedUncertainty:
-    """Predict the standard uncertainties that a plan reaches.
-
-    Args:
-        counts: (K,) how often each unit is taken.
-        information: (P, P) instead, prior included; of the prior alone where neither is given.
-    """
+    """Predict the standard uncertainties that a plan reaches."""
     if information is None:
         information = problem.prior if counts is None else problem.information(counts)
     size = problem.model_size
@@ -87,9 +75,8 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
     Directions of the flat parameters that move all data together by less than 0.2 σ at an
     ordinary magnitude (see `regression.normal_equations`) are left out.
 
-    Args:
-        information: (P, P) by parameters in ordinary magnitudes, prior included.
-        flat: (P,) which of them have no prior.
+    information: (P, P) by parameters in ordinary magnitudes, prior included; flat: (P,) which of
+    them have no prior.
 
     Returns:
         (P, P) covariance, and (P, U) unit directions that were left out.
@@ -114,10 +101,9 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
 def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:
     """Return (T,) standard deviations of positions, m; infinite where not determined.
 
-    Args:
-        covariance: (L, L) of the model's live parameters.
-        null: (L, U) directions that were left out: a position that one of them moves at an
-            ordinary magnitude by a tenth of its standard deviation is not determined.
+    covariance: (L, L) of the model's live parameters; null: (L, U) directions that were left out: a
+    position that one of them moves at an ordinary magnitude by a tenth of its standard deviation is
+    not determined.
     """
     std = work.std(covariance)
     unseen = np.linalg.norm(work.derivative @ null, axis=(1, 2))

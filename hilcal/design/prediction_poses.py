@@ -23,27 +23,18 @@ _SEED = 20240608
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PredictionPoses:
-    """T states at which the position, or the deflection, is predicted.
+    """T states at which the position, or the deflection, is predicted."""
 
-    Attributes:
-        q: (T, n) joint angles, rad.
-        wrench: (T, 6) at the load point, base axes, N and N·m.
-        deflection: whether it is the change from the unloaded position that is predicted.
-        derivative: (T, 3, L) V, by the model's live parameters in their scales, m.
-        what: in words, e.g. "deflection under 5kg at 100 poses".
-    """
-
-    q: Floats
-    wrench: Floats
-    deflection: bool
-    derivative: Floats
-    what: str
+    q: Floats  # (T, n) joint angles, rad
+    wrench: Floats  # (T, 6) at the load point, base axes, N and N·m
+    deflection: bool  # whether it is the change from the unloaded position that is predicted
+    derivative: Floats  # (T, 3, L) V, by the model's live parameters in their scales, m
+    what: str  # in words, e.g. "deflection under 5kg at 100 poses".
 
     def std(self, covariance: Floats) -> Floats:
         """Return (T,) standard deviations of the position, sqrt(tr(V Cov Vᵀ)), m.
 
-        Args:
-            covariance: (L, L) of the model's live parameters, in their scales.
+        covariance: (L, L) of the model's live parameters, in their scales.
         """
         variance = np.einsum("tip,pq,tiq->t", self.derivative, covariance, self.derivative)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
@@ -51,23 +42,15 @@ class PredictionPoses:
 
 def prediction_poses(
     nominal: NominalModel,
-    config: CellConfig,
-    feasible: Floats,
+    config: CellConfig,  # `[planning] work_*`, loads
+    feasible: Floats,  # (N, n) states that are feasible, rad; test poses are drawn from them
+    # predicate of feasible states (N, n), for a box that needs more of them
     may: Callable[[Floats], Bools] | None = None,
 ) -> PredictionPoses:
     """Return the test poses of `[planning]`: named, within a box, or of the candidates.
 
     In deflections it is the deflection under `work_load` that is predicted; under "none" there
     is no deflection, and it is that under each of the loads in turn.
-
-    Args:
-        config: `[planning] work_*`, loads.
-        feasible: (N, n) states that are feasible, rad; test poses are drawn from them.
-        may: predicate of feasible states (N, n), for a box that needs more of them.
-
-    Raises:
-        InputError: joint vectors of the wrong length; no load to work under.
-        CannotAnswerError: no feasible pose with the target in the box; no feasible state.
     """
     q, where = _poses(nominal, config, feasible, may)
     cell, planning = nominal.cell, config.planning
@@ -96,10 +79,8 @@ def position_derivative(
 ) -> Floats:
     """Return the derivative (T, 3, P) of what is predicted, m.
 
-    Args:
-        nominal: the model, whose live parameters come first.
-        more: effects that are not in the model.
-        scale: (P,) what one unit of each parameter is, SI.
+    nominal: the model, whose live parameters come first; more: effects that are not in the model;
+    scale: (P,) what one unit of each parameter is, SI.
     """
     model, count = nominal.model, len(scale) - len(nominal.live)
     live = np.concatenate([nominal.live, model.size + np.arange(count)])

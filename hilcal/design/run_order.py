@@ -34,28 +34,19 @@ _ALL = 6  # loads up to which every order is tried
 
 @dataclass(frozen=True, slots=True)
 class PlannedStop:
-    """A reading at a pose under the load of its block.
+    """A reading at a pose under the load of its block."""
 
-    Attributes:
-        pose: index from 1; 0 is the reference.
-    """
-
-    pose: int
+    pose: int  # index from 1; 0 is the reference
     cycle: int
 
 
 @dataclass(frozen=True, slots=True)
 class LoadBlock:
-    """What is measured while one load hangs.
-
-    Attributes:
-        loops: stops of each loop from the reference.
-        seconds: what the loops take, s.
-    """
+    """What is measured while one load hangs."""
 
     load: str
-    loops: tuple[tuple[PlannedStop, ...], ...]
-    seconds: float
+    loops: tuple[tuple[PlannedStop, ...], ...]  # stops of each loop from the reference
+    seconds: float  # what the loops take, s
 
     @property
     def count(self) -> int:
@@ -65,15 +56,10 @@ class LoadBlock:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ways:
-    """Ways under one load between the reference, index 0, and P poses.
+    """Ways under one load between the reference, index 0, and P poses."""
 
-    Attributes:
-        direct: (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear.
-        seconds: the same, or by the reference with a reading there where that is needed.
-    """
-
-    direct: Floats
-    seconds: Floats
+    direct: Floats  # (P + 1, P + 1) seconds of straight motions, `NEVER` where none is known clear
+    seconds: Floats  # the same, or by the reference with a reading there where that is needed
 
     def among(self, which: Ints) -> "Ways":
         """Return the ways between the reference and some stops, poses (m,) from 1.
@@ -86,61 +72,42 @@ class Ways:
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """Readings to take at a pose.
-
-    Attributes:
-        loads: under which loads, "none" among them where it is measured unloaded.
-        count: how often all of it; each time is a cycle of its own.
-    """
+    """Readings to take at a pose."""
 
     pose: str
-    loads: tuple[str, ...]
-    count: int = 1
+    loads: tuple[str, ...]  # under which loads, "none" among them where it is measured unloaded
+    count: int = 1  # how often all of it; each time is a cycle of its own
 
 
 @dataclass(frozen=True, slots=True)
 class Ordering:
-    """How to order.
+    """How to order."""
 
-    Attributes:
-        slack: share of the shortest campaign that may be spent on a random order; 0 for the
-            shortest order. With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and
-            no further for 30 %.
-        unloaded: "around" takes half of the unloaded readings before the loads and half after,
-            "first" all before: deflections are then known while the loads are measured.
-        reference_every_s: longest time between two readings at the reference pose, s.
-        repeats: poses that are measured unloaded a second time, for the arm's repeatability.
-        draws: random orders of which the least confounded is taken.
-        drift: rate of the drift that figures are stated for, in one coordinate, m/s. There is
-            no figure for all cells; 20 µm/h is a tenth of the drift that the effect
-            `tracker_drift` takes as ordinary in a campaign of an hour.
-        reading_std: standard uncertainty of a reading in one coordinate, m.
-    """
-
+    # share of the shortest campaign that may be spent on a random order; 0 for the shortest order.
+    # With 40 poses and four loads ρ falls from 0.64 to 0.14 for 2 %, and no further for 30 %.
     slack: float = 0.05
+    # "around" takes half of the unloaded readings before the loads and half after, "first" all
+    # before: deflections are then known while the loads are measured
     unloaded: Literal["around", "first"] = "around"
-    reference_every_s: float = 900.0
-    repeats: int = 2
-    draws: int = 16
+    reference_every_s: float = 900.0  # longest time between two readings at the reference pose, s
+    repeats: int = 2  # poses that are measured unloaded a second time, for the arm's repeatability
+    draws: int = 16  # random orders of which the least confounded is taken
+    # rate of the drift that figures are stated for, in one coordinate, m/s. There is no figure for
+    # all cells; 20 µm/h is a tenth of the drift that the effect `tracker_drift` takes as ordinary
+    # in a campaign of an hour.
     drift: float = 20e-6 / 3600
-    reading_std: float = 15e-6
+    reading_std: float = 15e-6  # standard uncertainty of a reading in one coordinate, m
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ordered:
-    """A plan and what its order costs and loses.
+    """A plan and what its order costs and loses."""
 
-    Attributes:
-        plan: the plan; `about` holds these figures too.
-        shortest: of the shortest order with the same readings.
-        confounding_shortest: of the shortest order.
-    """
-
-    plan: Plan
+    plan: Plan  # the plan; `about` holds these figures too
     duration: Duration
-    shortest: Duration
+    shortest: Duration  # of the shortest order with the same readings
     confounding: Confounding
-    confounding_shortest: Confounding
+    confounding_shortest: Confounding  # of the shortest order
 
     @property
     def longer(self) -> float:
@@ -151,9 +118,9 @@ class Ordered:
 def order_plan(
     cell: Cell,
     config: CellConfig,
-    names: Sequence[str],
-    q: Floats,
-    reference: Floats,
+    names: Sequence[str],  # (P) names of poses
+    q: Floats,  # (P, n) their joint angles, rad
+    reference: Floats,  # (n,) joint angles of the reference pose, rad
     chosen: Sequence[Chosen],
     passable: Passable,
     rng: np.random.Generator,
@@ -178,15 +145,6 @@ def order_plan(
       walks through the orders, loops in random order and direction. Of some draws the one with
       the least ρ is taken (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263): the
       order stays random towards everything that is no regressor, such as temperatures.
-
-    Args:
-        names: (P) names of poses.
-        q: (P, n) their joint angles, rad.
-        reference: (n,) joint angles of the reference pose, rad.
-
-    Raises:
-        InputError: nothing is chosen, or a name is unknown.
-        CannotAnswerError: a pose cannot be reached from the reference under a load.
     """
     how = how or Ordering()
     _check(config, names, chosen, how)
@@ -270,25 +228,17 @@ def stops_of(
 
 @dataclass(slots=True)
 class OrderDraws:
-    """Plans of the same readings in different orders: short ones and random ones.
-
-    Attributes:
-        config: its loads, motion and acquisition.
-        names: (P) names of the poses that are measured.
-        q: (P + 1, n) joint angles of the reference and of these, rad.
-        stops: by load.
-        ways: between the stops under each load.
-        short: shortest order of the stops under each load, counted from 1.
-    """
+    """Plans of the same readings in different orders: short ones and random ones."""
 
     cell: Cell
-    config: CellConfig
-    names: tuple[str, ...]
-    q: Floats
+    config: CellConfig  # its loads, motion and acquisition
+    names: tuple[str, ...]  # (P) names of the poses that are measured
+    q: Floats  # (P + 1, n) joint angles of the reference and of these, rad
     how: Ordering
     rng: np.random.Generator
-    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)
-    ways: dict[str, Ways] = field(default_factory=dict)
+    stops: dict[str, list[PlannedStop]] = field(default_factory=dict)  # by load
+    ways: dict[str, Ways] = field(default_factory=dict)  # between the stops under each load
+    # shortest order of the stops under each load, counted from 1
     short: dict[str, list[int]] = field(default_factory=dict)
 
     @property
@@ -327,9 +277,8 @@ class OrderDraws:
     def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
         """Return the plan for an order of the stops under each load.
 
-        Args:
-            half: whether the second half of the unloaded order comes after the loads.
-            mixed: whether loops come in random order and direction.
+        half: whether the second half of the unloaded order comes after the loads; mixed: whether
+        loops come in random order and direction.
         """
         loads = [load for load in self.stops if load != UNLOADED]
         free = list(orders.get(UNLOADED, ()))
@@ -411,10 +360,8 @@ class OrderDraws:
 def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR) -> Ways:
     """Return the ways between poses under a load.
 
-    Args:
-        q: (P + 1, n) joint angles, rad; the reference first.
-        load: name of the load that hangs.
-        near: neighbours to which motions are tested; the nearest in time.
+    q: (P + 1, n) joint angles, rad; the reference first; load: name of the load that hangs; near:
+    neighbours to which motions are tested; the nearest in time.
     """
     legs = pace.legs(q, q)
     count = len(q)

@@ -26,8 +26,7 @@ COMPARED = ("D", "A", "E", "K", "I")
 """Criteria of the comparison: all but T-optimality, which needs suspects."""
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
 """Budgets of the sample-size curve by the plan's own. A choice."""
-WORTH = 0.9
-"""Efficiency of a plan below which it is said what another one would give; a choice."""
+WORTH = 0.9  # Efficiency of a plan below which it is said what another one would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
@@ -112,43 +111,29 @@ class CurvePoint:
 
 @dataclass(frozen=True, slots=True)
 class PlanSummary:
-    """Cost, predicted precision and efficiency of a plan.
+    """Cost, predicted precision and efficiency of a plan."""
 
-    Attributes:
-        poses: number of poses beside the reference.
-        readings: of all, those at the reference included.
-        loads: readings by load, "none" among them, in the order in which they are hung.
-        efficiency: certified lower bound of the efficiency; None without a certificate.
-        parameters: predicted precision by parameter.
-        position_std_m: RMS standard uncertainty of the prediction at the prediction poses, m; None
-            without. It is not the accuracy of the robot, see `position_note`.
-        position: what is predicted there, e.g. "deflection under 5kg at 100 poses".
-        criteria: criterion comparison, the plan's own among them.
-        curve: sample-size curve, fewest poses first.
-        detectable: minimum detectable effects.
-        longer: share of time beyond the shortest order.
-        confounding: of the plan's order with a linear drift; None where it is not known.
-        shortest: confounding of the shortest order.
-        remarks: assumptions and omissions, one sentence each.
-        asked_poses: poses that were asked for, see `planner.Request`; None where readings were.
-    """
-
-    poses: int
-    readings: int
+    poses: int  # number of poses beside the reference
+    readings: int  # of all, those at the reference included
+    # readings by load, "none" among them, in the order in which they are hung
     loads: dict[str, int]
     duration: Duration
     criterion: str
-    efficiency: float | None
-    parameters: tuple[PredictedParameter, ...]
+    efficiency: float | None  # certified lower bound of the efficiency; None without a certificate
+    parameters: tuple[PredictedParameter, ...]  # predicted precision by parameter
+    # RMS standard uncertainty of the prediction at the prediction poses, m; None without. It is not
+    # the accuracy of the robot, see `position_note`.
     position_std_m: float | None
-    position: str = ""
-    criteria: tuple[CriterionResult, ...] = ()
-    curve: tuple[CurvePoint, ...] = ()
-    detectable: tuple[DetectableEffect, ...] = ()
-    longer: float = 0.0
+    position: str = ""  # what is predicted there, e.g. "deflection under 5kg at 100 poses".
+    criteria: tuple[CriterionResult, ...] = ()  # criterion comparison, the plan's own among them
+    curve: tuple[CurvePoint, ...] = ()  # sample-size curve, fewest poses first
+    detectable: tuple[DetectableEffect, ...] = ()  # minimum detectable effects
+    longer: float = 0.0  # share of time beyond the shortest order
+    # of the plan's order with a linear drift; None where it is not known
     confounding: Confounding | None = None
-    shortest: Confounding | None = None
-    remarks: tuple[str, ...] = ()
+    shortest: Confounding | None = None  # confounding of the shortest order
+    remarks: tuple[str, ...] = ()  # assumptions and omissions, one sentence each
+    # poses that were asked for, see `planner.Request`; None where readings were
     asked_poses: int | None = None
 
     @property
@@ -200,15 +185,10 @@ def summarise(
     rng: np.random.Generator,
     say: Say = lambda words: None,
     *,
-    compare: bool = True,
-    curve: bool = True,
+    compare: bool = True,  # whether to compute the criterion comparison
+    curve: bool = True,  # whether to compute the sample-size curve
 ) -> PlanSummary:
-    """Return the summary of a plan.
-
-    Args:
-        compare: whether to compute the criterion comparison.
-        curve: whether to compute the sample-size curve.
-    """
+    """Return the summary of a plan."""
     plan, knows = planned.ordered.plan, planned.predicted
     if compare or curve:
         say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")

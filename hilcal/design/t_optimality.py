@@ -18,19 +18,12 @@ _FELT = 1e-5  # weight from which a pair enters the curvature
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """An effect that is there, and the parameters that are fitted in its place.
+    """An effect that is there, and the parameters that are fitted in its place."""
 
-    Attributes:
-        effect: (E,) indices of the effect's parameters.
-        beta: (E,) their values.
-        nuisance: (F,) indices of the parameters of the model and of the rival effect.
-        name: for messages where no candidate separates the two.
-    """
-
-    effect: Ints
-    beta: Floats
-    nuisance: Ints
-    name: str = "an effect from its rival"
+    effect: Ints  # (E,) indices of the effect's parameters
+    beta: Floats  # (E,) their values
+    nuisance: Ints  # (F,) indices of the parameters of the model and of the rival effect
+    name: str = "an effect from its rival"  # for messages where no candidate separates the two
 
     def __post_init__(self) -> None:
         """Refuse indices and values that do not belong together."""
@@ -48,8 +41,7 @@ class Pair:
         u has β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β is the minimum of
         vᵀ M v over all v with β at the effect, with S the Schur complement of the nuisance.
 
-        Args:
-            m: (P, P) information M.
+        m: (P, P) information M.
         """
         u = np.zeros(len(m))
         u[self.effect] = self.beta
@@ -63,12 +55,9 @@ class Separate(Criterion):
     What an effect of the size β adds to the sum of squares beyond what the model and its rival
     can explain; the power of the test between the two grows with it. Atkinson & Fedorov (1975),
     Biometrika 62(1), T-optimality, for linear rivals.
-
-    Attributes:
-        pairs: what is to be separated.
     """
 
-    pairs: tuple[Pair, ...]
+    pairs: tuple[Pair, ...]  # what is to be separated
     name = "separate"
     monotone = True
     kinked = True
@@ -236,9 +225,7 @@ def condensed(
     are dropped: as a nuisance they explain nothing, as an effect they show nothing. Every
     non-centrality of every plan stays what it is.
 
-    Args:
-        units: what can be taken, by the P parameters.
-        prior: (P, P) what is known before.
+    units: what can be taken, by the P parameters; prior: (P, P) what is known before.
     """
     model = pairs[0].nuisance
     for pair in pairs:

@@ -16,26 +16,17 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class Pace:
-    """What motions, readings and load changes take.
+    """What motions, readings and load changes take."""
 
-    Attributes:
-        speed: of the leading joint, rad/s.
-        acceleration: of the leading joint, rad/s².
-        reading_s: seconds at rest for one step: the readings of all targets.
-        change_s: seconds that a person needs for another load.
-    """
-
-    speed: float
-    acceleration: float
-    reading_s: float
-    change_s: float
+    speed: float  # of the leading joint, rad/s
+    acceleration: float  # of the leading joint, rad/s²
+    reading_s: float  # seconds at rest for one step: the readings of all targets
+    change_s: float  # seconds that a person needs for another load
 
     def legs(self, starts: Floats, ends: Floats) -> Floats:
         """Return (N, M) seconds of straight motions; `route.duration` for many.
 
-        Args:
-            starts: (N, n) joint angles, rad.
-            ends: (M, n) joint angles, rad.
+        starts: (N, n) joint angles, rad; ends: (M, n) joint angles, rad.
         """
         way = np.abs(starts[:, None] - ends[None]).max(axis=-1, initial=0.0)
         long = way / self.speed + self.speed / self.acceleration
@@ -45,16 +36,11 @@ class Pace:
 
 @dataclass(frozen=True, slots=True)
 class Duration:
-    """Seconds of a campaign.
-
-    Attributes:
-        readings: at rest.
-        load_changes: by hand.
-    """
+    """Seconds of a campaign."""
 
     motion: float
-    readings: float
-    load_changes: float
+    readings: float  # at rest
+    load_changes: float  # by hand
 
     @property
     def total(self) -> float:
@@ -81,8 +67,7 @@ def pace(config: CellConfig) -> Pace:
 def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, Floats]:
     """Return the duration of a plan and (S,) the middle of each step's reading, s.
 
-    Args:
-        margin: distance kept from the joint limits, rad.
+    margin: distance kept from the joint limits, rad.
     """
     stops = route(plan, arm, margin)
     motion = readings = changes = 0.0
@@ -105,32 +90,23 @@ class Confounding:
     """Time against what the model explains, and the error that a linear drift makes.
 
     A deflection's lag is the time from its unloaded to its loaded reading.
-
-    Attributes:
-        deflections: number of deflections outside the reference pose; 0 where none is planned,
-            and what follows is then of the readings and their time.
-        correlation: the largest |correlation| ρ of the lag with a regressor; ρ² is the share of
-            its information that a parameter with this regressor loses where a drift has to be
-            estimated as well.
-        regressor: which one, e.g. "fz cos q3".
-        lag_mean_s: mean lag, s; a constant drift times this is what all deflections have in
-            common.
-        lag_rms_s: root mean square of the lag, s.
-        drift: rate of the stated drift in one coordinate, m/s.
-        error_m: rms error of a deflection from that drift, m.
-        bias_m: mean error, m.
-        drift_std: standard uncertainty of a drift rate estimated from the readings at the reference
-            pose, in one coordinate, m/s; None where they do not determine it.
     """
 
+    # number of deflections outside the reference pose; 0 where none is planned, and what follows is
+    # then of the readings and their time
     deflections: int
+    # the largest |correlation| ρ of the lag with a regressor; ρ² is the share of its information
+    # that a parameter with this regressor loses where a drift has to be estimated as well
     correlation: float
-    regressor: str
+    regressor: str  # which one, e.g. "fz cos q3".
+    # mean lag, s; a constant drift times this is what all deflections have in common
     lag_mean_s: float
-    lag_rms_s: float
-    drift: float
-    error_m: float
-    bias_m: float
+    lag_rms_s: float  # root mean square of the lag, s
+    drift: float  # rate of the stated drift in one coordinate, m/s
+    error_m: float  # rms error of a deflection from that drift, m
+    bias_m: float  # mean error, m
+    # standard uncertainty of a drift rate estimated from the readings at the reference pose, in one
+    # coordinate, m/s; None where they do not determine it
     drift_std: float | None
 
     @property
@@ -160,10 +136,10 @@ class Confounding:
 
 def confounding(
     plan: Plan,
-    times: Floats,
-    wrenches: Mapping[str, Floats],
+    times: Floats,  # (S,) of the steps, s
+    wrenches: Mapping[str, Floats],  # (6,) by load
     drift: float,
-    reading_std: float,
+    reading_std: float,  # standard uncertainty of a reading in one coordinate, m
 ) -> Confounding:
     """Return how a plan's time is confounded with its joints and loads.
 
@@ -178,11 +154,6 @@ def confounding(
     Without deflections it is the centred correlation of t with the cos, the sin and the wrench.
     A slope fitted to readings of standard uncertainty σ at the reference pose, each load with
     its own mean, has the variance σ²/Σ(t - t̄)².
-
-    Args:
-        times: (S,) of the steps, s.
-        wrenches: (6,) by load.
-        reading_std: standard uncertainty of a reading in one coordinate, m.
     """
     when = dict(zip(plan.steps, times.tolist(), strict=True))
     unloaded = {(s.pose, s.cycle): t for s, t in when.items() if s.load == UNLOADED}

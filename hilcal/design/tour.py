@@ -11,8 +11,7 @@ import numpy as np
 
 from hilcal.types import Floats, Ints
 
-NEVER = 1e7
-"""Seconds of a way that does not exist: more than any campaign, so that sums stay exact."""
+NEVER = 1e7  # Seconds of a way that does not exist: more than any campaign, so that sums stay exact
 _EXACT = 7  # stops up to which every order is tried
 _LONGEST = 3  # stops of a segment that is moved as one
 _GAIN = 1e-9  # s, below which a change is rounding
@@ -30,8 +29,7 @@ def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list
     Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again
     after each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
 
-    Args:
-        seconds: (m + 1, m + 1), also asymmetric.
+    seconds: (m + 1, m + 1), also asymmetric.
     """
     count = len(seconds) - 1
     if count <= _EXACT:
@@ -142,9 +140,7 @@ def shaken(
     Turns and moves are as probable as their inverses, so that a long walk comes to every order
     within the budget that it can reach with the same probability.
 
-    Args:
-        seconds: (m + 1, m + 1).
-        budget: s.
+    seconds: (m + 1, m + 1); budget: s.
     """
     way = [0, *order, 0]
     here, count = length(seconds, order), len(order)
@@ -184,10 +180,8 @@ def loops(
     cluster second): T(j) = min over i of T(i) + loop(i + 1 … j). A loop of one stop is always
     allowed.
 
-    Args:
-        direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear.
-        reading_s: s at each stop and at the reference.
-        limit_s: s from leaving the reference to coming back.
+    direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear; reading_s: s at each stop
+    and at the reference; limit_s: s from leaving the reference to coming back.
 
     Returns:
         The loops in order; None where there is no such tour.

@@ -24,22 +24,15 @@ SHARE = 0.1
 
 @dataclass(frozen=True, slots=True)
 class UndeterminedParameter:
-    """A parameter that is left out of a plan.
+    """A parameter that is left out of a plan."""
 
-    Attributes:
-        name: as identification prints it, e.g. "joint_compliance.j1".
-        unit: SI.
-        value: at which it is assumed, SI.
-        confounded: other parameters that the readings do not separate it from; none where no
-            reading changes with it at all.
-        joint: "joint 1" or "joints 1-2" where it is the compliance of these; else empty.
-    """
-
-    name: str
-    unit: str
-    value: float
+    name: str  # as identification prints it, e.g. "joint_compliance.j1".
+    unit: str  # SI
+    value: float  # at which it is assumed, SI
+    # other parameters that the readings do not separate it from; none where no reading changes with
+    # it at all
     confounded: tuple[str, ...] = ()
-    joint: str = ""
+    joint: str = ""  # "joint 1" or "joints 1-2" where it is the compliance of these; else empty
 
     @property
     def remark(self) -> str:
@@ -76,9 +69,6 @@ def without_undetermined(
     A parameter without a prior is left out where all candidates together change by less than
     `regression.normal_equations.INFORMATION` with an ordinary magnitude of it; of those that are
     confounded with each other as many as it takes.
-
-    Raises:
-        CannotAnswerError: the candidates determine none of them.
     """
     size = of.model_size
     every = of.prior + of.units.information(np.ones(len(of.units)))

@@ -183,12 +183,9 @@ def different(a: Factor, b: Factor) -> bool:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Composed(Variable):
-    """A weighted sum of products, as a quantity.
+    """A weighted sum of products, as a quantity."""
 
-    Attributes:
-        terms: (weight, product); the first weight is 1, and all products have one unit.
-    """
-
+    # (weight, product); the first weight is 1, and all products have one unit
     terms: tuple[tuple[float, Amplitude], ...] = ()
 
     def read(self, s: Situation) -> Floats:
@@ -219,8 +216,7 @@ class Composed(Variable):
 def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
     """Return the quantity of a weighted sum of products.
 
-    Args:
-        terms: (weight, product); the first weight is 1, and all products have one unit.
+    terms: (weight, product); the first weight is 1, and all products have one unit.
     """
     products = [a for _, a in terms]
     slots = [f.variable.slot for a in products for f in a.factors if f.variable.slot is not None]

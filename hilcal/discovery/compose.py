@@ -32,20 +32,15 @@ if TYPE_CHECKING:
 
 BEST, EXTENDED = 10, 3
 """Bends that are extended, and further products that are tried of each; a choice, by time."""
-LARGEST_SUM = 3
-"""Products of a sum at most; a choice."""
-QUANTITIES = 2
-"""Recorded quantities of an argument at most; a choice: sums of more are too many."""
-REFINED = 2
-"""Functions of single products, and of sums, that are refined; a choice, by time."""
+LARGEST_SUM = 3  # Products of a sum at most; a choice
+QUANTITIES = 2  # Recorded quantities of an argument at most; a choice: sums of more are too many
+REFINED = 2  # Functions of single products, and of sums, that are refined; a choice, by time
 QUANTILES = tuple(k / 20 for k in range(1, 20))
 TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)
 """Levels, and weights by that of the linearisation, that are tried; a choice."""
-EVALUATIONS = 60
-"""Of the sum of squares, for each number that is refined; a choice."""
+EVALUATIONS = 60  # Of the sum of squares, for each number that is refined; a choice
 DIGITS = 3
-LEFT = 1e-3
-"""Share of a column's square that others must leave; a choice."""
+LEFT = 1e-3  # Share of a column's square that others must leave; a choice
 WORST = 1e12
 POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
 LEAST_POWER, MOST_POWER = 0.5, 4.0
@@ -56,25 +51,15 @@ LOG2 = float(np.log(2.0))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Bent:
-    """A function of a composed quantity at a site.
+    """A function of a composed quantity at a site."""
 
-    Attributes:
-        s: the site.
-        which: products of the argument, by index in the grammar.
-        weights: of these; the first is 1.
-        shape: the function.
-        numbers: of it.
-        evidence: logarithm, without what the search costs.
-        price: what the choice of the argument costs.
-    """
-
-    s: int
-    which: tuple[int, ...]
-    weights: tuple[float, ...]
-    shape: Shape
-    numbers: tuple[float, ...]
-    evidence: float
-    price: float
+    s: int  # the site
+    which: tuple[int, ...]  # products of the argument, by index in the grammar
+    weights: tuple[float, ...]  # of these; the first is 1
+    shape: Shape  # the function
+    numbers: tuple[float, ...]  # of it
+    evidence: float  # logarithm, without what the search costs
+    price: float  # what the choice of the argument costs
 
     @property
     def odds(self) -> float:

@@ -22,10 +22,8 @@ from hilcal.types import Floats
 
 MOST_CURVES = 3
 BINS = 12
-LINE = 101
-"""Points of the drawn law; a choice, as the two above."""
-MOST_POINTS = 2000
-"""Readings that are drawn at most; a choice, by memory."""
+LINE = 101  # Points of the drawn law; a choice, as the two above
+MOST_POINTS = 2000  # Readings that are drawn at most; a choice, by memory
 LEAST = 0.02
 """Readings whose other factors are a smaller share of the largest say nothing of the curve; a
 choice."""
@@ -33,38 +31,24 @@ choice."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Curve:
-    """A law over one quantity.
+    """A law over one quantity."""
 
-    Attributes:
-        site: where it acts.
-        of: symbol of what is drawn: the site's motion, over the other factors.
-        unit: of it, SI.
-        quantity: symbol of the quantity.
-        quantity_unit: SI; "1" for a number.
-        x: (P,) the quantity at readings.
-        y: (P,) what each reading by itself says.
-        std: (P,) its standard deviation by the noise.
-        binned: (4, B) mean of x, mean of y, its standard deviation, number of readings.
-        line: (2, L) quantity and law.
-    """
-
-    site: str
-    of: str
-    unit: str
-    quantity: str
-    quantity_unit: str
-    x: Floats
-    y: Floats
-    std: Floats
-    binned: Floats
-    line: Floats
+    site: str  # where it acts
+    of: str  # symbol of what is drawn: the site's motion, over the other factors
+    unit: str  # of it, SI
+    quantity: str  # symbol of the quantity
+    quantity_unit: str  # SI; "1" for a number
+    x: Floats  # (P,) the quantity at readings
+    y: Floats  # (P,) what each reading by itself says
+    std: Floats  # (P,) its standard deviation by the noise
+    binned: Floats  # (4, B) mean of x, mean of y, its standard deviation, number of readings
+    line: Floats  # (2, L) quantity and law
 
 
 def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]:
     """Return the curves of a law, those of its surest parts first.
 
-    Args:
-        after: a fit whose last effect is the law.
+    after: a fit whose last effect is the law.
     """
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]

@@ -56,65 +56,44 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """
 LEAST_SHARE = 0.1
 """Share of the misfit on poses left out that a law must explain, searched for without them."""
-NEAR = 0.7
-"""Cosine from which an effect of the catalogue is named as resembling; a choice."""
+NEAR = 0.7  # Cosine from which an effect of the catalogue is named as resembling; a choice
 
 
-MOST_RIVALS = 2
-"""Alternatives that can be written as effects; a choice: `next` separates few."""
+MOST_RIVALS = 2  # Alternatives that can be written as effects; a choice: `next` separates few
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FoldSearch:
-    """What the search without each fold came to.
+    """What the search without each fold came to."""
 
-    Attributes:
-        share: of the misfit of the poses left out that its laws explain.
-        sure: whether their error falls by more than it scatters from pose to pose.
-        found: the laws of each fold; empty where it proposes none.
-    """
-
-    share: float
-    sure: bool
-    found: tuple[Selection | None, ...]
+    share: float  # of the misfit of the poses left out that its laws explain
+    sure: bool  # whether their error falls by more than it scatters from pose to pose
+    found: tuple[Selection | None, ...]  # the laws of each fold; empty where it proposes none
 
 
 @dataclass(frozen=True, eq=False)
 class Discovery(Shown):
-    """What the search for laws came to.
+    """What the search for laws came to."""
 
-    Attributes:
-        fit: the fit whose misfit it explains.
-        reason: why there are laws, or none.
-        laws: simplest first of those that predict as well as any.
-        attainable: share of the misfit that anything recorded predicts on poses left out.
-        searched_share: that of the laws that the search without each pose finds.
-        catalogue: effects of the catalogue that explain the misfit, where they do.
-        candidates: number of candidates that were tried.
-        after: the fit with the first law.
-        source: of the first law's effect, as a Python file.
-        curves: the first law over what it depends on, with the readings.
-        carried: where no law is found, recorded variables that the misfit depends on.
-        refused: laws that predict the misfit and are not proposed, and why: their exact refits
-            failed.
-        unfitted: effects of the catalogue that the exact model could not be fitted with, and why.
-        structures: likely laws with their posterior probabilities, the likeliest first, and the
-            best of each complexity; see `structures`.
-    """
-
-    fit: Fit
-    reason: Reason
-    laws: tuple[Law, ...] = ()
-    attainable: float = 0.0
-    searched_share: float = 0.0
+    fit: Fit  # the fit whose misfit it explains
+    reason: Reason  # why there are laws, or none
+    laws: tuple[Law, ...] = ()  # simplest first of those that predict as well as any
+    attainable: float = 0.0  # share of the misfit that anything recorded predicts on poses left out
+    searched_share: float = 0.0  # that of the laws that the search without each pose finds
+    # effects of the catalogue that explain the misfit, where they do
     catalogue: tuple[str, ...] = ()
-    candidates: int = 0
-    after: Fit | None = None
-    source: str = ""
-    curves: tuple[Curve, ...] = ()
+    candidates: int = 0  # number of candidates that were tried
+    after: Fit | None = None  # the fit with the first law
+    source: str = ""  # of the first law's effect, as a Python file
+    curves: tuple[Curve, ...] = ()  # the first law over what it depends on, with the readings
+    # where no law is found, recorded variables that the misfit depends on
     carried: tuple[Dependence, ...] = ()
+    # laws that predict the misfit and are not proposed, and why: their exact refits failed
     refused: tuple[tuple[str, str], ...] = ()
+    # effects of the catalogue that the exact model could not be fitted with, and why
     unfitted: tuple[tuple[str, str], ...] = ()
+    # likely laws with their posterior probabilities, the likeliest first, and the best of each
+    # complexity; see `structures`
     structures: tuple[Structure, ...] = ()
 
     def __repr__(self) -> str:
@@ -128,9 +107,6 @@ class Discovery(Shown):
         Returns:
             (D, m) mean over the laws by their probability, and (D, m) standard deviation of the
             prediction with it, without the noise; see `averaged`.
-
-        Raises:
-            CannotAnswerError: there is no law.
         """
         if not self.structures:
             raise CannotAnswerError(f"no law was found ({self.reason}), so none is averaged")
@@ -336,8 +312,7 @@ def _law(
     )
 
 
-FOLDS = 5
-"""As in the regression of the residual; a choice."""
+FOLDS = 5  # As in the regression of the residual; a choice
 RIDGE = 1e-6
 
 
@@ -404,10 +379,8 @@ def agreement(before: Fit, after: Fit, moved: Floats) -> float:
 
     Both are whitened, and what the model without the effect describes is projected out.
 
-    Args:
-        before: the fit without the added effects.
-        after: the fit with more effects, behind those of the first model.
-        moved: (N, 3) by how much the hidden law moves each reading, sensor axes, m.
+    before: the fit without the added effects; after: the fit with more effects, behind those of the
+    first model; moved: (N, 3) by how much the hidden law moves each reading, sensor axes, m.
     """
     linear, w = linearise(before), before.whitening
     truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))

@@ -21,29 +21,21 @@ from hilcal.effects.protocol import Effect
 from hilcal.identification.fit import Fit
 from hilcal.types import Bools, Floats
 
-MOST_SITES = 2
-"""Sites of a law that are drawn, those that it moves most; a choice."""
+MOST_SITES = 2  # Sites of a law that are drawn, those that it moves most; a choice
 SMOOTH = 0.05
 """Von Neumann's ratio below which the law is drawn as a line, above as means in bins; a choice."""
 
-Way = tuple[Variable, Variable | None]
-"""What a law is drawn over, and what it is divided by."""
+Way = tuple[Variable, Variable | None]  # What a law is drawn over, and what it is divided by
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrawnLaw:
-    """An effect of a file in a fitted model.
-
-    Attributes:
-        formula: its summary; that of a proposed law is its formula.
-        acts_on: where it acts, in words.
-        curves: over what it depends on, where a site moves with something recorded.
-    """
+    """An effect of a file in a fitted model."""
 
     name: str
-    formula: str
-    acts_on: tuple[str, ...]
-    curves: tuple[Curve, ...]
+    formula: str  # its summary; that of a proposed law is its formula
+    acts_on: tuple[str, ...]  # where it acts, in words
+    curves: tuple[Curve, ...]  # over what it depends on, where a site moves with something recorded
 
 
 def drawn_laws(fit: Fit) -> tuple[DrawnLaw, ...]:

@@ -20,8 +20,7 @@ def expressions(law: "Law") -> dict[str, str]:
     N), `time` (s) and `air` (air temperature, °C); operators are Python's, functions have numpy's
     names, but for `max`. A site whose law depends on anything else, or has branches, is left out.
 
-    Args:
-        law: as it was discovered.
+    law: as it was discovered.
 
     Returns:
         By the site's symbol in formulas, e.g. {"dq_3": "0.0002*(sin(3 * q4))"}, in the site's unit.

@@ -10,8 +10,7 @@ from hilcal.discovery.amplitudes import Factor
 from hilcal.discovery.variables import Variable
 from hilcal.types import Floats
 
-HARMONICS = 4
-"""Multiples of an angle; as in the diagnosis."""
+HARMONICS = 4  # Multiples of an angle; as in the diagnosis
 FINEST = 512
 """Highest multiple of a joint's angle, as of encoders and gears; a choice. Not more than there are
 poses: each order costs the search, and few poses do not tell hundreds of them apart."""
@@ -29,9 +28,8 @@ def fine_waves(v: Variable, finest: int) -> list[Factor]:
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
     """Return the functions of one quantity, with starting values of their numbers.
 
-    Args:
-        x: (N,) it at the readings.
-        most: complexity of a product; functions that are to be in none have it.
+    x: (N,) it at the readings; most: complexity of a product; functions that are to be in none have
+    it.
     """
     linear = Factor(v, shapes.LINEAR)
     if v.kind in WAVES:

@@ -23,18 +23,14 @@ from hilcal.types import Floats, Ints
 
 MOST = 3
 """Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
-MOST_FACTORS = 2
-"""Factors of a product; a choice, likewise."""
-SOME = 2000
-"""Products that are formed at a time; a choice, for memory."""
-ARGUMENT = 2
-"""Complexity of a product in a composed quantity; a choice, by the number of them."""
+MOST_FACTORS = 2  # Factors of a product; a choice, likewise
+SOME = 2000  # Products that are formed at a time; a choice, for memory
+ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by the number of them
 COMPOSED_OF = {
     "angle", "torque", "load", "gravity", "temperature", "time", "hanging", "place",
 }  # fmt: skip
 """Quantities of which others are composed; a choice: components in joint axes are too many."""
-WAVES_OF_ARGUMENT = 2
-"""Multiples of an angle in a composed quantity; a choice."""
+WAVES_OF_ARGUMENT = 2  # Multiples of an angle in a composed quantity; a choice
 SHAPES = 5
 """Functions of a composed quantity: bends to both sides, the same with an exponent, steps."""
 FLAT = 0.1
@@ -44,27 +40,20 @@ factor's law to within that share. A choice."""
 
 @dataclass(frozen=True, eq=False)
 class Grammar:
-    """All amplitudes that are tried, and their values.
-
-    Attributes:
-        values: (F, N) their values, single precision, each with root mean square 1.
-        size: (F,) what they were divided by.
-        cost: (F,) complexities.
-        partner: (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none.
-        less: (2, F) the amplitude without the first and without the second factor of a product of
-            two; −1 for no product.
-        singles: the functions of one quantity from which products are made.
-    """
+    """All amplitudes that are tried, and their values."""
 
     known: list[Variable]
     amplitudes: tuple[Amplitude, ...]
-    values: Floats
-    size: Floats
-    cost: Ints
+    values: Floats  # (F, N) their values, single precision, each with root mean square 1
+    size: Floats  # (F,) what they were divided by
+    cost: Ints  # (F,) complexities
+    # (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none
     partner: Ints
+    # (2, F) the amplitude without the first and without the second factor of a product of two; −1
+    # for no product
     less: Ints
     situation: Situation
-    singles: tuple[Factor, ...]
+    singles: tuple[Factor, ...]  # the functions of one quantity from which products are made
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)
     _read: dict[str, Floats] = field(default_factory=dict)
 
@@ -214,8 +203,7 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of the functions of the quantities.
 
-    Args:
-        poses: number of poses, which limits the multiples of an angle; see `FINEST`.
+    poses: number of poses, which limits the multiples of an angle; see `FINEST`.
     """
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]
     singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
@@ -261,9 +249,7 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     """Products of pairs of rows, each with root mean square 1, some at a time to save memory.
 
-    Args:
-        value: (C, N) functions.
-        pairs: (F, 2) rows of both factors.
+    value: (C, N) functions; pairs: (F, 2) rows of both factors.
 
     Returns:
         (F', N) products in single precision, (F',) what they were divided by, and which of the

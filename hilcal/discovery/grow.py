@@ -24,14 +24,11 @@ if TYPE_CHECKING:
     from hilcal.discovery.problem import Beside
     from hilcal.discovery.terms import LawTerm, ScreenedTerm
 
-MOST = 4
-"""Complexity of a product; a choice."""
-MOST_FACTORS = 3
-"""Factors of a product; a choice."""
+MOST = 4  # Complexity of a product; a choice
+MOST_FACTORS = 3  # Factors of a product; a choice
 GROWN, VARIED = 12, 24
 """Candidates that are multiplied, and whose numbers are varied; a choice, by time."""
-KEPT = 24
-"""Of either the best that are scored in full; a choice."""
+KEPT = 24  # Of either the best that are scored in full; a choice
 TIMES = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)
 """Values of a number that are tried, by the one of the grid; a choice."""
 QUANTILES = tuple(k / 20 for k in range(1, 20))
@@ -41,8 +38,7 @@ QUANTILES = tuple(k / 20 for k in range(1, 20))
 def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:
     """Return terms of further factors and other numbers.
 
-    Args:
-        best: the best of the screening, best first.
+    best: the best of the screening, best first.
     """
     found = list({(x.s, x.f): x for x in best}.values())
     products = [(x.s, a, 0.0) for x in found[:GROWN] for a in _products(beside, x.s, x.f)]

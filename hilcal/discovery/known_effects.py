@@ -24,27 +24,18 @@ from hilcal.regression.forward_selection import families_beside
 from hilcal.regression.leave_out import left_out_residuals
 from hilcal.types import Floats
 
-MOST_TOGETHER = 6
-"""Effects that are added at most; a choice."""
+MOST_TOGETHER = 6  # Effects that are added at most; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KnownEffects:
-    """The effects of the catalogue beside a fit.
+    """The effects of the catalogue beside a fit."""
 
-    Attributes:
-        names: of those that explain the misfit together, in the order of adding them.
-        odds: that each adds: log evidence less the choice.
-        left: variance factor that the linearisation leaves with each of them.
-        white: (R, P) columns of all that could be added.
-        columns: which are whose.
-    """
-
-    names: tuple[str, ...]
-    odds: tuple[float, ...]
-    left: tuple[float, ...]
-    white: Floats
-    columns: dict[str, slice]
+    names: tuple[str, ...]  # of those that explain the misfit together, in the order of adding them
+    odds: tuple[float, ...]  # that each adds: log evidence less the choice
+    left: tuple[float, ...]  # variance factor that the linearisation leaves with each of them
+    white: Floats  # (R, P) columns of all that could be added
+    columns: dict[str, slice]  # which are whose
 
     @property
     def total(self) -> float:
@@ -72,14 +63,11 @@ def known_effects(fit: Fit) -> KnownEffects:
 
 @dataclass(frozen=True, slots=True)
 class Instead:
-    """What the catalogue has in the place of a law.
+    """What the catalogue has in the place of a law."""
 
-    Attributes:
-        names: effects that explain the misfit as well; none where the law is preferred.
-        unfitted: effects that the exact model could not be fitted with, and why.
-    """
-
+    # effects that explain the misfit as well; none where the law is preferred
     names: tuple[str, ...] = ()
+    # effects that the exact model could not be fitted with, and why
     unfitted: tuple[tuple[str, str], ...] = ()
 
 

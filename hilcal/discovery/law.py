@@ -182,57 +182,38 @@ def coefficients(form: Form, step: Floats, std: Floats) -> tuple[Coefficient, ..
 
 @dataclass(frozen=True, slots=True)
 class Again:
-    """How often a cause was found again.
-
-    Attributes:
-        variables: the quantities that move it.
-        share: share of the searches without some poses that find the same.
-    """
+    """How often a cause was found again."""
 
     acts_on: str
-    variables: tuple[str, ...]
-    share: float
+    variables: tuple[str, ...]  # the quantities that move it
+    share: float  # share of the searches without some poses that find the same
 
 
 @dataclass(frozen=True, slots=True)
 class Resemblance:
-    """An effect of the catalogue, and how near a law is to what it can describe.
-
-    Attributes:
-        cosine: correlation of the law with what the effect predicts of it on poses left out.
-    """
+    """An effect of the catalogue, and how near a law is to what it can describe."""
 
     effect: str
-    cosine: float
+    cosine: float  # correlation of the law with what the effect predicts of it on poses left out
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """A law that the readings speak for.
+    """A law that the readings speak for."""
 
-    Attributes:
-        name: of its effect.
-        form: where it acts, and how.
-        p_value: of the joint test of its columns, times the number of candidates that were tried.
-        odds: logarithm of the odds against no law, the search paid for.
-        holdout_share: share of the misfit that it explains on poses left out.
-        left: variance factor that is left.
-        again: for each site and its quantities, the share of them that find these.
-        probability: posterior, of its structure.
-        resembles: effects of the catalogue that are near, the nearest first.
-        ranges: least and largest of each quantity in the readings.
-    """
-
-    name: str
-    form: Form
+    name: str  # of its effect
+    form: Form  # where it acts, and how
     parameters: tuple[Coefficient, ...]
+    # of the joint test of its columns, times the number of candidates that were tried
     p_value: float
-    odds: float
-    holdout_share: float
-    left: float
-    probability: float
-    resembles: tuple[Resemblance, ...]
+    odds: float  # logarithm of the odds against no law, the search paid for
+    holdout_share: float  # share of the misfit that it explains on poses left out
+    left: float  # variance factor that is left
+    probability: float  # posterior, of its structure
+    resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
+    # least and largest of each quantity in the readings
     ranges: tuple[tuple[str, float, float, str], ...]
+    # for each site and its quantities, the share of them that find these
     again: tuple[Again, ...] = ()
 
     @property

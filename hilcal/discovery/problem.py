@@ -19,15 +19,13 @@ from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints
 
-EXTENDED = 40
-"""Of these, those that are extended to other axes and joints; a choice."""
+EXTENDED = 40  # Of these, those that are extended to other axes and joints; a choice
 
 
 LEFT = 1e-3
 """Share of a column's square that chosen terms must leave for it to count as another; a choice."""
 LOG2 = float(np.log(2.0))
-LOG_ZERO = 2 * LOG2
-"""Price of a free zero of one of two factors: for having one, and for which."""
+LOG_ZERO = 2 * LOG2  # Price of a free zero of one of two factors: for having one, and for which
 LEAST_RIDGE = 1e-6
 """Least ridge of the model's directions, not all of which some rows determine; a choice."""
 
@@ -38,8 +36,7 @@ class SearchProblem:
     def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
         """Refit the model to the rows.
 
-        Args:
-            rows: (R,) those that are used; all by default.
+        rows: (R,) those that are used; all by default.
         """
         linear = screen.linear
         self.screen = screen
@@ -369,12 +366,9 @@ class Beside:
             yield self.term(parts, LOG2, common=True)
 
 
-SHORT_LIST = 200
-"""Candidates that are scored in full at each step; a choice."""
-OF_SITE = 60
-"""Of each site at most; a choice."""
-SPANNED = 1e-9
-"""Directions of chosen columns below this share of the largest are rounding."""
+SHORT_LIST = 200  # Candidates that are scored in full at each step; a choice
+OF_SITE = 60  # Of each site at most; a choice
+SPANNED = 1e-9  # Directions of chosen columns below this share of the largest are rounding
 
 
 def orthonormal(model: Projection, x: Floats) -> Floats:

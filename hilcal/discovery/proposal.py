@@ -15,8 +15,7 @@ from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.whole_file import replace_file
 
-MOST_SEARCHES = 3
-"""Searches of one refinement at most; a choice, by time."""
+MOST_SEARCHES = 3  # Searches of one refinement at most; a choice, by time
 NAME = "found"
 
 
@@ -31,9 +30,8 @@ class LawSearch:
     def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
         """Laws are named after the files that they will be: found.py, found_2.py, ….
 
-        Args:
-            replacing: whether files of these names are removed first, as those of a rehearsal
-                that is repeated; else other names are taken.
+        replacing: whether files of these names are removed first, as those of a rehearsal that is
+        repeated; else other names are taken.
         """
         if replacing:
             for k in range(1, MOST_SEARCHES + 1):
@@ -70,11 +68,7 @@ class LawSearch:
         return self._folder.absolute() / f"{name}.py"
 
     def write(self, names: tuple[str, ...]) -> None:
-        """Write the files of those effects that are proposed laws.
-
-        Raises:
-            InputError: a file cannot be written, or is there by now.
-        """
+        """Write the files of those effects that are proposed laws."""
         for name in names:
             if name not in self._sources:
                 continue

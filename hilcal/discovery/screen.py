@@ -37,8 +37,7 @@ MOST_READINGS = 400
 SEEN = 1e-4
 """Share that must be left of a column's square, of what the readings move each by itself. Less is
 explained by the model, or cancels in deflections, and single precision does not resolve it."""
-ALIKE = 1 - 1e-9
-"""Cosine of two sites' motions from which on they are the same; rounding."""
+ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding
 LEAST_MOTION = 1e-4
 """Square of a column that counts as none, in units of the noise: all readings together move by less
 than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
@@ -46,55 +45,32 @@ than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bends:
-    """Functions of composed quantities, and their sums of squares.
+    """Functions of composed quantities, and their sums of squares."""
 
-    Attributes:
-        argument: (C,) index of the product in the grammar.
-        shape: function of each.
-        values: (C, K) at the readings of the screening, with root mean square 1.
-        square: (S, C) xᵀ M x; zero where a site does not take it.
-        across_one: (S, C) xᵀ M x' with a constant at the site.
-    """
-
-    argument: Ints
-    shape: tuple[Shape, ...]
+    argument: Ints  # (C,) index of the product in the grammar
+    shape: tuple[Shape, ...]  # function of each
     numbers: tuple[tuple[float, ...], ...]
-    values: Floats
-    square: Floats
-    across_one: Floats
+    values: Floats  # (C, K) at the readings of the screening, with root mean square 1
+    square: Floats  # (S, C) xᵀ M x; zero where a site does not take it
+    across_one: Floats  # (S, C) xᵀ M x' with a constant at the site
 
 
 @dataclass(frozen=True, eq=False)
 class Screen:
-    """All candidates beside a model.
+    """All candidates beside a model."""
 
-    Attributes:
-        linear: the fit as a linear problem.
-        grammar: amplitudes.
-        sites: where they act.
-        motion: (N, m, S) motion of each reading by an ordinary motion of each site.
-        rows: (R,) which of the whitened rows the screening uses.
-        readings: (K,) which of the fitted readings it uses.
-        form: (S, R', K) T_s of these rows and readings, single precision.
-        free: (S, K, K) Q_s of these.
-        square: (S, F) xᵀ M x; zero where the model explains a column.
-        across: (S, F) xᵀ M x' with the partner of each amplitude.
-        across_one: (S, F) xᵀ M x' with a constant at the site.
-        across_less: (2, S, F) xᵀ M x' of a product with what is left without either factor.
-    """
-
-    linear: Linearisation
-    grammar: Grammar
-    sites: tuple[Site, ...]
-    motion: Floats
-    rows: Bools
-    readings: Ints
-    form: Floats
-    free: Floats
-    square: Floats
-    across: Floats
-    across_one: Floats
-    across_less: Floats
+    linear: Linearisation  # the fit as a linear problem
+    grammar: Grammar  # amplitudes
+    sites: tuple[Site, ...]  # where they act
+    motion: Floats  # (N, m, S) motion of each reading by an ordinary motion of each site
+    rows: Bools  # (R,) which of the whitened rows the screening uses
+    readings: Ints  # (K,) which of the fitted readings it uses
+    form: Floats  # (S, R', K) T_s of these rows and readings, single precision
+    free: Floats  # (S, K, K) Q_s of these
+    square: Floats  # (S, F) xᵀ M x; zero where the model explains a column
+    across: Floats  # (S, F) xᵀ M x' with the partner of each amplitude
+    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
+    across_less: Floats  # (2, S, F) xᵀ M x' of a product with what is left without either factor
 
     @cached_property
     def price(self) -> Floats:
@@ -228,9 +204,7 @@ def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
 
     With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
 
-    Args:
-        values: (F, K) these, each with root mean square 1.
-        lifted: (F, K) Q of them.
+    values: (F, K) these, each with root mean square 1; lifted: (F, K) Q of them.
     """
     out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
     products = np.flatnonzero((words.less >= 0).all(axis=0))
@@ -263,10 +237,8 @@ def _thinned(fit: Fit) -> tuple[Bools, Ints]:
 LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8)
 STEPS = (0.25, 0.5, 0.75)
 """Shares of the readings below a bend, and a step, to begin with; a choice, by time."""
-WIDTH = 0.3
-"""Of a step, by the standard deviation of the argument; a choice."""
-MOST_ARGUMENTS = 4000
-"""Arguments at most, the simplest first; a choice, by memory."""
+WIDTH = 0.3  # Of a step, by the standard deviation of the argument; a choice
+MOST_ARGUMENTS = 4000  # Arguments at most, the simplest first; a choice, by memory
 
 
 def bends(

@@ -18,31 +18,20 @@ from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats
 
-BEAM = 3
-"""First terms with which selections are begun; a choice."""
-MOST_TERMS = 3
-"""Terms of a law at most; a choice."""
-MOST_COEFFICIENTS = 8
-"""Coefficients of a law at most; a choice: more is no law that one reads."""
-LEAST = 3.0
-"""Logarithm of the odds, the search paid for, that a further term needs: 20 : 1."""
-FALSE_ALARM = 1e-3
-"""Chance of a first term where nothing is hidden, over the whole search."""
-SAME = 0.98
-"""Correlation of two projected columns from which on they count as the same law."""
+BEAM = 3  # First terms with which selections are begun; a choice
+MOST_TERMS = 3  # Terms of a law at most; a choice
+MOST_COEFFICIENTS = 8  # Coefficients of a law at most; a choice: more is no law that one reads
+LEAST = 3.0  # Logarithm of the odds, the search paid for, that a further term needs: 20 : 1
+FALSE_ALARM = 1e-3  # Chance of a first term where nothing is hidden, over the whole search
+SAME = 0.98  # Correlation of two projected columns from which on they count as the same law
 
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Terms that were chosen.
+    """Terms that were chosen."""
 
-    Attributes:
-        terms: in the order of choosing them.
-        odds: that each added.
-    """
-
-    terms: tuple[LawTerm, ...]
-    odds: tuple[float, ...]
+    terms: tuple[LawTerm, ...]  # in the order of choosing them
+    odds: tuple[float, ...]  # that each added
 
     @property
     def total(self) -> float:

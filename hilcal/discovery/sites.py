@@ -27,29 +27,17 @@ _AXES = "xyz"
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """A unit motion.
+    """A unit motion."""
 
-    Attributes:
-        field: of `Deviation`; "sensor" for the recorded wrench, flange axes.
-        element: joint or slot; 0 where the field has none.
-        axis: component of the twist; 0 for joints and the scale.
-        group: what moves, e.g. "joint 2 bearing tilts".
-        words: the same with the axis.
-        symbol: in formulas.
-        latex: likewise.
-        unit: rad, m, 1, N or N·m.
-        joint: index of the joint that it belongs to; −1 for none.
-    """
-
-    field: Place
-    element: int
-    axis: int
-    group: str
-    words: str
-    symbol: str
-    latex: str
-    unit: str
-    joint: int = -1
+    field: Place  # of `Deviation`; "sensor" for the recorded wrench, flange axes
+    element: int  # joint or slot; 0 where the field has none
+    axis: int  # component of the twist; 0 for joints and the scale
+    group: str  # what moves, e.g. "joint 2 bearing tilts".
+    words: str  # the same with the axis
+    symbol: str  # in formulas
+    latex: str  # likewise
+    unit: str  # rad, m, 1, N or N·m
+    joint: int = -1  # index of the joint that it belongs to; −1 for none
 
     @property
     def rank(self) -> int:

@@ -45,34 +45,23 @@ from hilcal.readings.whitening import whitening
 from hilcal.types import Floats
 
 Terms = tuple[LawTerm, ...]
-MOST_LIKELY = 8
-"""Structures within Occam's window that are kept; a choice."""
+MOST_LIKELY = 8  # Structures within Occam's window that are kept; a choice
 CLOSE = 12.0
 """Log odds from the best within which a structure counts; a choice: others are e⁻¹² of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """A structure of a law, its numbers where they explain most.
+    """A structure of a law, its numbers where they explain most."""
 
-    Attributes:
-        kind: sites and functions; see `structure_of`.
-        probability: posterior, of all that were met.
-        holdout_share: share of the misfit that it explains on poses left out, by algebra.
-        step: (P,) posterior mean of its coefficients, in ordinary motions.
-        root: (P, Q) root of their posterior covariance.
-        absorbed: (K, P) change of the model's coordinates that describes most of each column.
-        law: name of the law that it is, where it is proposed.
-    """
-
-    kind: Hashable
+    kind: Hashable  # sites and functions; see `structure_of`
     form: Form
-    probability: float
-    holdout_share: float
-    step: Floats
-    root: Floats
-    absorbed: Floats
-    law: str = ""
+    probability: float  # posterior, of all that were met
+    holdout_share: float  # share of the misfit that it explains on poses left out, by algebra
+    step: Floats  # (P,) posterior mean of its coefficients, in ordinary motions
+    root: Floats  # (P, Q) root of their posterior covariance
+    absorbed: Floats  # (K, P) change of the model's coordinates that describes most of each column
+    law: str = ""  # name of the law that it is, where it is proposed
 
     @property
     def parameters(self) -> tuple[Coefficient, ...]:
@@ -191,9 +180,8 @@ def pareto(of: Sequence[Structure]) -> tuple[Structure, ...]:
 def averaged(fit: Fit, of: Sequence[Structure], readings: Readings) -> tuple[Floats, Floats]:
     """Return what likely laws add to a fit's prediction of D measurements, and its uncertainty.
 
-    Args:
-        of: structures; their probabilities are taken relative to their sum.
-        readings: of the same cell, measured or planned.
+    of: structures; their probabilities are taken relative to their sum; readings: of the same cell,
+    measured or planned.
 
     Returns:
         (D, m) mean of the average, and (D, m) standard deviation of the prediction with it: of

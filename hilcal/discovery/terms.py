@@ -8,19 +8,12 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True)
 class LawTerm:
-    """Columns of a law that are chosen together.
+    """Columns of a law that are chosen together."""
 
-    Attributes:
-        parts: (site, amplitude) of each column, by index.
-        price: what the search costs it.
-        common: whether all columns have one coefficient.
-        alone: what it would cost as the first term.
-    """
-
-    parts: tuple[tuple[int, int], ...]
-    price: float
-    common: bool = False
-    alone: float = 0.0
+    parts: tuple[tuple[int, int], ...]  # (site, amplitude) of each column, by index
+    price: float  # what the search costs it
+    common: bool = False  # whether all columns have one coefficient
+    alone: float = 0.0  # what it would cost as the first term
 
     @property
     def count(self) -> int:
@@ -30,14 +23,10 @@ class LawTerm:
 
 @dataclass(frozen=True, eq=False)
 class Scored:
-    """A term beside others.
-
-    Attributes:
-        score: its score as a family.
-    """
+    """A term beside others."""
 
     term: LawTerm
-    score: FamilyScore
+    score: FamilyScore  # its score as a family
 
     @property
     def odds(self) -> float:
@@ -56,16 +45,9 @@ class ScreenedTerm:
 
 @dataclass(frozen=True, eq=False)
 class Screening:
-    """All candidates beside some columns, as in `Screen`.
+    """All candidates beside some columns, as in `Screen`."""
 
-    Attributes:
-        slope: (S, F) xᵀ r.
-        square: (S, F) xᵀ M x; zero where little of a column is left.
-        across: (S, F) xᵀ M x' with the partner.
-        across_one: (S, F) xᵀ M x' with a constant at the site.
-    """
-
-    slope: Floats
-    square: Floats
-    across: Floats
-    across_one: Floats
+    slope: Floats  # (S, F) xᵀ r
+    square: Floats  # (S, F) xᵀ M x; zero where little of a column is left
+    across: Floats  # (S, F) xᵀ M x' with the partner
+    across_one: Floats  # (S, F) xᵀ M x' with a constant at the site

@@ -17,8 +17,7 @@ Kind = Literal[
     "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
     "place", "sight", "sensor", "composed",
 ]  # fmt: skip
-VARIES = 1e-6
-"""Least spread, as a share of the largest value, of a quantity that counts as varying."""
+VARIES = 1e-6  # Least spread, as a share of the largest value, of a quantity that counts as varying
 _AXES = "xyz"
 _COMPONENTS = tuple(
     (c, *(("force", "f") if c < 3 else ("moment", "m")), _AXES[c % 3], "N" if c < 3 else "N·m")
@@ -29,33 +28,20 @@ _COMPONENTS = tuple(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Variable:
-    """A recorded quantity.
+    """A recorded quantity."""
 
-    Attributes:
-        kind: what functions of it are tried.
-        names: what the diagnosis calls it, or those that it is a sum of.
-        symbol: in formulas.
-        latex: likewise.
-        unit: SI; °C for temperatures, "1" for a number.
-        code: how an effect reads it of its situation s; the search reads it so, too.
-        need: column of the readings that it needs; empty for none.
-        slot: slot and component of the transmitted wrench that it is; None for none.
-        joint: index of the joint that it belongs to; −1 for none.
-        vector: what it is a component of; empty for none.
-        axis: along which; −1 for none.
-    """
-
-    kind: Kind
-    names: tuple[str, ...]
-    symbol: str
-    latex: str
-    unit: str
-    code: str
-    need: str = ""
+    kind: Kind  # what functions of it are tried
+    names: tuple[str, ...]  # what the diagnosis calls it, or those that it is a sum of
+    symbol: str  # in formulas
+    latex: str  # likewise
+    unit: str  # SI; °C for temperatures, "1" for a number
+    code: str  # how an effect reads it of its situation s; the search reads it so, too
+    need: str = ""  # column of the readings that it needs; empty for none
+    # slot and component of the transmitted wrench that it is; None for none
     slot: tuple[int, int] | None = None
-    joint: int = -1
-    vector: str = ""
-    axis: int = -1
+    joint: int = -1  # index of the joint that it belongs to; −1 for none
+    vector: str = ""  # what it is a component of; empty for none
+    axis: int = -1  # along which; −1 for none
 
     def read(self, s: Situation) -> Floats:
         """(N,) it in the states."""

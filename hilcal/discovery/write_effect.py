@@ -13,8 +13,7 @@ from hilcal.effects.protocol import Effect
 from hilcal.errors import InputError
 from hilcal.names import escaped, quoted
 
-USUAL = 1e-4
-"""Ordinary magnitude of a coefficient that nothing is known of, SI; a choice."""
+USUAL = 1e-4  # Ordinary magnitude of a coefficient that nothing is known of, SI; a choice
 _HEAD = '''"""`{name}`: {formula}
 
 Proposed by `hilcal discover`; change it as you like. Every command takes it:
@@ -84,19 +83,11 @@ _FLOATS = "from hilcal.types import Floats\n"
 def source_of_form(
     form: Form,
     name: str,
-    found: tuple[Coefficient, ...] = (),
-    evidence: str = "Nothing is stated of its evidence.",
+    found: tuple[Coefficient, ...] = (),  # its coefficients, for their ordinary magnitudes
+    evidence: str = "Nothing is stated of its evidence.",  # what speaks for it, in lines
     file: str = "F.py",
 ) -> str:
-    """Return the Python file of a law.
-
-    Raises:
-        InputError: the name is none of an effect.
-
-    Args:
-        found: its coefficients, for their ordinary magnitudes.
-        evidence: what speaks for it, in lines.
-    """
+    """Return the Python file of a law."""
     if not NAME.fullmatch(name):
         raise InputError(f"effect {escaped(name)!r}; valid: lower-case letters, digits and _")
     attributes = ["    elastic = True\n"] if form.elastic else []

@@ -20,8 +20,7 @@ class Backlash(PerJoint):
     change = Changeable(
         "joint", words="play", cause="wear or repair?", listed=True, options={"joints": "each"}
     )
-    plausible = 20.0
-    """1 mrad; makers of gears state 0.3 mrad at most. A choice."""
+    plausible = 20.0  # 1 mrad; makers of gears state 0.3 mrad at most. A choice.
     elastic = True
     local_response = True
     option_help: ClassVar = {

@@ -18,8 +18,7 @@ class BaseCompliance(Effect):
     name = "base_compliance"
     summary = "rotation B t_0 about the base origin: the ground gives way"
     change = Changeable("base", "base", "the ground under the base", "loose bolts?")
-    plausible = 30.0
-    """90 µrad/(N·m): an arm on a trolley. A choice."""
+    plausible = 30.0  # 90 µrad/(N·m): an arm on a trolley. A choice.
     elastic = True
     local_response = True
 

@@ -14,8 +14,7 @@ class BaseFrame(Effect):
 
     name = "base_frame"
     summary = "registration of the tracker to the arm's base is off"
-    plausible = 20.0
-    """20 mm, 20 mrad: a base that was surveyed by hand. A choice."""
+    plausible = 20.0  # 20 mm, 20 mrad: a base that was surveyed by hand. A choice.
     of_setup = True
     option_help: ClassVar = PRIOR_HELP
     role = "registration"

@@ -92,11 +92,7 @@ class Catalogue:
         return tuple(kind.name for kind in self.effects)
 
     def __getitem__(self, name: str) -> type[Effect]:
-        """Return the class of an effect.
-
-        Raises:
-            InputError: on an unknown name; lists the valid ones.
-        """
+        """Return the class of an effect."""
         for kind in self.effects:
             if kind.name == name:
                 return kind

@@ -47,8 +47,7 @@ AGREES = 1e-3
 """Share of the largest value by which a derivative may be outside of the difference quotients of
 both sides, between which it lies, at a bend as well: max(τ, 0) has its own at τ = 0. A guess, far
 above rounding."""
-ROUNDING = 1e-9
-"""Share of the largest value that rounding may change; a guess, far above 1e-16."""
+ROUNDING = 1e-9  # Share of the largest value that rounding may change; a guess, far above 1e-16
 STEP = 1e-4
 """Step of difference quotients, in ordinary magnitudes; a guess between rounding and curvature."""
 _FIELDS = Deviation.__slots__

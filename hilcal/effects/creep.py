@@ -12,8 +12,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-SECOND = 1.0
-"""Unit of time of the law, s."""
+SECOND = 1.0  # Unit of time of the law, s
 
 
 class Creep(PerJoint):
@@ -27,8 +26,7 @@ class Creep(PerJoint):
 
     name = "creep"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
-    plausible = 10.0
-    """20 % per decade of time: polymers; metals creep by less than 2 %. A choice."""
+    plausible = 10.0  # 20 % per decade of time: polymers; metals creep by less than 2 %. A choice.
     elastic = True
     local_response = True
     needs = ("load_time",)

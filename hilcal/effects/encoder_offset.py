@@ -22,8 +22,7 @@ class EncoderOffset(PerJoint):
         options={"joints": "each"},
         with_others=True,
     )
-    plausible = 5.0
-    """5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice."""
+    plausible = 5.0  # 5 mrad: mastering to a mark, without a gauge, leaves 0.1° to 0.5°. A choice.
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

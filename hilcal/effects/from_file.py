@@ -15,26 +15,17 @@ from hilcal.errors import InputError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EffectFile:
-    """A file of effects.
+    """A file of effects."""
 
-    Attributes:
-        path: the file, absolute.
-        sha256: hash (hex) of its content.
-        effects: the effects that it defines.
-    """
-
-    path: str
-    sha256: str
-    effects: tuple[type[Effect], ...]
+    path: str  # the file, absolute
+    sha256: str  # hash (hex) of its content
+    effects: tuple[type[Effect], ...]  # the effects that it defines
 
 
 def read_effects(path: Path) -> EffectFile:
     """Run a Python file and return the effects that it defines.
 
     These are all classes derived from `Effect` in it, but for those whose name begins with "_".
-
-    Raises:
-        InputError: it cannot be read or run, or has no effect.
     """
     return effects_of(_content(path), path)
 

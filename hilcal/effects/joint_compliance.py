@@ -20,10 +20,8 @@ class JointCompliance(PerJoint):
         options={"joints": "each"},
         with_others=True,
     )
-    plausible = 10.0
-    """30 mrad at the rated torque; gears state 1 to 5. A choice."""
-    spread = 0.5
-    """Springs and oil of one type of gear scatter by a third; a choice."""
+    plausible = 10.0  # 30 mrad at the rated torque; gears state 1 to 5. A choice.
+    spread = 0.5  # Springs and oil of one type of gear scatter by a third; a choice
     elastic = True
     local_response = True
     role = "baseline"

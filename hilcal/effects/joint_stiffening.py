@@ -11,8 +11,7 @@ class JointStiffening(PerJoint):
 
     name = "joint_stiffening"
     summary = "dq_j = s_j τ_j³: compliance changes with the torque (s_j < 0: stiffens)"
-    plausible = 10.0
-    """30 mrad at the rated torque, as for joint_compliance. A choice."""
+    plausible = 10.0  # 30 mrad at the rated torque, as for joint_compliance. A choice.
     elastic = True
     local_response = True
 

@@ -24,8 +24,7 @@ class JointTiltCompliance(PerJoint):
     change = Changeable(
         "joint", words="tilt compliance", cause="wear or crash?", options={"joints": "each"}
     )
-    plausible = 10.0
-    """10 mrad at the rated torque; cross-roller bearings state under 1. A choice."""
+    plausible = 10.0  # 10 mrad at the rated torque; cross-roller bearings state under 1. A choice.
     elastic = True
     local_response = True
 

@@ -26,8 +26,7 @@ class LinkCompliance(Effect):
 
     name = "link_compliance"
     summary = "tip moves L³/3EI F + L²/2EI M, turns L²/2EI F + L/EI M, twists L/GJ M: links bend"
-    plausible = 10.0
-    """Ten times as soft as a link of ordinary section, see `parameters`. A choice."""
+    plausible = 10.0  # Ten times as soft as a link of ordinary section, see `parameters`. A choice.
     elastic = True
     local_response = True
 

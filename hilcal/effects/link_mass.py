@@ -34,8 +34,7 @@ class LinkMass(Effect):
     summary = "moment (R_k δ_k) × g at joint k: links are heavier or balanced otherwise"
     change = Changeable("tool", "tool", "the tool's weight", directions=tool_weight)
     for_missing_weight = True
-    plausible = 20.0
-    """1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice."""
+    plausible = 20.0  # 1 kg·m: a fifth of the first moment of an upper arm of 20 kg. A choice.
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:

@@ -19,8 +19,7 @@ class LoadPoint(Effect):
     name = "load_point"
     summary = "the load acts elsewhere than configured (flange axes)"
     change = Changeable("tool", "load point", "where the load acts on the tool")
-    plausible = 10.0
-    """10 cm: a hook or an eye instead of the flange. A choice."""
+    plausible = 10.0  # 10 cm: a hook or an eye instead of the flange. A choice.
     of_setup = True
 
     @property

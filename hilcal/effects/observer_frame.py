@@ -21,8 +21,7 @@ class ObserverFrame(Effect):
 
     name = "observer_frame"
     summary = "one of several stations, points or gauges stands elsewhere than described"
-    plausible = 20.0
-    """20 mm, 20 mrad, as of `base_frame`. A choice."""
+    plausible = 20.0  # 20 mm, 20 mrad, as of `base_frame`. A choice.
     of_setup = True
     option_help: ClassVar = PRIOR_HELP
     role = "observer"

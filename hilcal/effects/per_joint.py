@@ -23,19 +23,12 @@ _RANGE = re.compile(r"([0-9]{1,3})(?:-([0-9]{1,3}))?")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JointGroups:
-    """Which joints have a parameter, and which of them share one.
+    """Which joints have a parameter, and which of them share one."""
 
-    Attributes:
-        text: "each", "common", or the groups, as "2/3/4-6".
-        labels: (G,) joints of each group, as "2" or "4-6".
-        joint: (J,) indices of the joints that have a parameter, ascending.
-        group: (J,) the group of each of them, 0..G−1.
-    """
-
-    text: str
-    labels: tuple[str, ...]
-    joint: Ints
-    group: Ints
+    text: str  # "each", "common", or the groups, as "2/3/4-6"
+    labels: tuple[str, ...]  # (G,) joints of each group, as "2" or "4-6"
+    joint: Ints  # (J,) indices of the joints that have a parameter, ascending
+    group: Ints  # (J,) the group of each of them, 0..G−1
 
     @property
     def words(self) -> tuple[str, ...]:
@@ -48,9 +41,6 @@ def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
 
     Groups are separated by "/", the joints of a group by "+" or as a range: "2/3/4-6" is one
     parameter for joint 2, one for 3 and one for 4 to 6; a joint that is not named has none.
-
-    Raises:
-        InputError: what is wrong with it, and what would be valid.
     """
     given = options["joints"]
     text = str(given) if type(given) is int else given
@@ -152,26 +142,18 @@ class PerJoint(Effect):
 
     def group_parameters(
         self,
-        unit: str,
+        unit: str,  # of joints that turn; that of slides has m for rad, N for N·m
+        # (n,) ordinary magnitude at each joint; that of a group is the geometric mean of its
+        # joints'
         ordinary: Floats,
-        meaning: str,
+        meaning: str,  # with "{joint}" and "{kind}" where they belong
+        # suffixes of the parameters of one group, as ".cos2", each with its words
         kinds: Mapping[str, str] | None = None,
         *,
+        # whether it is of what the drive moves; else slides have the same unit
         of_drive: bool = True,
     ) -> tuple[Parameter, ...]:
-        """Parameters of all groups, one for each, or one for each of `kinds`.
-
-        Args:
-            unit: of joints that turn; that of slides has m for rad, N for N·m.
-            ordinary: (n,) ordinary magnitude at each joint; that of a group is the geometric
-                mean of its joints'.
-            meaning: with "{joint}" and "{kind}" where they belong.
-            kinds: suffixes of the parameters of one group, as ".cos2", each with its words.
-            of_drive: whether it is of what the drive moves; else slides have the same unit.
-
-        Raises:
-            InputError: joints that turn and joints that slide share a parameter.
-        """
+        """Parameters of all groups, one for each, or one for each of `kinds`."""
         g = self.shared
         sizes: list[list[float]] = [[] for _ in g.labels]
         for size, k in zip(ordinary[g.joint].tolist(), g.group.tolist(), strict=True):

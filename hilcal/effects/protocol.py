@@ -28,51 +28,39 @@ from hilcal.types import Bools, Floats, Ints
 Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
 Role = Literal["registration", "target", "observer", "baseline", "effect"]
 FRAME_ROLES: tuple[Role, ...] = ("registration", "target", "observer")
-OWN_SPREAD = 0.7
-"""Of the logarithm of a pool's standard deviation, beside what is shared; a choice."""
+OWN_SPREAD = 0.7  # Of the logarithm of a pool's standard deviation, beside what is shared; a choice
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter of an effect.
+    """One parameter of an effect."""
 
-    Attributes:
-        name: within the effect, e.g. "j2" or "j3.cos4".
-        unit: physical unit, SI.
-        scale: a magnitude that would be ordinary in practice; it defines when a direction
-            counts as identifiable and how parameters of one effect compare.
-        meaning: one phrase for people.
-    """
-
-    name: str
-    unit: str
+    name: str  # within the effect, e.g. "j2" or "j3.cos4".
+    unit: str  # physical unit, SI
+    # a magnitude that would be ordinary in practice; it defines when a direction counts as
+    # identifiable and how parameters of one effect compare
     scale: float
-    meaning: str = ""
+    meaning: str = ""  # one phrase for people
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Situation:
-    """N states at their deflected configuration: everything that a law may depend on.
-
-    Attributes:
-        angle: (N, n) joint angles at which laws are evaluated, rad: the actual ones where
-            recorded; those of the drives where joints are coupled, and the phase of its travel
-            where a joint slides (`Arm.phases`).
-        chain: the deviated chain, or None before it is known.
-        wrench: (N, n + 1, 6) wrench transmitted through each slot, slot axes; element
-            (j, 5) is the torque τ about the axis of joint j + 1, (j, 2) the force along it.
-        load: the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and
-            the weights.
-        compliance: (n,) joint compliances, rad/(N·m): those of the model, or typical ones where
-            no effect of it has any.
-    """
+    """N states at their deflected configuration: everything that a law may depend on."""
 
     cell: Cell
     states: States
+    # (N, n) joint angles at which laws are evaluated, rad: the actual ones where recorded; those of
+    # the drives where joints are coupled, and the phase of its travel where a joint slides
+    # (`Arm.phases`)
     angle: Floats
-    chain: Chain
+    chain: Chain  # the deviated chain, or None before it is known
+    # (N, n + 1, 6) wrench transmitted through each slot, slot axes; element (j, 5) is the torque τ
+    # about the axis of joint j + 1, (j, 2) the force along it
     wrench: Floats
+    # the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and the weights
     load: Load
+    # (n,) joint compliances, rad/(N·m): those of the model, or typical ones where no effect of it
+    # has any
     compliance: Floats
 
     @property
@@ -108,20 +96,14 @@ class Situation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Columns:
-    """Derivative of one field of the deviation by P of an effect's parameters.
+    """Derivative of one field of the deviation by P of an effect's parameters."""
 
-    Attributes:
-        field: the field of `Deviation` that moves.
-        parameter: (P,) indices of the parameters within the effect; one that moves several
-            elements occurs several times.
-        element: (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise.
-        values: (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant).
-    """
-
-    field: Field
+    field: Field  # the field of `Deviation` that moves
+    # (P,) indices of the parameters within the effect; one that moves several elements occurs
+    # several times
     parameter: Ints
-    element: Ints
-    values: Floats
+    element: Ints  # (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise
+    values: Floats  # (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant)
 
     def only(self, wanted: Bools) -> "Columns":
         """Return the columns of some of the parameters."""
@@ -141,28 +123,19 @@ class Columns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Response:
-    """Derivative of an elastic deviation by P changes of the wrenches at the slots of the chain.
+    """Derivative of an elastic deviation by P changes of the wrenches at the slots of the chain."""
 
-    Attributes:
-        dq: (N, P, n) or None.
-        twist: (N, P, n + 1, 6) or None.
-    """
-
-    dq: Floats | None = None
-    twist: Floats | None = None
+    dq: Floats | None = None  # (N, P, n) or None
+    twist: Floats | None = None  # (N, P, n + 1, 6) or None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadChange:
-    """Change of the load on the arm, in axes that move with it.
+    """Change of the load on the arm, in axes that move with it."""
 
-    Attributes:
-        point: (3,) shift of the load point, flange axes, m; None for none.
-        first_moment: (n, 3) change of each link's mass × centre of mass, link axes (as
-            `Arm.coms`), kg·m; None for none.
-    """
-
-    point: Floats | None = None
+    point: Floats | None = None  # (3,) shift of the load point, flange axes, m; None for none
+    # (n, 3) change of each link's mass × centre of mass, link axes (as `Arm.coms`), kg·m; None for
+    # none
     first_moment: Floats | None = None
 
 
@@ -229,11 +202,7 @@ class Effect(ABC):
     change: ClassVar[Changeable | None] = None
 
     def __init__(self, cell: Cell, states: States, options: Options | None = None) -> None:
-        """Build the effect for a cell and the states at hand.
-
-        Raises:
-            InputError: on an unknown option, or where `states` lacks a needed column.
-        """
+        """Build the effect for a cell and the states at hand."""
         self.cell = cell
         self.options: dict[str, object] = dict(options or {})
         for key in self.options:

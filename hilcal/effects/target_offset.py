@@ -23,8 +23,7 @@ class TargetOffset(Effect):
     name = "target_offset"
     summary = "the tracked target sits elsewhere on the flange than configured"
     change = Changeable("setup", "target", "the target's place on the tool")
-    plausible = 10.0
-    """10 mm, 10 mrad: a target that was mounted anew. A choice."""
+    plausible = 10.0  # 10 mm, 10 mrad: a target that was mounted anew. A choice.
     of_setup = True
     option_help: ClassVar = {
         "rotation": "True where the readings are poses, so that the target's axes matter.",

@@ -11,8 +11,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 
-REFERENCE_DEGC = 20.0
-"""Standard reference temperature of lengths, ISO 1."""
+REFERENCE_DEGC = 20.0  # Standard reference temperature of lengths, ISO 1
 SOURCES = ("air", "joints")
 FORMS = ("common", "each")
 
@@ -22,7 +21,6 @@ class ThermalGrowth(Effect):
 
     T is one temperature for the whole arm; slot k moves along L_k, by L_kᵀ p_k α ΔT in its
     own axes.
-
     """
 
     name = "thermal_growth"
@@ -30,8 +28,7 @@ class ThermalGrowth(Effect):
     change = Changeable(
         "surroundings", "temperature", "the length of the links with the temperature"
     )
-    plausible = 5.0
-    """60e-6 per kelvin: polymers; aluminium has 23e-6. A choice."""
+    plausible = 5.0  # 60e-6 per kelvin: polymers; aluminium has 23e-6. A choice.
     needs = ("air_temperature or joint_temperature",)
     option_help: ClassVar = {
         "reference_degC": "T_ref, at which the links are as long as configured; unless given, 20.",

@@ -15,8 +15,7 @@ class ThermalJointDrift(PerJoint):
 
     name = "thermal_joint_drift"
     summary = "dq_j = κ_j ΔT_j: the zero of each joint wanders with its temperature"
-    plausible = 20.0
-    """0.1 mrad/K, 2 mrad for the 20 K that a drive warms up. A choice."""
+    plausible = 20.0  # 0.1 mrad/K, 2 mrad for the 20 K that a drive warms up. A choice.
     needs = ("joint_temperature",)
     option_help: ClassVar = {
         **PerJoint.option_help,

@@ -17,10 +17,8 @@ FEWEST_HARMONICS = 4
 POSES_PER_HARMONIC = 5
 """A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
 majority. A guess, as the bounds are: the upper one limits the cost."""
-ORDINARY, ORDINARY_M = 5e-5, 1e-5
-"""Ordinary amplitude of a harmonic, rad; of a slide m."""
-SCORED_HARMONICS = 40
-"""Bounds the cost of scoring; a guess."""
+ORDINARY, ORDINARY_M = 5e-5, 1e-5  # Ordinary amplitude of a harmonic, rad; of a slide m
+SCORED_HARMONICS = 40  # Bounds the cost of scoring; a guess
 
 
 class TransmissionError(PerJoint):
@@ -43,8 +41,7 @@ class TransmissionError(PerJoint):
     """Few readings resolve no more than four harmonics; finer ones act as scatter. A choice."""
     plausible = 30.0
     """1.5 mrad per harmonic; strain wave gears state 0.3 mrad, spur gears 1 mrad. A choice."""
-    spread = 2.0**0.5
-    """Another gear errs as much, but elsewhere: the difference of two."""
+    spread = 2.0**0.5  # Another gear errs as much, but elsewhere: the difference of two
     option_help: ClassVar = {
         **PerJoint.option_help,
         "harmonics": "K, the harmonics tried per joint, 1 to 1000; unless given, one for every "

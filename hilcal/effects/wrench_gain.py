@@ -19,8 +19,7 @@ class WrenchGain(ForceSensorEffect):
     name = "wrench_gain"
     summary = "wrench read = (1 + g) true per axis: the force sensor has a gain error"
     change = Changeable("setup", "force sensor", "the gain of the force sensor")
-    plausible = 50.0
-    """50 %: a wrong calibration matrix, a channel that hardly reads. A choice."""
+    plausible = 50.0  # 50 %: a wrong calibration matrix, a channel that hardly reads. A choice.
     of_setup = True
 
     @property
@@ -33,11 +32,7 @@ class WrenchGain(ForceSensorEffect):
         )
 
     def error(self, theta: Floats, recorded: Floats) -> Floats:
-        """Return g/(1 + g) w per axis.
-
-        Raises:
-            CannotAnswerError: a gain of −100 % or less, which no sensor has.
-        """
+        """Return g/(1 + g) w per axis."""
         if np.any(theta <= -1):
             raise CannotAnswerError(
                 f"{self.name}: a gain error of {100 * theta.min():.0f} % turns the wrench round; "

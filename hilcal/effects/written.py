@@ -29,15 +29,11 @@ def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, 
     Options are separated by "," or ";". A value is a number, true or false, a word, text in
     quotes, or a list of them in brackets.
 
-    Args:
-        text: e.g. "joint_compliance, transmission_error(harmonics=20)".
-        where: begins the message, e.g. "--effects".
+    text: e.g. "joint_compliance, transmission_error(harmonics=20)".; where: begins the message,
+    e.g. "--effects"..
 
     Returns:
         Options by name of the effect, in order.
-
-    Raises:
-        InputError: what is wrong, and what would be valid.
     """
     out: dict[str, dict[str, object]] = {}
     for part in _split(text, ",", f"{where} {text!r}", EXAMPLE):
@@ -79,10 +75,7 @@ def written(value: object) -> str:
 def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
     """Options of an effect other than it has by itself on these states, without its priors.
 
-    Args:
-        effect: the effect.
-        states: those that it was made for.
-        m: 3 for positions, 6 for poses.
+    effect: the effect; states: those that it was made for; m: 3 for positions, 6 for poses.
     """
     usual = type(effect)(effect.cell, states, effect.usual_options(m)).options
     return {

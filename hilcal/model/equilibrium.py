@@ -30,31 +30,20 @@ TOLERANCE = 1e-8
 """Part of the derivative, root mean square over the states, that may be missing; a choice, with
 room for states whose loads are several times the mean."""
 MAX_TERMS = 40
-TORQUE, ALONG = 5, 2
-"""Components of a slot's wrench about the axis of its joint, and along it."""
-FORCE, MOMENT = slice(0, 3), slice(3, 6)
-"""Components of a slot's wrench."""
+TORQUE, ALONG = 5, 2  # Components of a slot's wrench about the axis of its joint, and along it
+FORCE, MOMENT = slice(0, 3), slice(3, 6)  # Components of a slot's wrench
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlotResponse:
-    """Derivative of the deviation at one slot by the wrench through one slot.
+    """Derivative of the deviation at one slot by the wrench through one slot."""
 
-    Attributes:
-        slot: whose wrench.
-        to: which joint (index) or slot deviates.
-        joint: whether it is a joint displacement, else a twist.
-        components: range of the components of the wrench: of its force, or of its moment.
-        elements: range of the elements of the deviation.
-        values: (N, I, E) or (1, I, E).
-    """
-
-    slot: int
-    to: int
-    joint: bool
-    components: slice
-    elements: slice
-    values: Floats
+    slot: int  # whose wrench
+    to: int  # which joint (index) or slot deviates
+    joint: bool  # whether it is a joint displacement, else a twist
+    components: slice  # range of the components of the wrench: of its force, or of its moment
+    elements: slice  # range of the elements of the deviation
+    values: Floats  # (N, I, E) or (1, I, E)
 
 
 def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[SlotResponse]:
@@ -108,9 +97,8 @@ def at_equilibrium(
 ) -> ReadingDerivative:
     """Add to the motions of a reading how the arm yields to the change of the wrenches.
 
-    Args:
-        moves: derivatives of the reading with the wrenches held as they are.
-        stiffness: of the chain under its load.
+    moves: derivatives of the reading with the wrenches held as they are; stiffness: of the chain
+    under its load.
     """
     term = wrench_form(moves, blocks)
     form, whole = dict(term), _norm(term)
@@ -143,8 +131,7 @@ def wrench_form(
 def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
     """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches.
 
-    Args:
-        form: derivatives by the wrenches, see `wrench_form`.
+    form: derivatives by the wrenches, see `wrench_form`.
     """
     out = zeros(len(change), m, change.shape[1])
     for (slot, moment), rows in form.items():
@@ -158,8 +145,7 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 
     A force f and a moment t there are R_kᵀ f and R_kᵀ (t + d_k × f) in slot k, d_k the lever.
 
-    Args:
-        form: derivatives by the slot wrenches, see `wrench_form`.
+    form: derivatives by the slot wrenches, see `wrench_form`.
     """
     point = chain.point(load.point)
     out = zeros(len(point), m, 6)
@@ -174,16 +160,13 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 
 def by_wrenches(
     blocks: list[SlotResponse],
-    by_joint: Callable[[int], Floats],
+    by_joint: Callable[[int], Floats],  # (N, m) by the displacement of a joint
+    # (N, m, E) by a range of the elements of the twist of a slot
     by_slot: Callable[[int, slice], Floats],
 ) -> dict[tuple[int, bool], Floats]:
     """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot.
 
     From those by the deviation; those that are zero are left out.
-
-    Args:
-        by_joint: (N, m) by the displacement of a joint.
-        by_slot: (N, m, E) by a range of the elements of the twist of a slot.
     """
     used: dict[int, slice] = {}
     for b in blocks:

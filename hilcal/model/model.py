@@ -38,17 +38,11 @@ FLANGE_STEP = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction(Brief):
-    """What a model predicts of N states.
+    """What a model predicts of N states."""
 
-    Attributes:
-        situation: the states at their deflected configuration.
-        deviation: the summed deviation.
-        observation: what the sensor would read.
-    """
-
-    situation: Situation
-    deviation: Deviation
-    observation: Observation
+    situation: Situation  # the states at their deflected configuration
+    deviation: Deviation  # the summed deviation
+    observation: Observation  # what the sensor would read
 
     def __getitem__(self, rows: slice) -> "Prediction":
         """Return the prediction of the chosen states."""
@@ -128,11 +122,7 @@ class Model(Brief):
         return self._slices
 
     def __add__(self, effect: Effect | EffectSpec | str | type[Effect]) -> "Model":
-        """Return the model with one more effect; one that is only named is built for it.
-
-        Raises:
-            InputError: an effect that is there already, or cannot be built.
-        """
+        """Return the model with one more effect; one that is only named is built for it."""
         if isinstance(effect, str | type):
             effect = EffectSpec(effect)
         if isinstance(effect, EffectSpec):

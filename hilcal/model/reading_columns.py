@@ -17,8 +17,7 @@ from hilcal.robot.geometric_stiffness import rows_times, rows_times_constant
 from hilcal.robot.statics import Load
 from hilcal.types import Floats, Ints
 
-WIDE = 64
-"""Successive parameters of one joint that are written as they are; a choice by timing."""
+WIDE = 64  # Successive parameters of one joint that are written as they are; a choice by timing
 
 
 class ReadingColumns:
@@ -33,13 +32,9 @@ class ReadingColumns:
         moves: ReadingDerivative,
         blocks: list[SlotResponse],
         load: Load,
-        scale: Floats | None = None,
+        scale: Floats | None = None,  # (L,) units of the parameters; SI unless given
     ) -> None:
-        """Begin without any.
-
-        Args:
-            scale: (L,) units of the parameters; SI unless given.
-        """
+        """Begin without any."""
         self._moves, self._blocks, self._load, self._scale = moves, blocks, load, scale
         self._columns: list[tuple[Columns, Ints]] = []
         self._wrenches: list[tuple[Floats, Ints]] = []
@@ -48,8 +43,7 @@ class ReadingColumns:
     def add(self, c: Columns, place: Ints) -> None:
         """Add one block of an effect's columns.
 
-        Args:
-            place: which of the L each parameter of the effect is; −1 for none.
+        place: which of the L each parameter of the effect is; −1 for none.
         """
         c = c.only(place[c.parameter] >= 0)
         at = place[c.parameter]

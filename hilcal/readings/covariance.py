@@ -35,15 +35,12 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.types import Bools, Floats, Ints
 
-COVERS = "covariance"
-"""Key among the texts about a campaign: what the stored covariances cover."""
+COVERS = "covariance"  # Key among the texts about a campaign: what the stored covariances cover
 FROM = "covariance from"
 """Key of `TRACKER` where they were made from the noise in [tracker]; absent elsewhere."""
 TRACKER = "tracker"
-INSTRUMENT = "instrument"
-"""They cover the instrument alone, not the arm's repeatability."""
-WHOLE = "instrument+arm"
-"""They include the arm's repeatability."""
+INSTRUMENT = "instrument"  # They cover the instrument alone, not the arm's repeatability
+WHOLE = "instrument+arm"  # They include the arm's repeatability
 ROUNDING = "+rounding"
 """End of either word in a table, where the covariances also include the rounding of positions."""
 PRIOR_REPEATS = 20.0
@@ -52,28 +49,17 @@ PRIOR_REPEATS = 20.0
 
 @dataclass(frozen=True, slots=True)
 class TrackerNoise:
-    """A specification: standard deviations a + b d of a spherical instrument at distance d.
+    """A specification: standard deviations a + b d of a spherical instrument at distance d."""
 
-    Attributes:
-        range_std: along the beam at zero distance, m.
-        range_std_per_m: its growth with distance, m/m.
-        transverse_std: across the beam at zero distance, m.
-        transverse_std_per_m: its growth with distance (an angle), m/m.
-        orientation_std: of a small rotation about any axis, rad; 0 where only positions are read.
-    """
-
-    range_std: float
-    range_std_per_m: float
-    transverse_std: float
-    transverse_std_per_m: float
+    range_std: float  # along the beam at zero distance, m
+    range_std_per_m: float  # its growth with distance, m/m
+    transverse_std: float  # across the beam at zero distance, m
+    transverse_std_per_m: float  # its growth with distance (an angle), m/m
+    # of a small rotation about any axis, rad; 0 where only positions are read
     orientation_std: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no instrument can have.
-
-        Raises:
-            InputError: a figure is negative or not finite, or a position has no noise at all.
-        """
+        """Refuse what no instrument can have."""
         for f in fields(self):
             value = getattr(self, f.name)
             if not np.isfinite(value) or value < 0:
@@ -96,10 +82,10 @@ def tracker_noise(section: Tracker) -> TrackerNoise:
 
 
 def tracker_covariance(
-    position: Floats,
+    position: Floats,  # (N, 3) positions in the frame of `station`, m
     noise: TrackerNoise,
-    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),
-    m: int = 3,
+    station: Floats | Sequence[float] = (0.0, 0.0, 0.0),  # (3,) where the beam starts, m
+    m: int = 3,  # 3 for positions, 6 for poses
 ) -> Floats:
     """Instrument covariance of one sample: an ellipsoid that turns with the line of sight.
 
@@ -110,17 +96,8 @@ def tracker_covariance(
     where the angles' errors are equal across the beam: d σ_el = d cos(el) σ_az = c + e d.
     The rotation of a pose (m = 6) has the covariance σ_o² I, independent of the position.
 
-    Args:
-        position: (N, 3) positions in the frame of `station`, m.
-        station: (3,) where the beam starts, m.
-        m: 3 for positions, 6 for poses.
-
     Returns:
         (N, m, m) covariances, m² and rad², exactly symmetric.
-
-    Raises:
-        InputError: a position lies at the station, where the beam has no direction; m = 6 with
-            `orientation_std` 0.
     """
     beam = np.asarray(position, dtype=float) - np.asarray(station, dtype=float)
     distance = np.linalg.norm(beam, axis=1)

@@ -26,9 +26,7 @@ class Range:
     def over(self, values: Floats, *, turning: bool = False) -> Floats:
         """Return by how much values are outside; zero or less inside.
 
-        Args:
-            values: (N,) SI.
-            turning: angles that mean the same whole turns on.
+        values: (N,) SI; turning: angles that mean the same whole turns on.
         """
         if not turning:
             return np.asarray(np.maximum(values - self.high, self.low - values))

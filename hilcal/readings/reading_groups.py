@@ -41,10 +41,6 @@ def deflection_groups(readings: Readings) -> list[Group]:
 
     Targets that share the scatter of an arrival are in one group. A loaded reading whose target,
     of several, was not read unloaded in its pose and cycle makes no deflection.
-
-    Raises:
-        InputError: a pose without unloaded reading, no loaded reading at all, or more readings that
-            share one than `limits.SHARED` allows.
     """
     if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
@@ -86,9 +82,8 @@ def deflection_groups(readings: Readings) -> list[Group]:
 def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
     """Join groups to runs along `Readings.along`, each in its order.
 
-    Args:
-        groups: those that share another error; none is divided.
-        most: measurements in a run, but for its last group.
+    groups: those that share another error; none is divided; most: measurements in a run, but for
+    its last group.
     """
     each = [
         (loaded, reference, weights)

@@ -13,8 +13,7 @@ from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
 ObserverKind = Literal["station", "point", "gauge"]
-SAME_POSE = 1e-6
-"""Commanded joints of one pose agree to this, rad."""
+SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,13 +70,10 @@ class States(Brief):
 
 @dataclass(frozen=True, slots=True)
 class ObserverName:
-    """What observes the target.
+    """What observes the target."""
 
-    Attributes:
-        kind: "station" reads positions or poses, "point" the distance from a point, "gauge" the
-            height over a plane.
-    """
-
+    # "station" reads positions or poses, "point" the distance from a point, "gauge" the height over
+    # a plane
     kind: ObserverKind
     name: str
 

@@ -39,8 +39,7 @@ MANY = 1000
 """Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
 rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
 timing."""
-TOGETHER = 1_000_000
-"""Numbers that are whitened at a time; a choice by memory."""
+TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
 RUN = 200
 """Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
 larger ones the whitening costs as much as predicting."""
@@ -100,19 +99,13 @@ def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bucket:
-    """G groups of one shape: L measurements each, and the U unloaded readings they share.
+    """G groups of one shape: L measurements each, and the U unloaded readings they share."""
 
-    Attributes:
-        loaded: (G, L) rows of the readings.
-        reference: (G, U) rows of the unloaded readings; U = 0 for absolute readings.
-        factor: (G, L·m, L·m) scaling matrices.
-        weights: (L, U) of the unloaded readings in the mean that each deflection is taken from:
-            those of its target.
-    """
-
-    loaded: Ints
-    reference: Ints
-    factor: Floats
+    loaded: Ints  # (G, L) rows of the readings
+    reference: Ints  # (G, U) rows of the unloaded readings; U = 0 for absolute readings
+    factor: Floats  # (G, L·m, L·m) scaling matrices
+    # (L, U) of the unloaded readings in the mean that each deflection is taken from: those of its
+    # target
     weights: Floats
 
     def difference(self, x: Floats) -> Floats:
@@ -132,27 +125,16 @@ class Bucket:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Whitening:
-    """The scaled regression: from readings to stacked whitened rows.
+    """The scaled regression: from readings to stacked whitened rows."""
 
-    Attributes:
-        mode: "absolute" or "deflection".
-        scaling: "none", "gu" or "gc".
-        m: elements per reading.
-        buckets: groups by shape.
-        reading: (D,) row of the reading behind each measurement, in the stacked order.
-        covariance: (D, m, m) covariance of each measurement by itself.
-        group: (D,) pose of each measurement.
-        rank: number of whitened rows that carry information.
-    """
-
-    mode: Mode
-    scaling: Scaling
-    m: int
-    buckets: tuple[Bucket, ...]
-    reading: Ints
-    covariance: Floats
-    group: Ints
-    rank: int
+    mode: Mode  # "absolute" or "deflection"
+    scaling: Scaling  # "none", "gu" or "gc"
+    m: int  # elements per reading
+    buckets: tuple[Bucket, ...]  # groups by shape
+    reading: Ints  # (D,) row of the reading behind each measurement, in the stacked order
+    covariance: Floats  # (D, m, m) covariance of each measurement by itself
+    group: Ints  # (D,) pose of each measurement
+    rank: int  # number of whitened rows that carry information
 
     def __len__(self) -> int:
         """Return the number of measurements D (readings or deflections)."""
@@ -190,12 +172,7 @@ class Whitening:
 
 
 def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whitening:
-    """Prepare the scaling of the readings in one mode.
-
-    Raises:
-        InputError: where there are no readings; in deflection mode, where a pose has no
-            unloaded reading or there is no loaded reading at all.
-    """
+    """Prepare the scaling of the readings in one mode."""
     if not len(readings):
         raise InputError("there are no readings to fit; measure or import some")
     v, m = readings.covariance, readings.m
@@ -267,8 +244,7 @@ def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
 def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
     """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
 
-    Args:
-        readings: those of the scaling, with any covariance.
+    readings: those of the scaling, with any covariance.
     """
     return [measurement_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
@@ -276,8 +252,7 @@ def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
 def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
     """Deflections where every loaded reading has an unloaded one in its pose and cycle.
 
-    Args:
-        planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
+    planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
     """
     if planned == "absolute" or readings.unloaded.all():
         return "absolute"

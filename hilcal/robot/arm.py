@@ -23,15 +23,10 @@ def missing(
     file: str,
     weighed: bool,
     unlimited: Sequence[str],
-    weak: Sequence[str],
-    forceless: Sequence[str] = (),
+    weak: Sequence[str],  # joints without a torque or effort
+    forceless: Sequence[str] = (),  # prismatic ones without a force or effort
 ) -> tuple[str, ...]:
-    """Return what a description lacks, and what that means, a sentence each.
-
-    Args:
-        weak: joints without a torque or effort.
-        forceless: prismatic ones without a force or effort.
-    """
+    """Return what a description lacks, and what that means, a sentence each."""
     out = [] if weighed else [NO_MASSES.format(file)]
     if unlimited:
         out.append(f"no limits in {file} for {', '.join(unlimited)}: ±360° is assumed")
@@ -64,49 +59,35 @@ class Arm(Brief):
     What is an angle of a revolute joint (rad) is a displacement of a prismatic one (m), and what is
     a torque (N·m) is a force along its axis (N); speeds and tolerances in the configuration are the
     same number in m for a prismatic joint as in rad for a revolute one.
-
-    Attributes:
-        name: catalogue name or file stem.
-        links: (n + 1, 4, 4) transforms L_k, lengths in m.
-        masses: (n,) masses of the bodies, kg.
-        coms: (n, 3) centres of mass in the body frames (after the joint's rotation), m.
-        q_min: (n,) lower joint limits, rad.
-        q_max: (n,) upper joint limits, rad.
-        torque_max: (n,) joint torque limits, N·m.
-        payload: rated payload, kg.
-        joint_names: (n,) names.
-        source: where the figures come from.
-        coupling: (n, n) C with θ = C q: the angles of the chain from the controller's values, where
-            joints follow others (see `conventions`); None where each turns by itself.
-        drive: (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the
-            drives, where drives turn several joints; None where each turns its own.
-        mimic: (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no
-            value of their own (`<mimic>` of a URDF): their rows say what it would be, those of the
-            others are of the identity; None where every joint has one.
-        sign: (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1;
-            None for 1 everywhere.
-        notes: what its description lacks, and what that means, a sentence each.
-        repeatability: pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown.
-        prismatic: (n,) which joints slide; None where all turn.
     """
 
-    name: str
-    links: Floats
-    masses: Floats
-    coms: Floats
-    q_min: Floats
-    q_max: Floats
-    torque_max: Floats
-    payload: float
-    joint_names: tuple[str, ...]
-    source: str
+    name: str  # catalogue name or file stem
+    links: Floats  # (n + 1, 4, 4) transforms L_k, lengths in m
+    masses: Floats  # (n,) masses of the bodies, kg
+    coms: Floats  # (n, 3) centres of mass in the body frames (after the joint's rotation), m
+    q_min: Floats  # (n,) lower joint limits, rad
+    q_max: Floats  # (n,) upper joint limits, rad
+    torque_max: Floats  # (n,) joint torque limits, N·m
+    payload: float  # rated payload, kg
+    joint_names: tuple[str, ...]  # (n,) names
+    source: str  # where the figures come from
+    # (n, n) C with θ = C q: the angles of the chain from the controller's values, where joints
+    # follow others (see `conventions`); None where each turns by itself
     coupling: Floats | None = None
+    # (n, n) D with dθ = D dδ: displacements of the chain's joints from those of the drives, where
+    # drives turn several joints; None where each turns its own
     drive: Floats | None = None
+    # (n, n + 1) [F, f] with q = F q + f for the controller's values, where joints have no value of
+    # their own (`<mimic>` of a URDF): their rows say what it would be, those of the others are of
+    # the identity; None where every joint has one
     mimic: Floats | None = None
+    # (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1; None for 1
+    # everywhere
     sign: Floats | None = None
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # what its description lacks, and what that means, a sentence each
+    # pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown
     repeatability: float | None = None
-    prismatic: Bools | None = None
+    prismatic: Bools | None = None  # (n,) which joints slide; None where all turn
 
     @property
     def slides(self) -> Bools:
@@ -208,11 +189,7 @@ class Arm(Brief):
         return np.asarray(given @ self.mimic[:, :-1].T + self.mimic[:, -1])
 
     def __post_init__(self) -> None:
-        """Refuse an arm of more joints than any has, or a slide without an end.
-
-        Raises:
-            InputError: says what would be valid.
-        """
+        """Refuse an arm of more joints than any has, or a slide without an end."""
         if self.prismatic is not None:
             travel = (self.q_max - self.q_min)[self.prismatic]
             if not np.all(np.isfinite(travel) & (travel > 0.0)):

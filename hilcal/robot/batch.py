@@ -19,8 +19,7 @@ CHUNK = 8200
 """States of a chunk, at most; a choice by timing. No power of two: the components of an array would
 all fall into the same few lines of the processor's cache, and what is turned over in memory take
 four times as long."""
-BUDGET = 1 << 20
-"""Numbers of a chunk's largest array, 8 MB; a choice by timing."""
+BUDGET = 1 << 20  # Numbers of a chunk's largest array, 8 MB; a choice by timing
 LEAST_CHUNK = 256
 """States of a chunk, at least: Python's share of the time grows with the number of chunks."""
 
@@ -52,8 +51,7 @@ def along_states(x: Floats) -> Floats:
 def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
     """Yield slices that cover `count` states; one empty slice where there is none.
 
-    Args:
-        numbers: that are computed for each state, where they are many: chunks are smaller then.
+    numbers: that are computed for each state, where they are many: chunks are smaller then.
     """
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
     for start in range(0, max(count, 1), size):

@@ -24,38 +24,24 @@ TURNED = np.array([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Capsule:
-    """A capsule that moves with a body.
+    """A capsule that moves with a body."""
 
-    Attributes:
-        name: what it is, for people.
-        body: 0 the base, i what joint i moves.
-        start: (3,) one end of the segment in the body's frame, m.
-        end: (3,) the other end, m.
-        radius: m.
-    """
-
-    name: str
-    body: int
-    start: Floats
-    end: Floats
-    radius: float
+    name: str  # what it is, for people
+    body: int  # 0 the base, i what joint i moves
+    start: Floats  # (3,) one end of the segment in the body's frame, m
+    end: Floats  # (3,) the other end, m
+    radius: float  # m
 
 
 @dataclass(frozen=True, slots=True)
 class Figures:
-    """Sizes of an arm of Universal Robots' build, m.
+    """Sizes of an arm of Universal Robots' build, m."""
 
-    Attributes:
-        shoulder: offset of the upper arm's tube along the shoulder's axis.
-        elbow: offset of the forearm's tube along the same direction.
-        housings: radii of the housings on joints 1, 2, 3 and on the wrists.
-        tubes: radii of the tubes of upper arm and forearm.
-    """
-
-    shoulder: float
-    elbow: float
+    shoulder: float  # offset of the upper arm's tube along the shoulder's axis
+    elbow: float  # offset of the forearm's tube along the same direction
+    # radii of the housings on joints 1, 2, 3 and on the wrists
     housings: tuple[float, float, float, float]
-    tubes: tuple[float, float]
+    tubes: tuple[float, float]  # radii of the tubes of upper arm and forearm
 
 
 # Offsets: the manufacturer's ROS 2 description package, config/*/physical_parameters.yaml,
@@ -125,9 +111,8 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 
     T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
 
-    Args:
-        q: (N, n) the controller's joint values, rad.
-        chain: the chain at q where it is evaluated already.
+    q: (N, n) the controller's joint values, rad; chain: the chain at q where it is evaluated
+    already.
 
     Returns:
         (N, n + 2, 4, 4): base, the n bodies, flange.
@@ -152,10 +137,7 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
     """Return a capsule that the flange carries.
 
-    Args:
-        start: (3,) one end, flange axes, m.
-        end: (3,) the other end, flange axes, m.
-        radius: m.
+    start: (3,) one end, flange axes, m; end: (3,) the other end, flange axes, m; radius: m.
     """
     axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
     return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)

@@ -45,26 +45,16 @@ def other_arms(arm: Arm) -> Iterator[Arm]:
 
 
 def load_arm(
-    model: str,
+    model: str,  # catalogue name, or a path relative to `base_dir`
+    # directory of the cell configuration; the working directory if None
     base_dir: Path | None = None,
     *,
-    base_link: str | None = None,
-    tip_link: str | None = None,
+    base_link: str | None = None,  # first link of a URDF's chain
+    tip_link: str | None = None,  # last link of a URDF's chain
+    # what the file holds, as a campaign keeps it; then no file of that path is read
     text: str | None = None,
 ) -> Arm:
-    """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table.
-
-    Args:
-        model: catalogue name, or a path relative to `base_dir`.
-        base_dir: directory of the cell configuration; the working directory if None.
-        base_link: first link of a URDF's chain.
-        tip_link: last link of a URDF's chain.
-        text: what the file holds, as a campaign keeps it; then no file of that path is read.
-
-    Raises:
-        InputError: unknown name (lists the valid ones), or a file that does not describe a
-            serial arm.
-    """
+    """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table."""
     path = (base_dir or Path()) / model
     suffix = path.suffix.lower()
     if text is not None and suffix in (".urdf", ".toml"):

@@ -21,26 +21,20 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviation:
-    """Departure of N states from the nominal chain; None stands for zero.
+    """Departure of N states from the nominal chain; None stands for zero."""
 
-    Attributes:
-        dq: (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`).
-        twist: (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes
-            of slot k, m and rad.
-        base: (N, 6) twist of the base relative to its registration, base axes.
-        station: (N, 6) twist of the readings about the sensor's origin, sensor axes.
-        target: (N, 6) displacement of the tracked target, flange axes.
-        scale: (N,) relative scale error of the sensor's ranges.
-        observer: (N, 6) twist of the position in the axes of what observes it, where there are
-            several; of a distance, which no turn changes, element 3 is the offset, m.
-    """
-
+    # (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`)
     dq: Floats | None = None
+    # (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes of slot k, m
+    # and rad
     twist: Floats | None = None
-    base: Floats | None = None
+    base: Floats | None = None  # (N, 6) twist of the base relative to its registration, base axes
+    # (N, 6) twist of the readings about the sensor's origin, sensor axes
     station: Floats | None = None
-    target: Floats | None = None
-    scale: Floats | None = None
+    target: Floats | None = None  # (N, 6) displacement of the tracked target, flange axes
+    scale: Floats | None = None  # (N,) relative scale error of the sensor's ranges
+    # (N, 6) twist of the position in the axes of what observes it, where there are several; of a
+    # distance, which no turn changes, element 3 is the offset, m
     observer: Floats | None = None
 
     def __add__(self, other: "Deviation") -> "Deviation":
@@ -50,21 +44,13 @@ class Deviation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chain:
-    """Frames of the deviated chain in base axes.
+    """Frames of the deviated chain in base axes."""
 
-    Attributes:
-        rotation: (n + 1, N, 3, 3) orientation of slot k, after its twist.
-        position: (n + 1, N, 3) origin of slot k, after its twist, m.
-        com: (n, N, 3) centre of mass of body i + 1, m.
-        twist: (n + 1, N, 6) the twists that were applied, or None.
-        slides: which joints are prismatic, counted from 0.
-    """
-
-    rotation: Floats
-    position: Floats
-    com: Floats
-    twist: Floats | None
-    slides: tuple[int, ...] = ()
+    rotation: Floats  # (n + 1, N, 3, 3) orientation of slot k, after its twist
+    position: Floats  # (n + 1, N, 3) origin of slot k, after its twist, m
+    com: Floats  # (n, N, 3) centre of mass of body i + 1, m
+    twist: Floats | None  # (n + 1, N, 6) the twists that were applied, or None
+    slides: tuple[int, ...] = ()  # which joints are prismatic, counted from 0
 
     def point(self, offset: Floats) -> Floats:
         """Position of a point fixed in flange axes, offset (3,) or (N, 3) -> (N, 3)."""

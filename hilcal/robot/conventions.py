@@ -23,16 +23,11 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)."""
+_HALF_TURN = np.diag([1.0, -1.0, -1.0, 1.0])  # Rx(π): Rz(−θ) = Rx(π) Rz(θ) Rx(π)
 
 
 def as_counted(arm: Arm, by: Conventions) -> Arm:
-    """Return the arm as the controller counts its joints.
-
-    Raises:
-        InputError: another number of values than the arm has joints, or no such joint.
-    """
+    """Return the arm as the controller counts its joints."""
     for key in ("joint_sign", "joint_offset_deg"):
         given = getattr(by, key)
         if given is not None and len(given) != arm.n:

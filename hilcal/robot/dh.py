@@ -111,9 +111,6 @@ def arm_from_dh(path: Path) -> Arm:
 
     What a row may leave out is said in `Arm.notes`, as of a URDF: masses (none), limits (±360°),
     torques (infinite).
-
-    Raises:
-        InputError: unreadable file, unknown or missing key, bad value.
     """
     table = load_section(path, DhTable)
     rows = table.joints

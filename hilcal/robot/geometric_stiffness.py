@@ -35,31 +35,22 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class GeometricStiffness:
-    """The load of a chain as its motions see it; base axes.
-
-    Attributes:
-        force: (n + 1,) list of (N, 3) f_k, N.
-        dyad: (n + 1,) list of (N, 3, 3) D_k, N·m.
-        carried: (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment.
-        spun: (n,) list of (N, 3) D_j z_j, N·m.
-        load_point: (N, 3) where the load acts, m.
-        following: (N, 6, 6) change of the load's wrench at the load point by a displacement and
-            a turn of the flange; None where it stays as it is.
-    """
+    """The load of a chain as its motions see it; base axes."""
 
     chain: Chain
-    force: list[Floats]
-    dyad: list[Floats]
-    carried: list[Floats]
-    spun: list[Floats]
-    load_point: Floats
+    force: list[Floats]  # (n + 1,) list of (N, 3) f_k, N
+    dyad: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k, N·m
+    carried: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
+    spun: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
+    load_point: Floats  # (N, 3) where the load acts, m
+    # (N, 6, 6) change of the load's wrench at the load point by a displacement and a turn of the
+    # flange; None where it stays as it is
     following: Floats | None = None
 
     def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
         """Gradient by the motions of a linear form of the slot wrenches.
 
-        Args:
-            form: its coefficients (N, m, 3) by the force (False) and moment (True) of slots.
+        form: its coefficients (N, m, 3) by the force (False) and moment (True) of slots.
         """
         chain, slots = self.chain, len(self.force)
         still: list[Floats | None] = [None]
@@ -94,21 +85,17 @@ class GeometricStiffness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionGradient:
-    """Gradient of a linear form of the slot wrenches by motions of the chain.
-
-    Attributes:
-        rows: N and m.
-        still: (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base
-            axes; None for zero, here and below.
-        along: (n + 2,) gradients (N, m, 3) by a turn that carries the slots i ≥ k along.
-        flange: (N, m, 6) gradient by a displacement and a turn of the flange, of what the
-            load's wrench does with it.
-    """
+    """Gradient of a linear form of the slot wrenches by motions of the chain."""
 
     stiffness: GeometricStiffness
-    rows: tuple[int, ...]
+    rows: tuple[int, ...]  # N and m
+    # (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base axes; None for
+    # zero, here and below
     still: list[Floats | None]
+    # (n + 2,) gradients (N, m, 3) by a turn that carries the slots i ≥ k along
     along: list[Floats | None]
+    # (N, m, 6) gradient by a displacement and a turn of the flange, of what the load's wrench does
+    # with it
     flange: Floats | None
 
     def joint(self, j: int) -> Floats:

@@ -22,21 +22,13 @@ _NEAR = 0.03  # m; guessed shapes that are so near in every state are neighbours
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """What does not move with a body, as a capsule in every one of N states, base axes.
+    """What does not move with a body, as a capsule in every one of N states, base axes."""
 
-    Attributes:
-        name: what it is, for people.
-        start: (N, 3) or (3,) one end, m.
-        end: (N, 3) or (3,) the other end, m.
-        radius: m.
-        ignored: names of parts that it may touch.
-    """
-
-    name: str
-    start: Floats
-    end: Floats
-    radius: float
-    ignored: frozenset[str] = frozenset()
+    name: str  # what it is, for people
+    start: Floats  # (N, 3) or (3,) one end, m
+    end: Floats  # (N, 3) or (3,) the other end, m
+    radius: float  # m
+    ignored: frozenset[str] = frozenset()  # names of parts that it may touch
 
 
 class Scene:
@@ -47,10 +39,11 @@ class Scene:
 
     Attributes:
         parts: capsules of the arm, then what the flange carries.
-        rates: (P, n) by part and joint: no point of the part goes farther than this per radian, m.
+        rates: (P, n) by part and joint: no point of the part goes farther than this per radian,
+            m.
         itself: pairs of parts.
-        around: parts and obstacles; base and shoulder stand where the arm is mounted, and are not
-            checked.
+        around: parts and obstacles; base and shoulder stand where the arm is mounted, and are
+            not checked.
         free: parts and obstacles against a segment that is given with the states.
     """
 
@@ -87,8 +80,7 @@ class Scene:
         It moves with the point and does not turn. A joint that turns a part turns the point with
         it, so that they near each other by no more than their distance per radian.
 
-        Args:
-            point: (3,) flange axes, m.
+        point: (3,) flange axes, m.
 
         Returns:
             (P + obstacles, n), by joint.
@@ -176,10 +168,8 @@ class Pairs:
     ) -> Bools:
         """Return (N,) in which states (N, n) any pair is closer than its margin, m.
 
-        Args:
-            q: (N, n) joint angles, rad.
-            margin: of all pairs, or (K,) of each; negative where shapes may overlap.
-            segment: what is given with the states, of `Scene.free`.
+        q: (N, n) joint angles, rad; margin: of all pairs, or (K,) of each; negative where shapes
+        may overlap; segment: what is given with the states, of `Scene.free`.
         """
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
@@ -263,10 +253,8 @@ def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
     length of the way along the links, |L_k| each; exact for a body that the joint carries, or
     that carries the joint.
 
-    Args:
-        body: 0 the base, i what joint i moves.
-        points: (K, 3) points in the body's frame, m.
-        joint: 1 to n.
+    body: 0 the base, i what joint i moves; points: (K, 3) points in the body's frame, m; joint: 1
+    to n.
     """
     if arm.slides[joint - 1]:
         return 1.0

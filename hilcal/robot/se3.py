@@ -19,8 +19,7 @@ import numpy as np
 from hilcal.robot.batch import empty, zeros
 from hilcal.types import Floats
 
-_NEAR = 0.25
-"""θ² below which b and c are summed as series: the closed forms cancel near zero."""
+_NEAR = 0.25  # θ² below which b and c are summed as series: the closed forms cancel near zero
 _TERMS = 8
 _B = [(-1) ** k / factorial(2 * k + 2) for k in range(_TERMS)]
 _C = [(-1) ** k / factorial(2 * k + 3) for k in range(_TERMS)]

@@ -13,23 +13,15 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Load:
-    """What pulls at the arm beside its own weight.
+    """What pulls at the arm beside its own weight."""
 
-    Attributes:
-        wrench: (N, 6) force and moment on the tool at the load point, base axes, N, N·m.
-        point: (3,) or (N, 3) load point, flange axes, m.
-        tool_mass: mass carried permanently, kg.
-        tool_com: (3,) its centre of mass, flange axes, m.
-        gravity: (3,) acceleration, base axes, m/s².
-        first_moment: (n, 3) what the bodies' mass × centre of mass is beyond that of the arm,
-            body axes, kg·m; None for nothing.
-    """
-
-    wrench: Floats
-    point: Floats
-    tool_mass: float
-    tool_com: Floats
-    gravity: Floats
+    wrench: Floats  # (N, 6) force and moment on the tool at the load point, base axes, N, N·m
+    point: Floats  # (3,) or (N, 3) load point, flange axes, m
+    tool_mass: float  # mass carried permanently, kg
+    tool_com: Floats  # (3,) its centre of mass, flange axes, m
+    gravity: Floats  # (3,) acceleration, base axes, m/s²
+    # (n, 3) what the bodies' mass × centre of mass is beyond that of the arm, body axes, kg·m; None
+    # for nothing
     first_moment: Floats | None = None
 
 
@@ -77,9 +69,8 @@ def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
     """Change (N, P, n + 1, 6) of the slot wrenches by changes of the wrench at the flange.
 
-    Args:
-        force: (N, P, 3) change of the force, base axes, N.
-        moment: (N, P, 3) change of the moment about the flange's origin, base axes, N·m.
+    force: (N, P, 3) change of the force, base axes, N; moment: (N, P, 3) change of the moment about
+    the flange's origin, base axes, N·m.
     """
     slots, count = chain.position.shape[:2]
     out = empty(count, force.shape[1], slots, 6)

@@ -43,14 +43,8 @@ def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None
     by multiplier · q_i + offset of the joint i of the chain that it follows: that is a coupling of
     the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
 
-    Args:
-        base_link: link whose frame is the base; the root link if None.
-        tip_link: link whose frame is the flange; the only leaf link if None.
-
-    Raises:
-        InputError: no file, not a URDF, unknown link, a branching chain without `tip_link`
-            (lists the leaf links), a joint of more than one degree of freedom, or one that mimics
-            no joint with a value of its own within the chain.
+    base_link: link whose frame is the base; the root link if None; tip_link: link whose frame is
+    the flange; the only leaf link if None.
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -245,17 +239,11 @@ def _captured_stderr() -> Iterator[IO[str]]:
 
 @dataclass(frozen=True, slots=True)
 class Mimic:
-    """What a joint follows: q = multiplier · q of `joint` + offset.
+    """What a joint follows: q = multiplier · q of `joint` + offset."""
 
-    Attributes:
-        joint: name of the joint that it follows.
-        multiplier: 1 where it is not written.
-        offset: 0 where it is not written, rad or m.
-    """
-
-    joint: str
-    multiplier: float
-    offset: float
+    joint: str  # name of the joint that it follows
+    multiplier: float  # 1 where it is not written
+    offset: float  # 0 where it is not written, rad or m
 
 
 def mimics(path: Path) -> dict[str, Mimic]:
@@ -285,12 +273,8 @@ def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
 
     The motor of joint i turns the joint along, so that the coupling is mechanical.
 
-    Args:
-        arm: the arm with every joint by itself.
-        given: what joints of the file follow; those that the arm does not have do not count.
-
-    Raises:
-        InputError: what is followed is no joint of the arm, or follows another one itself.
+    arm: the arm with every joint by itself; given: what joints of the file follow; those that the
+    arm does not have do not count.
     """
     names, n = list(arm.joint_names), arm.n
     follows = {names.index(name): m for name, m in given.items() if name in names}
