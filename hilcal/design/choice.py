@@ -17,15 +17,13 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, relax
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criteria import D, E, K, MeanVariance
-from hilcal.design.criterion import Criterion
+from hilcal.design.criteria import D, E, K, MeanVariance, Separate, condensed
+from hilcal.design.criterion import CandidateSet, Criterion
 from hilcal.design.discriminated_pairs import DiscriminatedPairs, discriminated_pairs
 from hilcal.design.information import DesignProblem
 from hilcal.design.mixed_design import balanced, mixed_design
 from hilcal.design.optimum import Design, best
-from hilcal.design.prediction_poses import PredictionPoses
-from hilcal.design.t_optimality import Separate, condensed
+from hilcal.design.predicted import PredictionPoses
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Bools, Floats, Ints
 

@@ -6,10 +6,45 @@ from typing import Protocol
 
 import numpy as np
 
-from hilcal.design.candidate_set import CandidateSet
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.regression.schur import DETERMINED
-from hilcal.types import Bools, Floats
+from hilcal.types import Bools, Floats, Ints
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CandidateSet:
+    """K units, each of which a plan may take any whole number of times.
+
+    A unit is one reading (absolute positions), or one pose with its unloaded reading and some
+    loads (deflections, which share the unloaded reading and are correlated by it). The
+    information of a plan that takes unit k n_k times is
+
+        M = M0 + Σ n_k A_kᵀ A_k,    cost = Σ n_k c_k
+    """
+
+    # (K, R, P) whitened Jacobians A_k by the parameters in ordinary magnitudes (pure numbers);
+    # units with fewer rows are filled up with zeros
+    rows: Floats
+    cost: Floats  # (K,) what taking the unit once costs, over 0: readings, or seconds
+
+    def __len__(self) -> int:
+        """Return the number of units K."""
+        return len(self.rows)
+
+    @property
+    def size(self) -> int:
+        """Number of parameters P."""
+        return int(self.rows.shape[2])
+
+    def information(self, weight: Floats, which: Ints | None = None) -> Floats:
+        """Return (P, P) Σ w_k A_kᵀ A_k.
+
+        weight: (K,) weights, or of the chosen units; which: indices of the units that the weights
+        belong to; all by default.
+        """
+        rows = self.rows if which is None else self.rows[which]
+        root = (rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.size)
+        return np.asarray(root.T @ root)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,3 +210,92 @@ def square(m: Floats, what: str, size: int | None = None) -> Floats:
     if not np.allclose(m, m.T, rtol=1e-8, atol=1e-12 * float(np.abs(m).max(initial=0.0))):
         raise InputError(f"{what} is not symmetric")
     return 0.5 * (m + m.T)
+
+
+_CHUNK = 2048
+
+
+def prices(rows: Floats, matrix: Floats) -> Floats:
+    """Return (K,) tr(G A_kᵀA_k) of (K, R, P) rows, for a symmetric (P, P) matrix G.
+
+    G = L Lᵀ where it is positive definite, else V diag(s) Vᵀ: sums of squares do not cancel.
+    """
+    try:
+        root, minus = np.linalg.cholesky(matrix), None
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrix)
+        kept = np.abs(values) > 1e-15 * float(np.abs(values).max(initial=0.0))
+        root = vectors[:, kept] * np.sqrt(np.abs(values[kept]))
+        minus = np.flatnonzero(values[kept] < 0.0)
+    count, size = rows.shape[:2]
+    out = np.empty(count)
+    for start in range(0, count, _CHUNK):
+        part = rows[start : start + _CHUNK].reshape(-1, rows.shape[2]) @ root
+        total = np.einsum("ij,ij->i", part, part)
+        if minus is not None and len(minus):
+            total -= 2.0 * np.einsum("ij,ij->i", part[:, minus], part[:, minus])
+        out[start : start + _CHUNK] = total.reshape(-1, size).sum(axis=1)
+    return out
+
+
+def total_information(units: CandidateSet, weight: Floats) -> Floats:
+    """Return (P, P) Σ w_k A_kᵀA_k over all units, in chunks."""
+    out = np.zeros((units.size, units.size))
+    for start in range(0, len(units), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        root = units.rows[part] * np.sqrt(weight[part])[:, None, None]
+        root = root.reshape(-1, units.size)
+        out += root.T @ root
+    return out
+
+
+def upper_bound(
+    smooth: Smooth,  # with Z and Y
+    prior: Floats,  # (P, P) M0
+    gains: Floats,  # (K,) tr(Z H_k)
+    cost: Floats,  # (K,) c
+    budget: float,  # B
+    most: float,  # how often a unit may be taken
+    below: Floats | None = None,  # (K,) tr(Y H_k)
+) -> float:
+    """Return what φ of no plan within the budget exceeds, whole or not.
+
+    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget
+    goes to the best prices per cost, each at most `most` times. Kiefer & Wolfowitz (1960),
+    Canadian J. Math. 12; Pukelsheim (1993), Optimal Design of Experiments, ch. 7. Of a ratio
+    tr(Z N)/tr(Y N) of eigenvalues, the largest value over the same plans (Dinkelbach 1967), at
+    most 1.
+    """
+    known = float(np.sum(smooth.above * prior))
+    if below is None or smooth.below is None:
+        return known + float(gains @ spend(gains, cost, budget, most))
+    known_below = float(np.sum(smooth.below * prior))
+    if known_below <= 0.0:  # the best unit alone
+        return min(1.0, float(np.max(gains / np.maximum(below, np.finfo(float).tiny))))
+    ratio = known / known_below
+    for _ in range(100):
+        weight = spend(gains - ratio * below, cost, budget, most)
+        new = (known + float(gains @ weight)) / (known_below + float(below @ weight))
+        if new <= ratio * (1.0 + 1e-13):
+            break
+        ratio = new
+    return min(1.0, ratio)
+
+
+def spend(gains: Floats, cost: Floats, budget: float, most: float) -> Floats:
+    """Return the weights (K,) of the fractional knapsack: best gain per cost first."""
+    rate = gains / cost
+    # no more than so many of the best are reached by the budget
+    best = best_first(rate, int(np.ceil(budget / (most * float(cost.min())))) + 1)
+    before = np.concatenate([[0.0], np.cumsum(most * cost[best[:-1]])])
+    taken = np.clip((budget - before) / cost[best], 0.0, most)
+    weight = np.zeros(len(gains))
+    weight[best] = np.where(rate[best] > 0.0, taken, 0.0)
+    return weight
+
+
+def best_first(rate: Floats, count: int) -> Ints:
+    """Return the indices of the `count` largest, best first."""
+    count = min(count, len(rate))
+    chosen = np.argpartition(-rate, count - 1)[:count] if count < len(rate) else np.arange(count)
+    return np.asarray(chosen[np.argsort(-rate[chosen], kind="stable")])

@@ -21,8 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.design.approximate_design import relax
+from hilcal.design.criteria import Pair, Separate
 from hilcal.design.information import DesignProblem
-from hilcal.design.t_optimality import Pair, Separate
 from hilcal.effects.protocol import Effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.effect_columns import computable, effect_columns

@@ -25,16 +25,16 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.bound import total_information
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.candidates import (
+from hilcal.design.criterion import CandidateSet, inverse, total_information
+from hilcal.design.information import (
     Candidates,
+    DesignProblem,
+    information_of,
     reading_derivatives,
+    unit_rows,
 )
-from hilcal.design.criterion import inverse
-from hilcal.design.information import DesignProblem, information_of, unit_rows
 from hilcal.design.nominal_model import NominalModel, build, potential_names
-from hilcal.design.prediction_poses import PredictionPoses, position_derivative
+from hilcal.design.predicted import PredictionPoses, position_derivative
 from hilcal.effects.protocol import Effect
 from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.mixed.families import families_of

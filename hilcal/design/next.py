@@ -7,6 +7,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
+from hilcal.design.criteria import Pair
 from hilcal.design.discriminated_pairs import (
     LEAST_POWER,
     LEVEL,
@@ -21,7 +22,6 @@ from hilcal.design.information import DesignProblem, readings_of
 from hilcal.design.planner import Planned, Request, Say, make, ordered
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Ordering
-from hilcal.design.t_optimality import Pair
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.regression.power import family_power

@@ -8,9 +8,7 @@ import scipy.linalg as sl
 from numpy.typing import NDArray
 
 from hilcal.design.approximate_design import KINKED_TOLERANCE, ApproximateDesign, checked, relax
-from hilcal.design.bound import best_first
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criterion import Criterion
+from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 

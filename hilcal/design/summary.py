@@ -9,12 +9,11 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.design.candidates import reading_derivatives
 from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
-from hilcal.design.information import DesignProblem
+from hilcal.design.information import DesignProblem, reading_derivatives
 from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import PredictedUncertainty, predicted
-from hilcal.design.timing import Confounding, Duration
+from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
 from hilcal.regression.schur import schur_complement

@@ -10,14 +10,206 @@ transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
+from itertools import combinations
+from types import CodeType
+from typing import Literal
 
 import numpy as np
 
 from hilcal.discovery.shapes import Numbers, Shape
-from hilcal.discovery.variables import Variable
+from hilcal.effects.force_sensor import recorded
 from hilcal.effects.protocol import Situation
 from hilcal.types import Floats
+
+Kind = Literal[
+    "angle", "sum", "torque", "force", "load", "gravity", "temperature", "time", "hanging", "side",
+    "place", "sight", "sensor", "composed",
+]  # fmt: skip
+VARIES = 1e-6  # Least spread, as a share of the largest value, of a quantity that counts as varying
+_AXES = "xyz"
+_COMPONENTS = tuple(
+    (c, *(("force", "f") if c < 3 else ("moment", "m")), _AXES[c % 3], "N" if c < 3 else "N·m")
+    for c in range(6)
+)
+"""Of a wrench: index, word, letter, axis, unit."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Variable:
+    """A recorded quantity."""
+
+    kind: Kind  # what functions of it are tried
+    names: tuple[str, ...]  # what the diagnosis calls it, or those that it is a sum of
+    symbol: str  # in formulas
+    latex: str  # likewise
+    unit: str  # SI; °C for temperatures, "1" for a number
+    code: str  # how an effect reads it of its situation s; the search reads it so, too
+    need: str = ""  # column of the readings that it needs; empty for none
+    # slot and component of the transmitted wrench that it is; None for none
+    slot: tuple[int, int] | None = None
+    joint: int = -1  # index of the joint that it belongs to; −1 for none
+    vector: str = ""  # what it is a component of; empty for none
+    axis: int = -1  # along which; −1 for none
+
+    def read(self, s: Situation) -> Floats:
+        """(N,) it in the states."""
+        known = {"np": np, "recorded": recorded, "s": s}
+        return np.asarray(eval(_compiled(self.code), known))  # noqa: S307 - made below
+
+    @property
+    def cost(self) -> int:
+        """Complexity that it adds to a function of it."""
+        return int(self.kind == "sum")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Columns of the readings that it needs."""
+        return (self.need,) if self.need else ()
+
+    @property
+    def recorded(self) -> tuple["Variable", ...]:
+        """The recorded quantities that it is made of: itself."""
+        return (self,)
+
+    def slopes(self) -> tuple[tuple[tuple[int, int], str], ...]:
+        """Slots and components of the transmitted wrenches, and ∂x by each as Python."""
+        return () if self.slot is None else ((self.slot, ""),)
+
+
+@cache
+def _compiled(code: str) -> CodeType:
+    return compile(code, "<quantity>", "eval")
+
+
+def variables(s: Situation) -> list[Variable]:
+    """Return all quantities that vary over the states of a situation."""
+    found = ((v, v.read(s)) for v in _all(s))
+    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
+
+
+def _all(s: Situation) -> Iterator[Variable]:
+    n = s.angle.shape[1]
+    yield from _angles(s)
+    yield from _wrenches(n)
+    yield from _attitude(n)
+    yield from _recorded(s, n)
+    yield from _places()
+
+
+def _angles(s: Situation) -> Iterator[Variable]:
+    """Angles of joints and their sums; of a joint that slides the phase of its travel, φ."""
+    arm = s.cell.arm
+    for j, slides in enumerate(arm.slides.tolist()):
+        letter, latex = ("φ", r"\phi") if slides else ("q", "q")
+        yield Variable(
+            "angle", (f"joint {j + 1} {arm.kind(j)}",), f"{letter}_{j + 1}", f"{latex}_{j + 1}",
+            "rad", f"s.angle[:, {j}]", joint=j,
+        )  # fmt: skip
+    for i, j in combinations(np.flatnonzero(~arm.slides).tolist(), 2):
+        for sign in "+-":
+            names = f"joint {i + 1} angle", f"joint {j + 1} angle"
+            text = f"(q_{i + 1} {sign} q_{j + 1})"
+            code = f"(s.angle[:, {i}] {sign} s.angle[:, {j}])"
+            yield Variable("sum", names, text, text, "rad", code)
+    for a, b in ((i, i + k) for k in range(3, arm.n + 1) for i in range(arm.n - k + 1)):
+        # The turn of a link against another one: of consecutive joints.
+        if not arm.slides[a:b].any():
+            text = f"({' + '.join(f'q_{j + 1}' for j in range(a, b))})"
+            mine = tuple(f"joint {j + 1} angle" for j in range(a, b))
+            yield Variable("sum", mine, text, text, "rad", f"s.angle[:, {a}:{b}].sum(axis=1)")
+
+
+def _wrenches(n: int) -> Iterator[Variable]:
+    """Torques of the drives, wrenches through joints and flange, the load, the force sensor's."""
+    for j in range(n):
+        yield Variable(
+            "torque", (f"joint {j + 1} torque",), f"τ_{j + 1}", rf"\tau_{j + 1}", "N·m",
+            f"s.torque[:, {j}]", slot=(j, 5), joint=j,
+        )  # fmt: skip
+    for k in range(n + 1):
+        where, short, joint = (f"joint {k + 1}", str(k + 1), k) if k < n else ("flange", "F", -1)
+        for c, word, letter, axis, unit in _COMPONENTS[: 5 if k < n else 6]:
+            yield Variable(
+                "force", (f"{where} {word} {axis}",), f"{letter}{short}_{axis}",
+                f"{letter}_{{{short},{axis}}}", unit, f"s.wrench[:, {k}, {c}]", slot=(k, c),
+                joint=joint, vector=f"{letter}{short}", axis=c % 3,
+            )  # fmt: skip
+    for c, _, letter, axis, unit in _COMPONENTS:
+        if c % 3 == 0:
+            norm = f"np.linalg.norm(s.states.wrench[:, {c}:{c + 3}], axis=1)"
+            yield Variable("load", ("load",), f"|{letter}|", f"|{letter}|", unit, norm)
+        text, code = f"{letter}_{axis}", f"s.states.wrench[:, {c}]"
+        yield Variable("load", ("load",), text, text, unit, code, vector=letter, axis=c % 3)
+    for c, word, letter, axis, unit in _COMPONENTS:  # causes of the sensor's own errors
+        yield Variable(
+            "sensor", (f"force sensor {word} {axis}",), f"{letter}S_{axis}",
+            rf"{letter}_{{S,{axis}}}", unit, f"recorded(s)[:, {c}]",
+            vector=f"{letter}S", axis=c % 3,
+        )  # fmt: skip
+
+
+def _attitude(n: int) -> Iterator[Variable]:
+    """Direction of gravity along the axes of the joints, and across the flange."""
+    places = [(k, 2, f"axis of joint {k + 1} to gravity", f"g{k + 1}") for k in range(n)]
+    places += [(n, c, "flange attitude", f"gF_{_AXES[c]}") for c in range(3)]
+    for k, c, name, symbol in places:
+        yield Variable(
+            "gravity", (name,), symbol, symbol.replace("g", "g_", 1).replace("_F_", "_"), "1",
+            f"(s.chain.rotation[{k}][:, :, {c}]"
+            " @ (s.cell.gravity / np.linalg.norm(s.cell.gravity)))",
+            joint=k if k < n else -1, vector="gravity" if k == n else "", axis=c,
+        )  # fmt: skip
+
+
+def _recorded(s: Situation, n: int) -> Iterator[Variable]:
+    """Temperatures, times, and sides of approach: columns that readings may have."""
+    of = s.states
+    if of.air_temperature is not None:
+        zero = round(float(np.median(of.air_temperature)), 1)
+        yield Variable(
+            "temperature", ("air temperature",), f"(T_air - {zero})",
+            rf"(T_\mathrm{{air}} - {zero})", "°C", f"(s.states.air_temperature - {zero})",
+            "air_temperature",
+        )  # fmt: skip
+    if of.joint_temperature is not None:
+        zero = round(float(np.median(of.joint_temperature)), 1)
+        for j in range(n):
+            name, text = (f"joint {j + 1} temperature",), f"(T_{j + 1} - {zero})"
+            code = f"(s.states.joint_temperature[:, {j}] - {zero})"
+            yield Variable(
+                "temperature", name, text, text, "°C", code, "joint_temperature", joint=j
+            )
+    if of.time is not None:
+        zero = float(np.floor(of.time.min()))
+        text = "t" if zero == 0 else f"(t - {zero:.0f})"
+        yield Variable("time", ("time",), text, text, "s", f"(s.states.time - {zero})", "time")
+    if of.load_time is not None:
+        latex, code = r"t_\mathrm{load}", "s.states.load_time"
+        yield Variable("hanging", ("time under load",), "t_load", latex, "s", code, "load_time")
+    for j in range(n if of.approach is not None else 0):
+        name, text, code = (f"joint {j + 1} approach",), f"s_{j + 1}", f"s.states.approach[:, {j}]"
+        yield Variable("side", name, text, text, "1", code, "approach", joint=j)
+
+
+def _places() -> Iterator[Variable]:
+    """Where the target is: from the base, and as the tracker sees it."""
+    at = "s.chain.point(s.cell.target[:3, 3])"
+    seen = f"({at} @ s.cell.registration[:3, :3].T + s.cell.registration[:3, 3])"
+    for name, text, latex, code in (
+        ("reach", "ρ", r"\rho", f"np.linalg.norm({at}[:, :2], axis=1)"),
+        ("height", "z", "z", f"{at}[:, 2]"),
+        ("distance", "d", "d", f"np.linalg.norm({seen}, axis=1)"),
+        ("target x", "x", "x", f"{at}[:, 0]"),
+        ("target y", "y", "y", f"{at}[:, 1]"),
+    ):
+        axis = _AXES.find(text)
+        vector = "target" if axis >= 0 else ""
+        yield Variable("place", (name,), text, latex, "m", code, vector=vector, axis=axis)
+    flat = f"np.hypot({seen}[:, 0], {seen}[:, 1])"
+    turns = f"{seen}[:, 1], {seen}[:, 0]", f"{seen}[:, 2], {flat}"
+    yield Variable("sight", ("azimuth",), "az", r"\alpha", "rad", f"np.arctan2({turns[0]})")
+    yield Variable("sight", ("elevation",), "el", r"\varepsilon", "rad", f"np.arctan2({turns[1]})")
 
 
 @dataclass(frozen=True, slots=True)

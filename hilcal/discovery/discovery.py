@@ -16,7 +16,8 @@ law then explains of their misfit is what the whole procedure may claim.
 """
 
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -26,16 +27,15 @@ from hilcal.diagnosis.noise_verdict import MISFIT_ALARM, PREDICTABLE
 from hilcal.diagnosis.residual_regression import Dependence, residual_regression
 from hilcal.discovery.curve import Curve, curves
 from hilcal.discovery.known_effects import KnownEffects, instead_of_law, known_effects, resembling
-from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of
+from hilcal.discovery.law import Again, Coefficient, Form, Law, form_of, source_of_form
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import exact, refine
-from hilcal.discovery.screen import Screen, screen
+from hilcal.discovery.screen import LawTerm, Screen, screen
 from hilcal.discovery.search import LEAST, MOST_TERMS, Selection, search
-from hilcal.discovery.structures import Structure, averaged, structure_of, structures
-from hilcal.discovery.terms import LawTerm
-from hilcal.discovery.write_effect import source_of_form
+from hilcal.discovery.structures import Structure, averaged, pareto, structure_of, structures
+from hilcal.effects.from_file import effects_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import random_folds
 from hilcal.identification.linearisation import by_pose, left_out_by_pose, linearise
 from hilcal.readings.readings import Readings
@@ -43,6 +43,7 @@ from hilcal.regression.evidence import score_family
 from hilcal.regression.paired_test import improves
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats
+from hilcal.whole_file import replace_file
 
 Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
 """Why there are laws, or none:
@@ -390,3 +391,164 @@ def agreement(before: Fit, after: Fit, moved: Floats) -> float:
     told = linear.project_out(w.whiten(w.raw(jacobian @ theta)).reshape(-1))
     size = float(np.linalg.norm(truth) * np.linalg.norm(told))
     return float(truth @ told) / max(size, 1e-300)
+
+
+def discovery_json(d: Discovery) -> dict[str, object]:
+    """Return the document of `discover`."""
+    return {
+        "model": list(d.fit.model.named),
+        "reason": d.reason,
+        "attainable_share": d.attainable,
+        "searched_share": d.searched_share,
+        "candidates": d.candidates,
+        "catalogue": list(d.catalogue),
+        "carried_by": [
+            {"variable": c.variable, "share": c.share, "moves": c.moves} for c in d.carried
+        ],
+        "laws": [law_json(law, d) for law in d.laws],
+        "structures": [
+            {
+                "formula": x.form.text(),
+                "probability": x.probability,
+                "complexity": x.form.complexity,
+                "holdout_share": x.holdout_share,
+                "pareto": x in pareto(d.structures),
+                "law": x.law or None,
+            }
+            for x in d.structures
+        ],
+        "refused": [{"formula": formula, "why": why} for formula, why in d.refused],
+        "unfitted": [{"effect": effect, "why": why} for effect, why in d.unfitted],
+        "average": dict(zip(("rms_m", "std_m"), d.average_m(), strict=True)) if d.laws else None,
+        "curves": [curve_json(c) for c in d.curves],
+    }
+
+
+def law_json(law: Law, d: Discovery) -> dict[str, object]:
+    """Return a law as JSON."""
+    return {
+        "name": law.name,
+        "formula": law.formula,
+        "latex": law.form.latex(),
+        "acts_on": list(law.acts_on),
+        "variables": list(law.variables),
+        "parameters": [asdict(c) for c in law.parameters],
+        "holdout_share": law.holdout_share,
+        "p_value": law.p_value,
+        "variance_factor": law.left,
+        "probability": law.probability,
+        "found_again": [{**asdict(a), "variables": list(a.variables)} for a in law.again],
+        "alternatives": [x.form.text() for x in alternatives(d, law)],
+        "resembles": [asdict(r) for r in law.resembles],
+        "ranges": [
+            {"quantity": symbol, "min": low, "max": high, "unit": unit}
+            for symbol, low, high, unit in law.ranges
+        ],
+    }
+
+
+def curve_json(c: Curve) -> dict[str, object]:
+    """Return a curve as JSON: what is drawn, the binned readings, and the law; SI."""
+    x, y, std, count = c.binned
+    return {
+        "site": c.site,
+        "of": c.of,
+        "unit": c.unit,
+        "quantity": c.quantity,
+        "quantity_unit": c.quantity_unit,
+        "binned": [
+            {"x": float(a), "y": float(b), "std": float(e), "readings": int(n)}
+            for a, b, e, n in zip(x, y, std, count, strict=True)
+        ],
+        "law": [[float(a), float(b)] for a, b in c.line.T],
+    }
+
+
+MOST_SEARCHES = 3  # Searches of one refinement at most; a choice, by time
+NAME = "found"
+
+
+class LawSearch:
+    """Searches laws for one refinement, and keeps what it found.
+
+    Attributes:
+        found: the searches, in order.
+        files: of laws that stayed, by name; see `write`.
+    """
+
+    def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
+        """Laws are named after the files that they will be: found.py, found_2.py, ….
+
+        replacing: whether files of these names are removed first, as those of a rehearsal that is
+        repeated; else other names are taken.
+        """
+        if replacing:
+            for k in range(1, MOST_SEARCHES + 1):
+                (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
+        self.found: list[Discovery] = []
+        self.files: dict[str, Path] = {}
+        self._folder, self._name = folder, name
+        self._sources: dict[str, str] = {}
+
+    def propose(self, of: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
+        """Return the fit with a law, and the law's name; None where no law is proposed.
+
+        A fit is searched once, and so many of a refinement at most.
+        """
+        if any(d.fit is of for d in self.found) or len(self.found) == MOST_SEARCHES:
+            return None
+        name = self._free(of)
+        d = discover(of, say, name)
+        self.found.append(d)
+        if d.after is None:
+            return None
+        model, after = of.model, d.after
+        where = self.path(name)
+        file = effects_of(d.source.encode(), where)
+        catalogue = model.catalogue.with_effects(*file.effects)
+        catalogue = replace(catalogue, files=(*catalogue.files, file))
+        made = catalogue.make(name, model.cell, of.readings.states, m=of.readings.m)
+        grown = replace(model, effects=(*model.effects, made), catalogue=catalogue)
+        self._sources[name] = d.source
+        return fit(grown, of.readings, of.mode, of.scaling, after.theta), name
+
+    def path(self, name: str) -> Path:
+        """Return the file of a law."""
+        return self._folder.absolute() / f"{name}.py"
+
+    def write(self, names: tuple[str, ...]) -> None:
+        """Write the files of those effects that are proposed laws."""
+        for name in names:
+            if name not in self._sources:
+                continue
+            where = self.path(name)
+            replace_file(where, self._sources[name], must_be_new=True)
+            self.files[name] = where
+
+    def _free(self, of: Fit) -> str:
+        taken = {*of.model.catalogue.names, *of.model.names, *self._sources}
+        names = (_numbered(self._name, k) for k in range(1, 10_000))
+        free = (n for n in names if n not in taken and not self.path(n).exists())
+        try:
+            return next(free)
+        except StopIteration:
+            raise InputError(f"{self._folder}: no free name for a law's file") from None
+
+
+def _numbered(name: str, k: int) -> str:
+    return name if k == 1 else f"{name}_{k}"
+
+
+def laws_json(s: LawSearch) -> dict[str, object]:
+    """Return the searches of a refinement as JSON."""
+    return {
+        "discover": [
+            {
+                **discovery_json(d),
+                "written": str(s.files[d.laws[0].name])
+                if d.laws and d.laws[0].name in s.files
+                else None,
+            }
+            for d in s.found
+        ]
+    }

@@ -11,10 +11,8 @@ from functools import cached_property
 
 import numpy as np
 
-from hilcal.discovery.compose import composed_terms
-from hilcal.discovery.grow import grown
-from hilcal.discovery.screen import Screen
-from hilcal.discovery.terms import LawTerm, Scored, ScreenedTerm, Screening
+from hilcal.discovery.compose import composed_terms, grown
+from hilcal.discovery.screen import LawTerm, Scored, Screen, ScreenedTerm, Screening
 from hilcal.regression.evidence import FamilyScore, score_family
 from hilcal.regression.projection import Projection, projection
 from hilcal.types import Bools, Floats, Ints

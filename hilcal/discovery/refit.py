@@ -17,11 +17,12 @@ from hilcal.discovery.law import (
     Coefficient,
     Form,
     coefficients,
+    effect_class,
+    source_of_form,
     with_coefficients,
     with_factors,
 )
 from hilcal.discovery.screen import Screen
-from hilcal.discovery.write_effect import effect_class, source_of_form
 from hilcal.effects.check import check_effect
 from hilcal.effects.protocol import Effect, Situation
 from hilcal.errors import CannotAnswerError

@@ -12,8 +12,7 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.discovery.problem import SHORT_LIST, SearchProblem
-from hilcal.discovery.screen import Screen
-from hilcal.discovery.terms import LawTerm, Scored
+from hilcal.discovery.screen import LawTerm, Scored, Screen
 from hilcal.regression.evidence import FamilyScore
 from hilcal.regression.forward_selection import families_beside
 from hilcal.types import Floats

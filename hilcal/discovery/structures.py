@@ -27,7 +27,7 @@ from hilcal.discovery.amplitudes import Composed, Factor
 from hilcal.discovery.law import Coefficient, Form, coefficients, form_of
 from hilcal.discovery.problem import SearchProblem
 from hilcal.discovery.refit import refine
-from hilcal.discovery.screen import Screen
+from hilcal.discovery.screen import LawTerm, Screen
 from hilcal.discovery.search import (
     LEAST,
     MOST_COEFFICIENTS,
@@ -38,7 +38,6 @@ from hilcal.discovery.search import (
     plain,
 )
 from hilcal.discovery.sites import motions_of
-from hilcal.discovery.terms import LawTerm
 from hilcal.identification.fit import Fit
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening

@@ -4,10 +4,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import positive, rated_torques
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Response, Situation
 from hilcal.readings.readings import States
 from hilcal.types import Floats
 

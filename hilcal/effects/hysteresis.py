@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Situation
 
 
 class Hysteresis(PerJoint):

@@ -1,9 +1,8 @@
 """`joint_compliance`: the drive train twists under torque."""
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import ordinary_give, rated_torques
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Response, Situation
 from hilcal.types import Floats
 
 

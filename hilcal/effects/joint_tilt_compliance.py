@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_moments
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import Columns, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Parameter, Response, Situation
 from hilcal.types import Floats
 
 ACROSS = np.array([0.0, 0.0, 0.0, 1.0, 1.0, 0.0])

@@ -2,8 +2,15 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable, Directions
-from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.effects.protocol import (
+    Changeable,
+    Columns,
+    Directions,
+    Effect,
+    LoadChange,
+    Parameter,
+    Situation,
+)
 from hilcal.robot.statics import first_moment_change
 from hilcal.types import Floats
 

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, LoadChange, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, LoadChange, Parameter, Situation
 from hilcal.robot import se3
 from hilcal.robot.statics import slot_wrench_change
 from hilcal.types import Floats

@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import choice, number
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats

@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.options import rated_moments
-from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
 PARTS = np.array([[0, 0, 0, 0, 0, 1.0], [0, 0, 0, 1.0, 1.0, 0]])

@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
-from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 
 
 class TrackerScale(Effect):

@@ -5,9 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.per_joint import PerJoint
-from hilcal.effects.protocol import OWN_SPREAD, Columns, Effect, Parameter, Situation
+from hilcal.effects.protocol import OWN_SPREAD, Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.types import Floats, Ints

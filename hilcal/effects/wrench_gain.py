@@ -2,9 +2,8 @@
 
 import numpy as np
 
-from hilcal.effects.changed import Changeable
 from hilcal.effects.force_sensor import ForceSensorEffect
-from hilcal.effects.protocol import Parameter
+from hilcal.effects.protocol import Changeable, Parameter
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats
 

@@ -13,16 +13,14 @@ from hilcal.effects.options import typical_compliances
 from hilcal.effects.protocol import Columns, Effect, Situation, total
 from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.model.equilibrium import SlotResponse, at_equilibrium, compliance
+from hilcal.model.equilibrium import ReadingColumns, SlotResponse, at_equilibrium, compliance
 from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
-from hilcal.model.reading_columns import ReadingColumns
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
 from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
 from hilcal.robot.chain import Chain, Deviation
-from hilcal.robot.geometric_stiffness import geometric_stiffness
-from hilcal.robot.statics import Load, slot_wrenches
+from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
 from hilcal.types import Floats, Ints
 

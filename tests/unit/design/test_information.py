@@ -5,11 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.design.candidates import reading_covariance
-from hilcal.design.information import problem
+from hilcal.design.information import problem, reading_covariance
 from hilcal.design.nominal_model import after, nominal_model, nominal_states
-from hilcal.design.predicted import predicted
-from hilcal.design.prediction_poses import prediction_poses
+from hilcal.design.predicted import predicted, prediction_poses
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit

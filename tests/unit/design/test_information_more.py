@@ -6,8 +6,7 @@ import pytest
 from hilcal.design.discriminated_pairs import discriminated_pairs
 from hilcal.design.information import MOST_ORDINARY, MOST_PARAMETERS, problem
 from hilcal.design.nominal_model import nominal_model, nominal_states
-from hilcal.design.predicted import predicted
-from hilcal.design.prediction_poses import prediction_poses
+from hilcal.design.predicted import predicted, prediction_poses
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.readings.whitening import MODES

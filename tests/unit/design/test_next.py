@@ -8,6 +8,7 @@ import scipy.linalg as sl
 from scipy import stats
 
 from hilcal.cell import cell_from_config
+from hilcal.design.criteria import Pair
 from hilcal.design.discriminated_pairs import (
     LEVEL,
     discriminated_pairs,
@@ -20,7 +21,6 @@ from hilcal.design.information import DesignProblem, problem
 from hilcal.design.next import DRAWS, measure_next
 from hilcal.design.nominal_model import after
 from hilcal.design.planner import Request
-from hilcal.design.t_optimality import Pair
 from hilcal.diagnosis.effect_ranking import candidates
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline

@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.design.criteria import D, E, K, MeanVariance
+from hilcal.design.criteria import D, E, K, MeanVariance, Pair, Separate
 from hilcal.design.criterion import Criterion, require_determined
-from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Floats
 

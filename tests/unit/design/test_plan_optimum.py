@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilcal.design.approximate_design import ApproximateDesign, relax
-from hilcal.design.candidate_set import CandidateSet
-from hilcal.design.criteria import D, E, K, MeanVariance
-from hilcal.design.criterion import Criterion
+from hilcal.design.criteria import D, E, K, MeanVariance, Pair, Separate
+from hilcal.design.criterion import CandidateSet, Criterion
 from hilcal.design.optimum import best
-from hilcal.design.t_optimality import Pair, Separate
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.types import Floats
 

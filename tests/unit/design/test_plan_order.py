@@ -13,8 +13,7 @@ from scipy import stats
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan
-from hilcal.design.timing import pace, timeline
+from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.route import route

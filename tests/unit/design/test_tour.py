@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from hilcal.design import tour
-from hilcal.design.timing import pace
+from hilcal.design.run_order import pace
 from hilcal.types import Floats
 from tests.support.campaigns import configuration
 

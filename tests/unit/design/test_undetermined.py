@@ -10,9 +10,8 @@ from hilcal.config import CellConfig
 from hilcal.config.loads import CellLoad
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import nominal_model, planned_effects
-from hilcal.design.planner import Request, make
+from hilcal.design.planner import Request, UndeterminedParameter, make, without_undetermined
 from hilcal.design.summary import summarise
-from hilcal.design.undetermined import UndeterminedParameter, without_undetermined
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
 from tests.support.plan_cases import config_of, poses_of

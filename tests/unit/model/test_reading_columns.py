@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from hilcal.effects.protocol import Columns, Field
+from hilcal.model.equilibrium import WIDE, ReadingColumns
 from hilcal.model.observe import ReadingDerivative
-from hilcal.model.reading_columns import WIDE, ReadingColumns
 from hilcal.types import Floats, Ints
 from tests.unit.model.test_observe import COUNT, FULL, NO_LOAD, motion_of
 

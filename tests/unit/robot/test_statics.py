@@ -10,9 +10,8 @@ import pytest
 from hilcal.robot import chain as chains
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Deviation, evaluate, twist_jacobian
-from hilcal.robot.geometric_stiffness import geometric_stiffness
-from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
-from hilcal.robot.statics import Load, slot_wrench_change, slot_wrenches
+from hilcal.robot.scene import FLANGE, pinocchio_model
+from hilcal.robot.statics import Load, geometric_stiffness, slot_wrench_change, slot_wrenches
 from hilcal.types import Floats
 from tests.support.arm_cases import ARMS, ODD, arm_of, displacement, twisted
 from tests.support.effect_cases import CELLS, situation
