@@ -145,14 +145,11 @@ class Optimum:
 
 
 def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float = 1.0) -> Optimum:
-    """Return the optimum to a relative gap.
+    """Return the optimum to a relative gap, from (n,) weights over 0, under `most`, that spend B.
 
-    Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the
-    duals z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point
-    Methods), μ falling to 0. Criteria with a kink have a surrogate of order μ.
-
-    start: (n,) weights over 0, under `most`, that spend the budget; tolerance: relative gap at
-    which to stop; order: μ n at the start, about the relative gap of the start.
+    Newton's method on the barrier problem f(w) + μ Σ log w_k + μ Σ log(most − w_k), with the duals
+    z of the bounds as variables of their own (Wright 1997, Primal-Dual Interior-Point Methods), μ
+    falling to 0 from `order` / n. Criteria with a kink have a surrogate of order μ.
     """
     w, n = start, len(start)
     capped = np.isfinite(program.most)
@@ -252,10 +249,7 @@ def _search(
     mu: float,
     slope: float,
 ) -> float:
-    """Return the length of the step: halved until the barrier problem improves; 0 if never.
-
-    The information is linear in the weights: `at` and `step` are weights and information.
-    """
+    """Return the length of a step of weights and information: halved until it helps; 0 if never."""
     capped = np.isfinite(program.most)
     (w, m), (move, moved) = at, step
 
@@ -324,9 +318,8 @@ def relax(
 ) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.
 
-    Column generation: the optimum over few units by an interior-point method, then a scan of
-    all for units whose price exceeds those in use, until none is left (equivalence theorem).
-    The bound is of the scan of all units.
+    Column generation: the optimum over few units, then a scan of all for units whose price exceeds
+    those in use, until none is left (equivalence theorem). The bound is of the scan of all units.
     """
     if tolerance is None:
         tolerance = KINKED_TOLERANCE if criterion.kinked else TOLERANCE
@@ -435,8 +428,8 @@ def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats
 def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
     """Return units that a few multiplicative steps give the most weight.
 
-    w_k <- w_k (price_k / mean price)^(2/3), over the units of the best prices at the uniform
-    plan and some of all. Silvey, Titterington & Torsney (1978), Comm. Statistics A7.
+    w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics
+    A7.
     """
     units, budget = scan.units, scan.budget
     count = min(len(units), max(_SHORT, int(4 * budget / (scan.cap * float(units.cost.min())))))

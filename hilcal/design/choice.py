@@ -39,10 +39,9 @@ SAMPLE = 150  # Poses by which sets of loads are compared. A choice.
 class Objective:
     """A design problem with its criterion.
 
-    D and A are of all parameters, the potential terms with their priors among them; in A these are
-    nuisance parameters. I is of predictions with all effects; see `mixed_design`. E and K are of
-    the model's parameters alone, as the observability indices of the literature are, without those
-    that have a prior.
+    D and A are of all parameters, the potential terms with their priors among them (nuisance
+    parameters in A), I of predictions with all effects (`mixed_design`), E and K of the model's
+    parameters without a prior.
     """
 
     criterion: Criterion  # φ
@@ -70,10 +69,7 @@ def canonical(name: str) -> str:
 def objective_of(
     problem: DesignProblem, config: CellConfig, name: str, work: PredictionPoses | None
 ) -> Objective:
-    """Return a design problem with a criterion.
-
-    name: one of `CRITERIA`, or "test", the former name of "I"; work: the prediction poses, for "I".
-    """
+    """Return a design problem with a criterion by its name; "I" needs prediction poses."""
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
     size = problem.model_size
@@ -131,8 +127,8 @@ def choose_poses(
 ) -> Design:
     """Return the exact design of so many poses, each read once under all that it bears.
 
-    Where the cell leaves fewer poses, some are read again. The design's bound is that of as many
-    readings at any number of poses, under any loads.
+    Where the cell leaves fewer poses, some are read again. The bound is that of as many readings at
+    any number of poses, under any loads.
     """
     free, index = only(asked, usable), np.flatnonzero(usable)
     of: dict[int, list[int]] = {}
@@ -178,11 +174,8 @@ def costly_loads(
 ) -> tuple[tuple[str, float], ...]:
     """Return loads without which the same time buys more, with the gain as a share of φ.
 
-    Hanging a load costs as much time as so many readings; a plan without it takes these
-    instead. Compared are the continuous optima over some of the poses, one load after the other.
-
-    budget: readings of the plan with all loads; change: readings that fit into the time of one load
-    change.
+    Hanging a load costs as much time as `change` readings; a plan without it takes these instead.
+    Compared are the continuous optima over some of the poses, one load after the other.
     """
     poses = np.array([pose for pose, _ in problem.what])
     few = rng.permutation(len(problem.candidates))[:SAMPLE]

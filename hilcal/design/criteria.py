@@ -94,9 +94,8 @@ class D(SmoothCriterion):
 class MeanVariance(SmoothCriterion):
     """φ(M) = 1 / tr(C M⁻¹), the inverse of a mean variance: A- and I-optimality.
 
-    With C = 1/s at s parameters it is their mean variance: O5 of Sun & Hollerbach (2008), IEEE
-    ICRA, "Observability index selection for robot calibration". With C the mean of VᵀV over
-    prediction poses, V the Jacobian of the position there, it is that of the predicted position:
+    With C = 1/s at s parameters it is O5 of Sun & Hollerbach (2008), IEEE ICRA; with C the mean of
+    VᵀV over prediction poses, V the Jacobian of the position, the predicted variance there:
     Atkinson, Donev and Tobias, *Optimum Experimental Designs, with SAS* (2007), chapter 10. With a
     model that may be complete, φ(M) = 1 / (tr(C M⁻¹) + tr(C_s M_ss⁻¹)).
     """
@@ -160,10 +159,9 @@ _FLOOR = 1e-14
 class E(Criterion):
     """φ(M) = λ_min(S): the worst determined direction of the parameters of interest.
 
-    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters,
-    M itself where all are of interest. The surrogate is the barrier of the semidefinite program
-    max t, S ⪰ t 1: F = max over t of t + μ log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has
-    trace 1: λ_min(N) ≤ tr(Z N).
+    O3 of Nahvi & Hollerbach (1996), IEEE ICRA; S is the Schur complement of the other parameters.
+    The surrogate is the barrier of the semidefinite program max t, S ⪰ t 1: F = max over t of t + μ
+    log det(S − t 1), whose gradient Z = μ (S − t 1)⁻¹ has trace 1: λ_min(N) ≤ tr(Z N).
     """
 
     interest: Ints | None = None  # indices of the parameters of interest; all by default
@@ -298,12 +296,10 @@ class Pair:
             raise InputError(f"{self.name}: a parameter is on both sides")
 
     def residual(self, m: Floats) -> Floats:
-        """Return the parameters u (P,) of the residual after model and rival are fitted.
+        """Return the parameters u (P,) of the residual after model and rival are fitted at M.
 
-        u has β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β is the minimum of
-        vᵀ M v over all v with β at the effect, with S the Schur complement of the nuisance.
-
-        m: (P, P) information M.
+        u has β at the effect and −M_nn⁻ M_ne β at the nuisance: uᵀ M u = βᵀ S β, S the Schur
+        complement.
         """
         u = np.zeros(len(m))
         u[self.effect] = self.beta
@@ -314,9 +310,8 @@ class Pair:
 class Separate(Criterion):
     """φ(M) = the least over pairs of uᵀ M u: the weakest non-centrality.
 
-    What an effect of the size β adds to the sum of squares beyond what the model and its rival
-    can explain; the power of the test between the two grows with it. Atkinson & Fedorov (1975),
-    Biometrika 62(1), T-optimality, for linear rivals.
+    What an effect of the size β adds to the sum of squares beyond what the model and its rival can
+    explain. Atkinson & Fedorov (1975), Biometrika 62(1), T-optimality, for linear rivals.
     """
 
     pairs: tuple[Pair, ...]  # what is to be separated
@@ -374,8 +369,7 @@ class Separate(Criterion):
     def _solved(self, m: Floats) -> tuple[Floats, Root, list[tuple[Ints, Root]]]:
         """Return the residuals (N, P) of the pairs, and roots of the inverse of their nuisance.
 
-        M_nn⁻ is that of the model, the same for all, and by rival what it adds: L S_ff⁻ Lᵀ with
-        L = (−M_mm⁻ M_mf, 1).
+        M_nn⁻ is that of the model, and by rival L S_ff⁻ Lᵀ more with L = (−M_mm⁻ M_mf, 1).
         """
         size, model = len(m), self._common
         own = np.zeros((size, len(model)))
@@ -431,7 +425,7 @@ class Separate(Criterion):
         """Return φ without the pairs that what is known already separates well enough.
 
         No plan brings the weakest pair over the least of the bounds uᵀ M0 u + B max |A_k u|² / c_k
-        of single pairs (see `bound.upper_bound`), and no pair falls below its value at M0.
+        of single pairs, and no pair falls below its value at M0.
         """
         spread = prior + total_information(
             units, np.full(len(units), budget / float(units.cost.sum()))
@@ -467,10 +461,7 @@ def _explained(m: Floats, model: Ints, rest: Ints) -> Floats:
 
 
 def _rival_root(left: Floats, m: Floats, rival: Ints) -> Floats:
-    """Return T (N, F, F) with Tᵀ T = S_ff⁻ of what is left beyond the model of matrices M.
-
-    A parameter of which the model leaves less than `DETERMINED` is none beside it.
-    """
+    """Return T (N, F, F) with Tᵀ T = S_ff⁻ of what the model leaves of matrices M."""
     block = left[:, rival[:, None], rival].copy()
     lost = block[:, range(len(rival)), range(len(rival))] <= DETERMINED * m[:, rival, rival]
     block[lost[:, :, None] | lost[:, None, :]] = 0.0
@@ -483,11 +474,8 @@ def condensed(
     """Return the same problem by fewer parameters, in which its information is well conditioned.
 
     The model, common to the nuisance of all pairs, is made orthogonal by the information of all
-    units together, and so is each suspect beyond the model. Directions that no unit determines
-    are dropped: as a nuisance they explain nothing, as an effect they show nothing. Every
-    non-centrality of every plan stays what it is.
-
-    units: what can be taken, by the P parameters; prior: (P, P) what is known before.
+    units together, and so is each suspect beyond the model. Directions that no unit determines are
+    dropped. Every non-centrality of every plan stays what it is.
     """
     model = pairs[0].nuisance
     for pair in pairs:

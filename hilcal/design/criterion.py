@@ -13,11 +13,9 @@ from hilcal.types import Bools, Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CandidateSet:
-    """K units, each of which a plan may take any whole number of times.
+    """K units, each of which a plan may take any whole number of times n_k.
 
-    A unit is one reading (absolute positions), or one pose with its unloaded reading and some
-    loads (deflections, which share the unloaded reading and are correlated by it). The
-    information of a plan that takes unit k n_k times is
+    A unit is one reading, or one pose with its unloaded reading and some loads (deflections).
 
         M = M0 + Σ n_k A_kᵀ A_k,    cost = Σ n_k c_k
     """
@@ -37,11 +35,7 @@ class CandidateSet:
         return int(self.rows.shape[2])
 
     def information(self, weight: Floats, which: Ints | None = None) -> Floats:
-        """Return (P, P) Σ w_k A_kᵀ A_k.
-
-        weight: (K,) weights, or of the chosen units; which: indices of the units that the weights
-        belong to; all by default.
-        """
+        """Return (P, P) Σ w_k A_kᵀ A_k of all units, or of those of some indices."""
         rows = self.rows if which is None else self.rows[which]
         root = (rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.size)
         return np.asarray(root.T @ root)
@@ -76,8 +70,8 @@ class Smooth:
 class Criterion(Protocol):
     """φ(M) of an information matrix M (P, P): more is better.
 
-    Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only
-    the ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
+    Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only the
+    ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
     """
 
     @property
@@ -96,11 +90,7 @@ class Criterion(Protocol):
         """Return φ of (..., P, P) information matrices; 0 where they are singular."""
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
-        """Return f near M = m, which tends to a function of φ alone as `order` tends to 0.
-
-        It is near φ / φ(m), or log φ, so that its changes are relative. It returns None for
-        an M at which it does not exist.
-        """
+        """Return f near φ / φ(m), or log φ, and nearer as `order` tends to 0; None if undefined."""
 
     def relevant(self, units: CandidateSet, prior: Floats, budget: float) -> "Criterion":
         """Return φ without what is decided: equal near the optimum of the plans of a budget."""
@@ -112,11 +102,7 @@ class Criterion(Protocol):
 
 
 def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
-    """Refuse a singular information matrix, and name what is not determined.
-
-    m: (P, P) of all candidates, and of what is known before; names: of the P parameters; numbers
-    from 1 by default.
-    """
+    """Refuse a singular information matrix (P, P), and name what is not determined."""
     label = tuple(f"parameter {k + 1}" for k in range(len(m))) if names is None else names
     diagonal = np.diag(m)
     blind = np.flatnonzero(diagonal <= 0.0)
@@ -160,8 +146,8 @@ def inverse(m: Floats) -> tuple[Floats, float] | None:
 def factors(m: Floats) -> tuple[Floats, Bools]:
     """Return Cholesky factors of (N, P, P) matrices, and which (N,) of them are regular.
 
-    A pivot is what is left of a parameter's information when those before it are unknown; in
-    place of zero, rounding leaves about 1e-16 P of it.
+    A pivot is what is left of a parameter's information when those before it are unknown; in place
+    of zero, rounding leaves about 1e-16 P of it.
     """
     try:
         factor = np.linalg.cholesky(m)
@@ -177,13 +163,10 @@ def factors(m: Floats) -> tuple[Floats, Bools]:
 
 
 def soft_least(values: Floats, width: float) -> tuple[float, Floats]:
-    """Smooth least of numbers s: F = max over t of t + μ Σ log((s_i − t) / μ).
+    """Return the smooth least F = max over t of t + μ Σ log((s_i − t) / μ) of numbers s, and p.
 
-    Its derivatives p_i = μ / (s_i − t) are over 0 and sum to 1, so that min s' ≤ Σ p_i s'_i for
-    any other numbers s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
-
-    Returns:
-        F, and (n,) p.
+    Its derivatives p_i = μ / (s_i − t) sum to 1, so that min s' ≤ Σ p_i s'_i for any other numbers
+    s'. Σ p_i s_i exceeds min s by at most (n − 1) μ.
     """
     least = float(values.min())
     gap = values - least
@@ -260,11 +243,10 @@ def upper_bound(
 ) -> float:
     """Return what φ of no plan within the budget exceeds, whole or not.
 
-    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget
-    goes to the best prices per cost, each at most `most` times. Kiefer & Wolfowitz (1960),
-    Canadian J. Math. 12; Pukelsheim (1993), Optimal Design of Experiments, ch. 7. Of a ratio
-    tr(Z N)/tr(Y N) of eigenvalues, the largest value over the same plans (Dinkelbach 1967), at
-    most 1.
+    φ(M0 + Σ n_k H_k) ≤ tr(Z M0) + max of Σ n_k tr(Z H_k) over n ≥ 0, Σ n_k c_k ≤ B: the budget goes
+    to the best prices per cost. Kiefer & Wolfowitz (1960), Canadian J. Math. 12; Pukelsheim (1993),
+    Optimal Design of Experiments, ch. 7. Of a ratio tr(Z N)/tr(Y N) of eigenvalues, the largest
+    value over the same plans (Dinkelbach 1967), at most 1.
     """
     known = float(np.sum(smooth.above * prior))
     if below is None or smooth.below is None:

@@ -57,11 +57,10 @@ class DiscriminatedPairs:
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:
     """Return the pairs of potential terms, both ways round, that some measurement separates.
 
-    None does where the best of all plans of `MANY` readings, with the prior information, has a
-    power below `LEAST_POWER`: for the first of the parameters of the effect that is there. These
-    are those that the readings so far support, see `supported_parameters`. Of the others a few
-    directions are drawn (always the same), each of an RMS strength of 1 σ of a measured element
-    over all units.
+    None does where the best plan of `MANY` readings, with the prior information, has a power below
+    `LEAST_POWER` at the first parameters of the effect. Parameters are those that the readings so
+    far support; of other effects a few directions are drawn, the same every time, each of an RMS
+    strength of 1 σ of a measured element over all units.
     """
     names = tuple(e.name for e in problem.families)
     if len(names) < 2:
@@ -90,10 +89,7 @@ def pair_of(problem: DesignProblem, names: tuple[str, str], beta: Floats) -> Pai
 
 
 def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats]:
-    """Return (count, E) parameters of the families that the readings so far support, SI.
-
-    Draws from their posterior, its mean first; see `effect_estimate`.
-    """
+    """Return (count, E) draws, SI, of the families that the readings so far support."""
     fit, out = problem.nominal.fit, {}
     if fit is None:
         return {}
@@ -154,11 +150,7 @@ def _best_power(problem: DesignProblem, of: DiscriminatedPairs, pair: Pair) -> f
 
 
 def power(pair: Pair, information: Floats) -> float:
-    """Return the power of the test at 1 % of the effect beyond model and rival.
-
-    pair: the effect, and what is fitted; information: (P, P) of a plan, with
-    `DiscriminatedPairs.prior`.
-    """
+    """Return the power of the test of a pair at the information (P, P) of a plan and the prior."""
     s = schur_complement(information, pair.effect, pair.nuisance)
     return family_power(s, pair.beta, LEVEL)
 
@@ -199,12 +191,7 @@ class EffectEstimate:
 
 
 def estimate(linear: Linearisation, effect: Effect) -> EffectEstimate | None:
-    """Estimate an effect beside the model.
-
-    None where these readings lack a column that it needs, or cannot show any direction of it.
-
-    linear: of a fit in scaling gc, of a model without the effect; effect: built for any states.
-    """
+    """Estimate an effect beside the model of a gc-scaled fit; None where its readings cannot."""
     if not computable(linear.fit, effect):
         return None
     columns = effect_columns(linear.fit, effect)

@@ -40,10 +40,7 @@ what in the cell's configuration decides it."""
 
 
 class Space(Feasibility):
-    """The states that a plan may use: `Feasibility` with margins, at most half a turn of a joint.
-
-    All targets have to be seen, and the pose is no singular one.
-    """
+    """The states that a plan may use: `Feasibility` with margins, at most half a turn a joint."""
 
     def __init__(self, cell: Cell, config: CellConfig, margins: Margins = PLANNED) -> None:
         """Build the shapes once."""
@@ -74,10 +71,7 @@ class Space(Feasibility):
         return (*(() if self.sight is not None else (TRACKER_UNKNOWN,)), *super().remarks)
 
     def reasons(self, q: Floats, load: str = UNLOADED) -> dict[str, Bools]:
-        """Return by reason (N,) which states keep it; in the order of `REASONS`.
-
-        q: (N, n) joint angles, rad.
-        """
+        """Return by reason, in the order of `REASONS`, (N,) which states (N, n) keep it."""
         return {reason: self.keeps(reason, q, load) for reason in REASONS}
 
     def keeps(self, kind: str, q: Floats, load: str = UNLOADED) -> Bools:
@@ -101,10 +95,7 @@ class Space(Feasibility):
         return good
 
     def begins(self, q: Floats, loads: Iterable[str]) -> bool:
-        """Return whether a run may begin and read again at a state (n,) under some loads.
-
-        The arm comes there from `beside` it.
-        """
+        """Return whether a run may begin and read again at a state (n,) under some loads."""
         away = beside(q, self.cell.arm, self.config.limits.joint_margin_rad)[None]
         return all(
             self.allowed(away, load, STATE).all() and self.passable(q, away, load).all()
@@ -200,10 +191,7 @@ def draw(
 
 
 def _kept(space: Space, q: Floats, left: dict[str, int], lost: dict[str, Floats]) -> Floats:
-    """Those of the states that are allowed unloaded.
-
-    Counts what each reason leaves, and keeps the last states that each has taken.
-    """
+    """Return the states that are allowed unloaded; note what each reason leaves and takes."""
     for reason in _FUNNEL:
         if len(q):
             keeps = space.keeps(reason, q, UNLOADED)

@@ -70,10 +70,7 @@ class Goal:
         return found
 
     def check(self, units: Mapping[str, str]) -> None:
-        """Refuse a goal that does not fit the parameters of a model.
-
-        units: SI unit of each parameter by name.
-        """
+        """Refuse a goal that does not fit the parameters of a model, by the SI unit of each."""
         if self.of_position or self.relative:
             if not self.of_position:
                 self.names(dict.fromkeys(units, 0.0))
@@ -181,19 +178,10 @@ SHARE = 0.1  # Share of the time that may be spent on fits while measuring
 class GoalRule:
     """Judges a campaign by its goal, with the fit that `hilcal identify` would make at its end.
 
-    The model is the effects of `[planning] model`. `[planning] readings` says what is fitted:
-    positions, or deflections: then a loaded reading counts from its unloaded one on, and readings
-    that are all unloaded are fitted as positions.
-
     The goal counts as met by a fit that converged, to readings that determine what the goal is
-    about: unloaded readings, for one, determine no deflection. Where the residual is more than
-    noise, the stated uncertainty is itself an estimate, and a check after every reading will once
-    find it small by chance: then two fits in a row have to meet the goal, except at the plan's end.
-
-    Fits take at most a tenth of the time (`SHARE`), so that none delays the campaign.
-
-    Attributes:
-        status: that of the last fit.
+    about. Where the residual is more than noise, the stated uncertainty is itself an estimate, and
+    a check after every reading will once find it small by chance: then two fits in a row have to
+    meet the goal, except at the plan's end. Fits take at most a tenth of the time (`SHARE`).
     """
 
     def __init__(
@@ -251,10 +239,7 @@ class GoalRule:
         return self.status
 
     def _fitted(self, readings: Readings) -> tuple[Readings, Mode]:
-        """Return the readings that are judged, and how.
-
-        Where deflections are planned, a loaded reading counts as soon as its unloaded one is read.
-        """
+        """Return the readings that are judged, and how; deflections need an unloaded one."""
         if self._config.planning.readings == "absolute":
             return readings, "absolute"
         kept = readings[has_unloaded(readings)]
@@ -289,10 +274,9 @@ class GoalRule:
         """RMS standard uncertainty of what is predicted where the robot will work, m.
 
         That of the fit's covariance T H⁻¹ Tᵀ, widened as `identify` widens the parameters'.
-        Infinite where directions that the readings do not determine move the prediction. A family
-        that the fit holds at zero may be so for want of readings, so that there have to be more
-        degrees of freedom than it has parameters, and more than one in any case; where deflections
-        are planned, some have to be read.
+        Infinite where directions that the readings do not determine move it, and where there are no
+        more degrees of freedom than a family has parameters that the fit holds at zero for want of
+        readings.
         """
         if found.mode != self._config.planning.readings:
             return float(np.inf)

@@ -85,11 +85,7 @@ class ReadingDerivatives:
 def candidates(
     nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
 ) -> Candidates:
-    """Return the states of poses under the loads of a configuration.
-
-    q: (N, n) joint angles, rad; allowed: (N, 1 + L) which states may be taken, unloaded first; all
-    by default.
-    """
+    """Return the states of poses (N, n) under the loads of a cell; all are allowed by default."""
     gravity = nominal.cell.gravity
     names = (UNLOADED, *(load.name for load in config.loads))
     wrench = np.array([np.zeros(6), *(load.wrench(gravity) for load in config.loads)])
@@ -135,11 +131,9 @@ def absolute_rows(of: ReadingDerivatives) -> Floats:
 
 
 def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...]) -> Floats:
-    """Whitened derivatives (N, S·m, P) of S deflections that share one unloaded reading.
+    """Whitened derivatives (k, S·m, P) of deflections of k poses under S loads.
 
     Block (i, j) of their covariance is δ_ij V_i + V_u: the unloaded reading's error is in all.
-
-    which: poses, of those in `of`; loads: S indices of loads, 1 to L.
     """
     jacobian, v = of.jacobian[which], of.covariance[which]
     count, _, m, size = jacobian.shape
@@ -154,16 +148,10 @@ def deflection_rows(of: ReadingDerivatives, which: Ints, loads: tuple[int, ...])
 
 
 def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
-    """Covariance of all that is read in one arrival of the arm: of its targets together.
+    """Covariance (N, T·m, T·m) of all that is read in each arrival: of N·T states in succession.
 
-    They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with
-    F = R J Σ_q^½ (see `reading_covariance`).
-
-    nominal: the model, with the tracker in its place; config: `[tracker]`, `[acquire]` and
-    `[repeatability]`; predicted: N·T states, the T readings of one arrival in succession.
-
-    Returns:
-        (N, T·m, T·m) covariances.
+    They have the arm's repeatability in common: block (i, j) is δ_ij V_instrument + F_i F_jᵀ with F
+    = R J Σ_q^½ (see `reading_covariance`).
     """
     single = reading_covariance(nominal, config, predicted)
     count, m = nominal.each, nominal.m
@@ -181,19 +169,12 @@ def arrival_covariance(nominal: NominalModel, config: CellConfig, predicted: Pre
 
 
 def reading_covariance(nominal: NominalModel, config: CellConfig, predicted: Prediction) -> Floats:
-    """Covariance of the mean of K samples at predicted states, and of the arm's return to them.
+    """Covariance (N, m, m) of the mean of K samples at predicted states, and of the arm's return.
 
         V = (s + (1 − s)/K) Σ + R J Σ_q Jᵀ Rᵀ
 
-    with Σ what the tracker states of one sample, s its systematic share, K the samples of a
-    reading (the expectation of what a run computes from its samples), and the arm's
-    repeatability as identification adds it.
-
-    nominal: the model, with the tracker in its place; config: `[tracker]`, `[acquire]` and
-    `[repeatability]`; predicted: N states.
-
-    Returns:
-        (N, m, m) covariances in sensor axes; m², m·rad, rad².
+    with Σ what the tracker states of one sample, s its systematic share, in sensor axes; m², m·rad,
+    rad².
     """
     a, o, m = config.acquire, predicted.observation, nominal.m
     stated = _instrument(nominal, config, predicted)
@@ -312,15 +293,11 @@ class DesignProblem:
 def problem(
     nominal: NominalModel, config: CellConfig, q: Floats, allowed: Bools | None = None
 ) -> DesignProblem:
-    """Return the design problem of candidate poses under the loads of a cell.
+    """Return the design problem of candidate poses (N, n), rad, under the loads of a cell.
 
-    A unit of absolute positions is one reading. A unit of deflections is a pose with its
-    unloaded reading and some loads: each by itself, all that the pose bears, and pairs where
-    there are few loads. It costs as many readings as it takes, the unloaded one included.
-
-    config: loads, noise, and `[planning]`: kind of readings, potential terms; q: (N, n) candidate
-    poses, rad; allowed: (N, 1 + L) which states may be taken, the unloaded ones first; all by
-    default.
+    A unit of absolute positions is one reading. A unit of deflections is a pose with its unloaded
+    reading and some loads: each by itself, all that the pose bears, and pairs where there are few
+    loads. It costs as many readings as it takes, the unloaded one included.
     """
     mode = config.planning.readings
     if mode == "deflection" and not config.loads:
@@ -519,16 +496,11 @@ def _strengths(
 
 
 def information_of(nominal: NominalModel, more: tuple[Effect, ...], scale: Floats) -> Floats:
-    """Return AᵀA (P, P) of the readings that the assumed model was fitted to; zero without any.
+    """Return AᵀA (P, P) of the readings that the model was fitted to, and of a carried prior.
 
-    With the information of a prior that is carried over from another campaign.
-
-    A is the Jacobian at the fit, whitened by the readings' own covariances: what the fit's normal
-    equations hold, without its priors.
-
-    nominal: the model, whose live parameters come first; more: effects that are not in the model.
-    Those that cannot be computed from these readings, which lack a column, have no information.;
-    scale: (P,) what one unit of each parameter is, SI.
+    A is the Jacobian at the fit, whitened by the readings' own covariances, by the live parameters
+    and those of `more` effects in units of `scale` (P,). Effects that lack a column of the readings
+    have no information.
     """
     fit, count = nominal.fit, len(nominal.live)
     known = np.zeros((len(scale), len(scale)))

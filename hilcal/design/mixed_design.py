@@ -59,11 +59,7 @@ class MixedDesign:
 
 
 def mixed_design(of: DesignProblem, config: CellConfig, work: PredictionPoses) -> MixedDesign:
-    """Return the design problem of predictions with all effects.
-
-    of: the design problem of the model; config: its noise; where it states no repeatability, an
-    ordinary one is assumed.
-    """
+    """Return the design problem of predictions with all effects."""
     nominal, config = of.nominal, _with_scatter(of.nominal, config)
     more, std = other_effects(nominal, config)
     prior_std = nominal.prior_std[nominal.live]
@@ -110,8 +106,7 @@ def balanced(of: MixedDesign) -> MixedDesign:
 def other_effects(nominal: NominalModel, config: CellConfig) -> tuple[tuple[Effect, ...], Floats]:
     """Return the effects beside the model, and the standard deviations of their parameters, SI.
 
-    Those of `[planning] against` at the sizes that arms have; none where a fit has a background,
-    which holds them already.
+    Those of `[planning] against`; none where a fit has a background, which holds them already.
     """
     model, known = nominal.model, nominal.model.catalogue
     names = () if model.background else potential_names(config, model)

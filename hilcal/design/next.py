@@ -76,8 +76,7 @@ def measure_next(
 ) -> Next:
     """Plan the measurements that separate suspects.
 
-    The criterion is the least non-centrality over all pairs of them, at the parameters that the
-    readings so far tell of each and at others that could be as well; see `discriminated_pairs`.
+    The criterion is the least non-centrality over all pairs of them; see `discriminated_pairs`.
     """
     names = tuple(dict.fromkeys(suspects))
     if len(names) < 2:
@@ -119,11 +118,7 @@ def measure_next(
 def expected(
     problem: DesignProblem, names: tuple[str, str], betas: Sequence[Floats], information: Floats
 ) -> float:
-    """Return the power of a pair, the mean over parameters that its effect may have.
-
-    names: effect that is there, rival that is fitted; betas: (E,) parameters of the effect, in the
-    problem's units; information: (P, P) of all readings, with `DiscriminatedPairs.prior`.
-    """
+    """Return the power of a pair (effect, rival), the mean over parameters β (E,) of the effect."""
     if not len(betas):
         return LEVEL
     pair = pair_of(problem, names, betas[0])
@@ -203,11 +198,7 @@ def reordered(
 
 
 def _where(made: Planned, pair: Pair, then: Floats) -> tuple[dict[str, float], float]:
-    """Return the shares of the loads in uᵀ M u of a pair, and the ratio of the reach (see `Next`).
-
-    Deflections that share an unloaded reading are correlated: a load's share is then what it
-    adds to those before it.
-    """
+    """Return the loads' shares in uᵀ M u of a pair, and the ratio of the reach (see `Next`)."""
     of, u = made.problem, pair.residual(then)
     taken = np.flatnonzero(made.counts)
     worth = np.array([float(np.sum((of.units.rows[k] @ u) ** 2)) for k in taken])

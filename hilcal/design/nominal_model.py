@@ -85,10 +85,9 @@ def nominal_model(
     # does not fix.
     prior: CarriedPrior | None = None,
 ) -> NominalModel:
-    """Return the model of `[planning]` with ordinary parameters.
+    """Return the model of `[planning]`: the baseline's parameters ordinary, all others zero.
 
-    What is planned hardly depends on the parameters: deflections are linear in them to about
-    1e-3. Those of the baseline's effects are ordinary, all others zero.
+    What is planned hardly depends on them: deflections are linear in them to about 1e-3.
     """
     known = catalogue or installed()
     place, given = nominal_tracker_place(cell, config)
@@ -154,11 +153,7 @@ def carried_information(model: Model, live: Ints) -> Floats | None:
 
 
 def after(fit: Fit, config: CellConfig) -> NominalModel:
-    """Return the model and the parameters of what has been measured already.
-
-    fit: the newest revision of the campaign; config: the configuration of the cell that is planned
-    for.
-    """
+    """Return the model and the parameters of what has been measured already, by its newest fit."""
     if fit.scaling != "gc":
         raise InputError(f"planning on needs a fit with scaling gc, this one has {fit.scaling}")
     cell, prior = replace(fit.model.cell, registration_known=True), fit.solution.prior
@@ -205,10 +200,7 @@ def random_columns(effects: tuple[Effect, ...]) -> tuple[str, ...]:
 
 
 def planned_effects(config: CellConfig, catalogue: Catalogue) -> dict[str, dict[str, object]]:
-    """Return the effects of `[planning] model`, by name, with the options written behind them.
-
-    Each is written as for `identify --effects`, e.g. "joint_compliance(joints=2-6)".
-    """
+    """Return the effects of `[planning] model` with their options, written as for `--effects`."""
     try:
         return read_effects_text(", ".join(config.planning.model), "effects", catalogue)
     except InputError as error:
@@ -245,8 +237,8 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
     """Names of the effects of `[planning] against`, without those of the model.
 
-    Of the whole catalogue those are left out that need what only the order of a plan determines, as
-    the time or the side of approach.
+    Of the whole catalogue those are left out that need what the order of a plan determines, as
+    time.
     """
     asked = config.planning.against
     if asked == "catalogue":
@@ -269,10 +261,7 @@ def nominal_tracker_place(cell: Cell, config: CellConfig) -> tuple[Floats, bool]
 
 
 def nominal_states(q: Floats, wrench: Floats) -> States:
-    """Return states (N) with times, temperatures and sides, as a shuffled order would have them.
-
-    q: (N, n) joint angles, rad; wrench: (N, 6) at the load point, base axes, N and N·m.
-    """
+    """Return states (N) with times, temperatures and sides, as a shuffled order would have them."""
     rng = np.random.default_rng(_SEED)
     time = rng.uniform(0.0, DURATION_S, len(q))
     approach = rng.choice([-1.0, 1.0], q.shape)
@@ -298,10 +287,7 @@ def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Fl
 
 
 def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
-    """Return the cell with what `[tracker] observes` plans for; a point of unknown place is there.
-
-    A plane of unknown place is level, at the height of the tracker.
-    """
+    """Return the cell with what `[tracker] observes`; a plane of unknown place is level."""
     kind: ObserverKind = "point" if config.tracker.observes == "distance" else "gauge"
     if config.tracker.observes == "position":
         return cell

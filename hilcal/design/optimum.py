@@ -111,11 +111,10 @@ def exact(
 ) -> Ints:
     """Return (K,) whole numbers n of units with Σ n_k c_k ≤ B that nearly maximise φ.
 
-    The whole parts of the continuous weights are completed unit by unit: the next one is that
-    with which the plan, ideally completed by the continuous optimum, is best. Then each unit is
-    taken out in turn and its budget spent anew (Fedorov 1972; with units of different cost a
-    unit may give way to several); where this no longer helps, a few random ones are taken out at
-    once, and what is a little worse is gone on from for a while.
+    The whole parts of the continuous weights are completed unit by unit: the next one is that with
+    which the plan, ideally completed by the continuous optimum, is best. Then each unit is taken
+    out in turn and its budget spent anew (Fedorov 1972); where this no longer helps, a few random
+    ones are taken out at once, and what is a little worse is gone on from for a while.
     """
     prior = checked(units, budget, prior, most)
     if effort is None:
@@ -184,10 +183,9 @@ class _Search:
     def refilled(
         self, counts: Ints, banned: int = -1, rng: np.random.Generator | None = None
     ) -> _Plan:
-        """Return the plan after its free budget is spent, one unit after another.
+        """Return the plan after its free budget is spent unit by unit, `banned` not first.
 
-        counts: (S,) of the plan; banned: a unit not to be taken first; rng: passes over some units
-        at random; the best is always taken by default.
+        The best unit is taken; with `rng`, some are passed over at random.
         """
         counts = counts.copy()
         m = self._information(counts)
@@ -249,8 +247,7 @@ class _Search:
     ) -> tuple[_Plan, int]:
         """Return the best of plans in which a few random units give way to others, again and again.
 
-        A plan that is little worse than the best so far is gone on from, ever less so
-        (record-to-record travel, Dueck 1993, J. Computational Physics 104(1)).
+        Record-to-record travel, Dueck (1993), J. Computational Physics 104(1).
         """
         best, whole = plan, left
         while left > 0 and 0.0 < best.value < goal:

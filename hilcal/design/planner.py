@@ -92,8 +92,8 @@ def without_undetermined(
     """Return the problem of those parameters that the candidates determine, and the others.
 
     A parameter without a prior is left out where all candidates together change by less than
-    `regression.normal_equations.INFORMATION` with an ordinary magnitude of it; of those that are
-    confounded with each other as many as it takes.
+    `INFORMATION` with an ordinary magnitude of it; of those that are confounded as many as it
+    takes.
     """
     size = of.model_size
     every = of.prior + of.units.information(np.ones(len(of.units)))

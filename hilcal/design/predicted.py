@@ -36,10 +36,7 @@ class PredictionPoses:
     what: str  # in words, e.g. "deflection under 5kg at 100 poses".
 
     def std(self, covariance: Floats) -> Floats:
-        """Return (T,) standard deviations of the position, sqrt(tr(V Cov Vᵀ)), m.
-
-        covariance: (L, L) of the model's live parameters, in their scales.
-        """
+        """Return (T,) standard deviations of the position, sqrt(tr(V Cov Vᵀ)), m; Cov (L, L)."""
         variance = np.einsum("tip,pq,tiq->t", self.derivative, covariance, self.derivative)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -53,8 +50,8 @@ def prediction_poses(
 ) -> PredictionPoses:
     """Return the test poses of `[planning]`: named, within a box, or of the candidates.
 
-    In deflections it is the deflection under `work_load` that is predicted; under "none" there
-    is no deflection, and it is that under each of the loads in turn.
+    In deflections it is the deflection under `work_load` that is predicted; under "none" that under
+    each of the loads in turn.
     """
     q, where = _poses(nominal, config, feasible, may)
     cell, planning = nominal.cell, config.planning
@@ -81,11 +78,7 @@ def prediction_poses(
 def position_derivative(
     nominal: NominalModel, at: PredictionPoses, more: tuple[Effect, ...], scale: Floats
 ) -> Floats:
-    """Return the derivative (T, 3, P) of what is predicted, m.
-
-    nominal: the model, whose live parameters come first; more: effects that are not in the model;
-    scale: (P,) what one unit of each parameter is, SI.
-    """
+    """Return the derivative (T, 3, P) of what is predicted, m, by live parameters and `more`."""
     model, count = nominal.model, len(scale) - len(nominal.live)
     live = np.concatenate([nominal.live, model.size + np.arange(count)])
 
@@ -152,8 +145,8 @@ def _inside(nominal: NominalModel, q: Floats, low: Floats, high: Floats) -> Floa
 class PredictedUncertainty:
     """Standard uncertainties that a fit to the planned readings will have.
 
-    Twice: with the model complete, as identification will state them, and with the potential
-    terms, as they are where any of those effects is there and has to be estimated as well.
+    With the model complete, as identification will state them, and with the potential terms, as
+    they are where any of those effects is there and has to be estimated as well.
     """
 
     names: tuple[str, ...]  # of the model's live parameters, as identification prints them
@@ -206,16 +199,10 @@ def predicted(
 
 
 def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
-    """Invert an information matrix, as identification does: what cannot be seen is held at zero.
+    """Invert an information matrix (P, P) as identification does; also (P, U) directions left out.
 
-    Directions of the flat parameters that move all data together by less than 0.2 σ at an
-    ordinary magnitude (see `regression.normal_equations`) are left out.
-
-    information: (P, P) by parameters in ordinary magnitudes, prior included; flat: (P,) which of
-    them have no prior.
-
-    Returns:
-        (P, P) covariance, and (P, U) unit directions that were left out.
+    Directions of the `flat` parameters, which have no prior, that move all data together by less
+    than 0.2 σ at an ordinary magnitude (see `regression.normal_equations`) are held at zero.
     """
     size = len(information)
     columns, held = np.flatnonzero(flat), np.flatnonzero(~flat)
@@ -235,11 +222,9 @@ def covariance(information: Floats, flat: Bools) -> tuple[Floats, Floats]:
 
 
 def positions_of(work: PredictionPoses, covariance: Floats, null: Floats) -> Floats:
-    """Return (T,) standard deviations of positions, m; infinite where not determined.
+    """Return (T,) standard deviations of positions, m, by a covariance (L, L).
 
-    covariance: (L, L) of the model's live parameters; null: (L, U) directions that were left out: a
-    position that one of them moves at an ordinary magnitude by a tenth of its standard deviation is
-    not determined.
+    Infinite where a direction of `null` (L, U) moves one by a tenth of it at an ordinary magnitude.
     """
     std = work.std(covariance)
     unseen = np.linalg.norm(work.derivative @ null, axis=(1, 2))

@@ -33,10 +33,7 @@ class Pace:
     change_s: float  # seconds that a person needs for another load
 
     def legs(self, starts: Floats, ends: Floats) -> Floats:
-        """Return (N, M) seconds of straight motions; `route.duration` for many.
-
-        starts: (N, n) joint angles, rad; ends: (M, n) joint angles, rad.
-        """
+        """Return (N, M) seconds of straight motions; `route.duration` for many."""
         way = np.abs(starts[:, None] - ends[None]).max(axis=-1, initial=0.0)
         long = way / self.speed + self.speed / self.acceleration
         short = 2.0 * np.sqrt(way / self.acceleration)
@@ -74,10 +71,7 @@ def pace(config: CellConfig) -> Pace:
 
 
 def timeline(plan: Plan, arm: Arm, margin: float, at: Pace) -> tuple[Duration, Floats]:
-    """Return the duration of a plan and (S,) the middle of each step's reading, s.
-
-    margin: distance kept from the joint limits, rad.
-    """
+    """Return the duration of a plan and (S,) the middle of each step's reading, s."""
     stops = route(plan, arm, margin)
     motion = readings = changes = 0.0
     times = []
@@ -120,10 +114,7 @@ class Confounding:
 
     @property
     def returned_m(self) -> float | None:
-        """Rms error of a deflection, m, after a correction by the drift estimated at the reference.
-
-        With the deflections themselves, which a fit uses as well, it is smaller.
-        """
+        """Rms error of a deflection, m, after a correction by the drift at the reference."""
         return None if self.drift_std is None else self.drift_std * self.lag_rms_s
 
     def about(self) -> dict[str, object]:
@@ -152,17 +143,16 @@ def confounding(
 ) -> Confounding:
     """Return how a plan's time is confounded with its joints and loads.
 
-    A drift v moves a reading by v t and a deflection by v τ, with the lag τ = t_loaded -
-    t_unloaded. Regressors of a deflection are the components of the load's wrench and their
-    products with cos and sin of every joint; the correlation is the uncentred one, since a
-    deflection has no constant term:
+    A drift v moves a deflection by v τ, with the lag τ = t_loaded - t_unloaded. Regressors are the
+    components of the load's wrench and their products with cos and sin of every joint; the
+    correlation is the uncentred one, since a deflection has no constant term:
 
         ρ = |τᵀx| / (|τ| |x|)
 
-    and estimating v beside a parameter with the column x leaves 1 - ρ² of its information.
-    Without deflections it is the centred correlation of t with the cos, the sin and the wrench.
-    A slope fitted to readings of standard uncertainty σ at the reference pose, each load with
-    its own mean, has the variance σ²/Σ(t - t̄)².
+    and estimating v beside a parameter with the column x leaves 1 - ρ² of its information. Without
+    deflections it is the centred correlation of t with the cos, the sin and the wrench. A slope
+    fitted to readings at the reference pose, each load with its own mean, has the variance σ²/Σ(t -
+    t̄)².
     """
     when = dict(zip(plan.steps, times.tolist(), strict=True))
     unloaded = {(s.pose, s.cycle): t for s, t in when.items() if s.load == UNLOADED}
@@ -335,23 +325,18 @@ def order_plan(
 ) -> Ordered:
     """Put chosen readings in order.
 
-    Time. Every load is hung once. Under a load the arm goes along a short tour in the metric of
-    the leading joint's time, cut into loops from the reference pose so that this is read every
-    so many minutes, also loaded, and before and after each load; where no straight motion is
-    clear it goes by the reference, which then counts as a return.
+    Every load is hung once. Under a load the arm goes along a short tour in the metric of the
+    leading joint's time, cut into loops from the reference pose so that this is read every so many
+    minutes; where no straight motion is clear it goes by the reference, which then counts as a
+    return.
 
-    Loss. Readings of a pose under different loads are far apart in time, so that a drift looks
-    like a load, or like a pose. What is lost is stated as ρ², see `Confounding`: the share of
-    its information that the parameter hit hardest loses where the drift has to be estimated as
-    well; and as the error of a deflection where it is not. Three things keep it small:
-    - half of the unloaded readings, drawn at random, come after the loads: lags of both signs,
-      at no cost but a second tour;
-    - loads in the order that is least correlated with time, which costs nothing, since every
-      load begins and ends at the reference;
-    - orders drawn at random among those whose campaign is at most 1 + slack times the shortest:
-      walks through the orders, loops in random order and direction. Of some draws the one with
-      the least ρ is taken (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263): the
-      order stays random towards everything that is no regressor, such as temperatures.
+    Readings of a pose under different loads are far apart in time, so that a drift looks like a
+    load, or like a pose. What is lost is stated as ρ², see `Confounding`. It is kept small by
+    - half of the unloaded readings, drawn at random, after the loads: lags of both signs;
+    - loads in the order that is least correlated with time;
+    - random orders of campaigns that take at most 1 + slack times the shortest; of some draws the
+      one with the least ρ (rerandomisation, Morgan & Rubin 2012, Ann. Statist. 40, 1263), so that
+      it stays random towards everything that is no regressor, such as temperatures.
     """
     how = how or Ordering()
     _check(config, names, chosen, how)
@@ -482,11 +467,7 @@ class OrderDraws:
         return self._plan(self.short, half=False, mixed=False)
 
     def _plan(self, orders: Mapping[str, Sequence[int]], *, half: bool, mixed: bool) -> Plan:
-        """Return the plan for an order of the stops under each load.
-
-        half: whether the second half of the unloaded order comes after the loads; mixed: whether
-        loops come in random order and direction.
-        """
+        """Return the plan for an order of the stops; loops may be mixed at random."""
         loads = [load for load in self.stops if load != UNLOADED]
         free = list(orders.get(UNLOADED, ()))
         cut = (len(free) + 1) // 2 if half else len(free)
@@ -565,11 +546,7 @@ class OrderDraws:
 
 
 def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR) -> Ways:
-    """Return the ways between poses under a load.
-
-    q: (P + 1, n) joint angles, rad; the reference first; load: name of the load that hangs; near:
-    neighbours to which motions are tested; the nearest in time.
-    """
+    """Return the ways between poses (P + 1, n) under a load, the reference first."""
     legs = pace.legs(q, q)
     count = len(q)
     close = np.argsort(legs, axis=1, kind="stable")[:, : near + 1]
@@ -597,9 +574,9 @@ def load_order(
 ) -> list[int]:
     """Return the order of the loads whose wrenches are least correlated with their lags.
 
-    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and
-    n_l readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|),
-    the lengths weighted by n as well. Of equal orders the first one in the order given.
+    With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and n_l
+    readings it is the least max over components k of |Σ n w_k (t - t0)| / (|w_k| |t - t0|), the
+    lengths weighted by n as well.
     """
     count = len(loaded)
     if count < 2:
@@ -630,8 +607,7 @@ def assembled(
 ) -> tuple[Step, ...]:
     """Return the steps of the blocks; the reference is read before and after every loop.
 
-    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles, spread
-    over all of them, so that each has its unloaded one.
+    Unloaded readings there are cycles 0, 1, ...; those under a load share their cycles.
     """
     free = (*before.loops, *after.loops)
     passes = max([len(block.loops) + 1 for block in loaded], default=0)

@@ -369,8 +369,8 @@ def _curve(planned: Planned) -> Iterator[CurvePoint]:
 def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[DetectableEffect]:
     """Yield the minimum detectable strength of each effect outside of the model.
 
-    Of some directions of the effect's parameters the median: rms of the displacement, over the
-    plan's poses and loads, divided by the root of the non-centrality beyond the model.
+    The median over some directions of its parameters: rms of the displacement over the plan's poses
+    and loads, divided by the root of the non-centrality beyond the model.
     """
     of, size = planned.problem, planned.problem.model_size
     taken = np.flatnonzero(planned.counts)

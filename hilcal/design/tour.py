@@ -26,10 +26,8 @@ def length(seconds: Floats, order: Sequence[int]) -> float:
 def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list[int]:
     """Return an order of stops 1 to m whose tour is short; the shortest up to 7 stops.
 
-    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again
-    after each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
-
-    seconds: (m + 1, m + 1), also asymmetric.
+    Nearest insertion, then 2-opt and Or-opt exchanges until none helps, then the same again after
+    each of some double bridges (Martin, Otto & Felten 1991), of which the best is kept.
     """
     count = len(seconds) - 1
     if count <= _EXACT:
@@ -134,13 +132,10 @@ def _moved(p: Floats) -> _Change:
 def shaken(
     seconds: Floats, order: Sequence[int], budget: float, rng: np.random.Generator, moves: int
 ) -> list[int]:
-    """Return a random order whose tour takes at most `budget`, or no longer than `order`'s.
+    """Return a random order whose tour takes at most `budget`, s, or no longer than `order`'s.
 
-    A random walk by turns and moves of parts; a step that would exceed the budget is not taken.
-    Turns and moves are as probable as their inverses, so that a long walk comes to every order
-    within the budget that it can reach with the same probability.
-
-    seconds: (m + 1, m + 1); budget: s.
+    A random walk by turns and moves of parts, which are as probable as their inverses; a step that
+    would exceed the budget is not taken.
     """
     way = [0, *order, 0]
     here, count = length(seconds, order), len(order)
@@ -174,17 +169,10 @@ def shaken(
 def loops(
     direct: Floats, order: Sequence[int], reading_s: float, limit_s: float
 ) -> list[list[int]] | None:
-    """Return a tour cut into loops from the reference, each within the limit, in least time.
+    """Return a tour cut into loops from the reference in least time; None if there is none.
 
-    Dynamic programming over the places where the tour may be cut (Beasley 1983, route first and
-    cluster second): T(j) = min over i of T(i) + loop(i + 1 … j). A loop of one stop is always
-    allowed.
-
-    direct: (m + 1, m + 1) s, `NEVER` where no straight motion is clear; reading_s: s at each stop
-    and at the reference; limit_s: s from leaving the reference to coming back.
-
-    Returns:
-        The loops in order; None where there is no such tour.
+    Dynamic programming over the places where the tour may be cut (Beasley 1983): T(j) = min over i
+    of T(i) + loop(i + 1 … j). A loop of one stop is always allowed.
     """
     count = len(order)
     best, cut = np.full(count + 1, np.inf), np.zeros(count + 1, dtype=np.int64)

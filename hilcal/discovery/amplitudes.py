@@ -406,10 +406,7 @@ class Composed(Variable):
 
 
 def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
-    """Return the quantity of a weighted sum of products.
-
-    terms: (weight, product); the first weight is 1, and all products have one unit.
-    """
+    """Return the quantity of a weighted sum of products of one unit; the first weight is 1."""
     products = [a for _, a in terms]
     slots = [f.variable.slot for a in products for f in a.factors if f.variable.slot is not None]
     joints = {f.variable.joint for a in products for f in a.factors}

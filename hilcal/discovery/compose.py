@@ -226,11 +226,9 @@ def _extended(beside: Beside, site: SiteSums, b: _Bent) -> list[_Bent]:
 
 
 def _gains(site: SiteSums, x: Floats) -> tuple[Floats, Floats]:
-    """Gain of each further column of X (2 + P, K) beside the first two, and coefficients.
+    """Gain (P,) of each further column of X (2 + P, K) beside the first two, −inf if no other.
 
-    Returns:
-        (P,) reduction of the sum of squares by the further column, −inf where it is no other one;
-        (2, P) coefficients of the first column and of the further one, fitted together.
+    Also (2, P) coefficients of the first column and of the further one, fitted together.
     """
     free = (x @ site.free).astype(float)
     slope = (x @ site.slope).astype(float)
@@ -344,10 +342,7 @@ FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)
 
 
 def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:
-    """Return terms of further factors and other numbers.
-
-    best: the best of the screening, best first.
-    """
+    """Return terms of further factors and other numbers, of the best of the screening."""
     found = list({(x.s, x.f): x for x in best}.values())
     products = [(x.s, a, 0.0) for x in found[:GROWN] for a in _products(beside, x.s, x.f)]
     numbers = [(x.s, a, price) for x in found[:VARIED] for a, price in _numbers(beside, x.f)]

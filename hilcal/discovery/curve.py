@@ -53,10 +53,7 @@ class Curve:
 
 
 def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]:
-    """Return the curves of a law, those of its surest parts first.
-
-    after: a fit whose last effect is the law.
-    """
+    """Return the curves of a law, the last effect of a fit, those of its surest parts first."""
     rows = after.model.slices()[-1]
     theta, std = after.theta[rows], after.uncertainty.std[rows]
     sure = sorted(form.parts, key=lambda p: -abs(theta[p.coefficient]) / std[p.coefficient])

@@ -103,12 +103,7 @@ class Discovery(Shown):
         return f"Discovery({self.reason!r}{''.join(rows)})"
 
     def average(self, readings: Readings) -> tuple[Floats, Floats]:
-        """Return what the likely laws add to the fit's prediction of D measurements.
-
-        Returns:
-            (D, m) mean over the laws by their probability, and (D, m) standard deviation of the
-            prediction with it, without the noise; see `averaged`.
-        """
+        """Return what the likely laws add to the fit's prediction, and its uncertainty."""
         if not self.structures:
             raise CannotAnswerError(f"no law was found ({self.reason}), so none is averaged")
         return averaged(self.fit, self.structures, readings)
@@ -378,10 +373,8 @@ def _causes(
 def agreement(before: Fit, after: Fit, moved: Floats) -> float:
     """Return the correlation of what was hidden with what the added effects do.
 
-    Both are whitened, and what the model without the effect describes is projected out.
-
-    before: the fit without the added effects; after: the fit with more effects, behind those of the
-    first model; moved: (N, 3) by how much the hidden law moves each reading, sensor axes, m.
+    Both are whitened, and what the model without the effect describes is projected out. `after` has
+    more effects, behind those of `before`; moved: (N, 3) by the hidden law, sensor axes, m.
     """
     linear, w = linearise(before), before.whitening
     truth = linear.project_out(w.whiten(w.raw(moved[~before.outlier])).reshape(-1))
@@ -477,11 +470,7 @@ class LawSearch:
     """
 
     def __init__(self, folder: Path, name: str = NAME, replacing: bool = False) -> None:
-        """Laws are named after the files that they will be: found.py, found_2.py, ….
-
-        replacing: whether files of these names are removed first, as those of a rehearsal that is
-        repeated; else other names are taken.
-        """
+        """Laws are named after the files that they will be; old ones may be replaced."""
         if replacing:
             for k in range(1, MOST_SEARCHES + 1):
                 (folder / f"{_numbered(name, k)}.py").unlink(missing_ok=True)
@@ -491,10 +480,7 @@ class LawSearch:
         self._sources: dict[str, str] = {}
 
     def propose(self, of: Fit, say: Callable[[str], None]) -> tuple[Fit, str] | None:
-        """Return the fit with a law, and the law's name; None where no law is proposed.
-
-        A fit is searched once, and so many of a refinement at most.
-        """
+        """Return the fit with a law, and the law's name; None where no law is proposed."""
         if any(d.fit is of for d in self.found) or len(self.found) == MOST_SEARCHES:
             return None
         name = self._free(of)

@@ -36,11 +36,7 @@ def fine_waves(v: Variable, finest: int) -> list[Factor]:
 
 
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
-    """Return the functions of one quantity, with starting values of their numbers.
-
-    x: (N,) it at the readings; most: complexity of a product; functions that are to be in none have
-    it.
-    """
+    """Return the functions of a quantity x (N,); those of complexity `most` are in no product."""
     linear = Factor(v, shapes.LINEAR)
     if v.kind in WAVES:
         waves = [
@@ -337,10 +333,7 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 
 
 def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
-    """Return all products of the functions of the quantities.
-
-    poses: number of poses, which limits the multiples of an angle; see `FINEST`.
-    """
+    """Return all products of functions of the quantities; poses limit the multiples of an angle."""
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]
     singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
@@ -383,13 +376,9 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
 
 
 def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
-    """Products of pairs of rows, each with root mean square 1, some at a time to save memory.
+    """Products (F', N) of pairs (F, 2) of rows, each with root mean square 1, in single precision.
 
-    value: (C, N) functions; pairs: (F, 2) rows of both factors.
-
-    Returns:
-        (F', N) products in single precision, (F',) what they were divided by, and which of the
-        pairs they are: those that are not zero throughout.
+    Also (F',) what they were divided by, and which of the pairs they are: those that are not zero.
     """
     size = np.empty(len(pairs))
     for part in (slice(a, a + SOME) for a in range(0, len(pairs), SOME)):

@@ -150,11 +150,7 @@ def resembling(
 
 
 def tells_more(problem: SearchProblem, s: Selection, known: KnownEffects, effect: str) -> bool:
-    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect that is near it.
-
-    An effect of the catalogue is preferred to a law that describes the same; a law that readings
-    tell from it, as a power of 2.3 from a cube, is not the same.
-    """
+    """Whether odds of 20 : 1, the search paid for, ask for a law beside an effect near it."""
     x, columns = known.white, known.columns
     law = np.hstack([problem.columns(t) for t in s.terms])
     both = np.hstack([x[:, columns[effect]], law])

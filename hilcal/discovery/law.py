@@ -26,16 +26,11 @@ _OTHER = re.compile(r"\bs\.|\brecorded\(|\bwhere\(|\bhypot\(|\[")
 
 
 def expressions(law: "Law") -> dict[str, str]:
-    """Return the value of a law at each site where plain arithmetic says it.
+    """Return the value of a law by site, in its unit, where plain arithmetic says it.
 
-    Quantities are `q1` ... (rad), `tau1` ... (torques of the drives, N·m), `force` (of the load,
-    N), `time` (s) and `air` (air temperature, °C); operators are Python's, functions have numpy's
-    names, but for `max`. A site whose law depends on anything else, or has branches, is left out.
-
-    law: as it was discovered.
-
-    Returns:
-        By the site's symbol in formulas, e.g. {"dq_3": "0.0002*(sin(3 * q4))"}, in the site's unit.
+    E.g. {"dq_3": "0.0002*(sin(3 * q4))"}. Quantities are `q1` ... (rad), `tau1` ... (torques of the
+    drives, N·m), `force` (of the load, N), `time` (s) and `air` (air temperature, °C); operators
+    are Python's, functions have numpy's names, but for `max`. Other sites are left out.
     """
     terms: dict[str, list[str]] = {}
     for p in law.form.parts:

@@ -32,10 +32,7 @@ class SearchProblem:
     """The search on some of the rows."""
 
     def __init__(self, screen: Screen, rows: Bools | None = None) -> None:
-        """Refit the model to the rows.
-
-        rows: (R,) those that are used; all by default.
-        """
+        """Refit the model to some of the rows (R,); all by default."""
         linear = screen.linear
         self.screen = screen
         every = np.ones(len(linear.residual), dtype=np.bool_)
@@ -91,11 +88,7 @@ class SearchProblem:
         return self.screen.inner(whole)
 
     def shadows(self, x: Floats) -> tuple[list[Floats], Floats, list[Floats]]:
-        """What columns (R', P) of chosen terms take from all candidates in the screening.
-
-        Returns:
-            (S, F) xᵀ u of orthonormal directions u beside the model, uᵀ r, and u.
-        """
+        """What columns (R', P) of chosen terms take: (S, F) xᵀ u of directions u, uᵀ r, and u."""
         x = x[self.screened[self.rows]]
         u = orthonormal(self._thin, x)
         told = u.T @ self._thin_residual
@@ -209,7 +202,7 @@ class Beside:
 
         Keys: "" for nothing; "p" for the phase: with the partner; "c" for a constant at the site,
         and "pc" for both; "1" and "2" for the zero of the first and of the second factor of a
-        product: with the other factor alone.
+        product.
         """
         p, all_ = self.problem, self.screened
         words, one = p.screen.grammar, p.screen.one
@@ -383,13 +376,8 @@ def together(
 ) -> Floats:
     """(H,) gain of candidates at a site with another column each; zero where they are alike.
 
-    Args:
-        square: (F,) xᵀ M x, not zero.
-        slope: (F,) xᵀ r.
-        across: (F,) xᵀ M x' with the other.
-        seen: (F,) whether the model leaves something of a candidate.
-        which: (H,) of the candidates.
-        other: (F,) the other of each.
+    Of all at the site: (F,) xᵀ M x, xᵀ r, xᵀ M x', whether the model leaves something; (H,) which,
+    and (F,) the other of each.
     """
     a, b, h = square[which], square[other[which]], across[which]
     g, k = slope[which], slope[other[which]]

@@ -89,13 +89,10 @@ def at_linearisation(screen: Screen, form: Form) -> tuple[Coefficient, ...]:
 def exact(
     screen: Screen, form: Form, name: str
 ) -> tuple[Fit, Form, tuple[Coefficient, ...], type[Effect]]:
-    """Refit the model with the law as an effect that keeps to the protocol.
+    """Refit the model with the law as an effect that keeps to the protocol; return both.
 
     A coefficient that the model absorbs is dropped, as the zero of a compliance that grows with
-    time, a τ (t − t0), beside a compliance of the model: it is no part of what is found.
-
-    Returns:
-        The fit, the law as it was fitted, its coefficients, and the effect.
+    time beside a compliance of the model: it is no part of what is found.
     """
     before = screen.linear.fit
     s = before.solution.prediction.situation
@@ -155,10 +152,7 @@ def _terms(factor: Factor) -> tuple[tuple[float, Amplitude], ...]:
 
 
 def free_numbers(form: Form, s: Situation) -> list[FreeNumber]:
-    """Return the free numbers of a law.
-
-    The same function of the same quantity in several products has one number.
-    """
+    """Return the free numbers of a law; the same function in several products has one number."""
     groups: dict[tuple[str, str, tuple[float, ...]], list[tuple[int, int]]] = {}
     for k, p in enumerate(form.parts):
         for i, f in enumerate(p.amplitude.factors):

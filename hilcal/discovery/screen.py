@@ -250,8 +250,6 @@ def _across_factors(words: Grammar, values: Floats, lifted: Floats) -> Floats:
     """(2, F) xᵀ Q x' of products with what is left without the first, and the second factor.
 
     With a product f g and Q symmetric, (f g)ᵀ Q g = fᵀ (g ∘ Q g): no product is formed.
-
-    values: (F, K) these, each with root mean square 1; lifted: (F, K) Q of them.
     """
     out: Floats = np.zeros((2, len(words.size)), dtype=np.float32)
     products = np.flatnonzero((words.less >= 0).all(axis=0))
@@ -292,14 +290,7 @@ def bends(
     grammar: Grammar, sites: tuple[Site, ...], readings: Ints, form: Floats, free: Floats,
     seen: tuple[float, float],
 ) -> Bends:  # fmt: skip
-    """Form all of them.
-
-    Args:
-        readings: (K,) those of the screening.
-        form: (S, R', K) whitened motion of each site; see `screen`.
-        free: (S, K, K) its products, the model projected out.
-        seen: share of a column's square, and square, that must be left.
-    """
+    """Form all bends of (K,) readings, motions (S, R', K) of the sites, products (S, K, K)."""
     which = grammar.smooth[:MOST_ARGUMENTS]
     argument, made, numbers, rows = [], [], [], []
     for k in which.tolist():

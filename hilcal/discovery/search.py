@@ -91,10 +91,7 @@ def _ordered(problem: SearchProblem, chosen: tuple[LawTerm, ...] = ()) -> list[S
 
 
 def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
-    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest.
-
-    The rank of functions decides only where the odds are the same to within one.
-    """
+    """Which of terms as good is taken: the simplest, and of equally simple ones the likeliest."""
     *simple, functions = _simplicity(screen, c.term)
     return (*simple, -round(c.odds), functions, -c.odds)
 
@@ -102,11 +99,10 @@ def _preference(screen: Screen, c: Scored) -> tuple[float, ...]:
 def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     """Numbers and complexity, rank of sites, joints apart, rank of functions; smaller is simpler.
 
-    A coefficient, and a number that is not of the grid, count as much as a unit of complexity: the
-    free zero of a factor is no less simple than an exponent of 4. Of causes that the readings do
-    not tell apart, as joints that warm alike, the one of the joint itself is simpler than that of
-    another. A joint's temperature seldom moves anything but this joint and stands for whatever
-    else changes with time: elsewhere it counts a unit more.
+    A coefficient, and a number that is not of the grid, count as much as a unit of complexity. Of
+    causes that the readings do not tell apart, the one of the joint itself is simpler than that of
+    another. A joint's temperature stands for whatever else changes with time: elsewhere it counts a
+    unit more.
     """
     amplitudes = [screen.grammar.at(a) for _, a in t.parts]
     cost = max(a.cost + screen.grammar.tuned(a) for a in amplitudes)
@@ -194,10 +190,7 @@ def _pruned(problem: SearchProblem, s: Selection) -> Selection:
 
 
 def _exchanged(problem: SearchProblem, s: Selection, last: int) -> Selection:
-    """Exchange each term, up to some, for a better one beside the others.
-
-    These were not there when it was chosen.
-    """
+    """Exchange each of the first terms for a better one beside the others, which came later."""
     for k in range(last):
         others = (*s.terms[:k], *s.terms[k + 1 :])
         found = _ordered(problem, others)
@@ -227,10 +220,7 @@ def _extent(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, 
 
 
 def chain(problem: SearchProblem, terms: tuple[LawTerm, ...]) -> tuple[float, ...]:
-    """Odds of each term beside those before it, whose coefficients keep their priors.
-
-    So they add up to the odds of the whole law, and compare with those of effects.
-    """
+    """Odds of each term beside those before it; they add up to the odds of the whole law."""
     scores = chained(problem, terms)
     return tuple(s.log_evidence - t.price for s, t in zip(scores, terms, strict=True))
 

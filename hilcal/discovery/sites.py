@@ -55,9 +55,9 @@ class Site:
     def takes(self, elastic: bool, sensed: bool = False) -> bool:
         """Whether a law that depends on transmitted or on recorded wrenches, or not, may act here.
 
-        Transmitted wrenches move parts of the arm only. They move the base as the frame of joint 1,
-        other causes as the frame of the base itself. What the force sensor reads, in its own axes,
-        is the cause of its own errors only.
+        Transmitted wrenches move parts of the arm only, the base as the frame of joint 1; other
+        causes move it as the frame of the base. What the force sensor reads is the cause of its own
+        errors only.
         """
         if self.field == "sensor" or sensed:
             return self.field == "sensor" and not elastic

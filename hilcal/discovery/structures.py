@@ -69,10 +69,7 @@ class Structure:
 
 
 def posterior(odds: Mapping[Hashable, Sequence[float]]) -> dict[Hashable, float]:
-    """Return the probability of each structure, from the log odds of its members against no law.
-
-    They and that of no law, which is not returned, sum to one.
-    """
+    """Return the probability of each structure, from the log odds of its members against no law."""
     each = {kind: float(logsumexp(of)) for kind, of in odds.items()}
     whole = float(logsumexp([0.0, *each.values()]))
     return {kind: float(np.exp(x - whole)) for kind, x in each.items()}
@@ -177,14 +174,9 @@ def pareto(of: Sequence[Structure]) -> tuple[Structure, ...]:
 
 
 def averaged(fit: Fit, of: Sequence[Structure], readings: Readings) -> tuple[Floats, Floats]:
-    """Return what likely laws add to a fit's prediction of D measurements, and its uncertainty.
+    """Return the (D, m) mean of what likely laws add to a prediction of readings, and its std.
 
-    of: structures; their probabilities are taken relative to their sum; readings: of the same cell,
-    measured or planned.
-
-    Returns:
-        (D, m) mean of the average, and (D, m) standard deviation of the prediction with it: of
-        the model's parameters, the laws' coefficients, and the choice of the law.
+    The uncertainty is of the model's parameters, the laws' coefficients, and the choice of the law.
     """
     prediction = fit.model.predict(readings.states, fit.theta)
     w, s = whitening(readings, fit.mode), prediction.situation

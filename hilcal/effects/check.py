@@ -36,10 +36,7 @@ ROBOT = "ur10e"
 
 
 def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
-    """Return the cell of an example arm; `joints` repeats its last joint, or leaves joints out.
-
-    With `slides` its first joint slides, by as many metres as it turns by radians.
-    """
+    """Return the cell of an example arm of so many joints, of which the first may slide."""
     cell = cell_from_config(CellConfig(robot=Robot(model=ROBOT)))
     arm = cell.arm
     rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
@@ -61,10 +58,7 @@ def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
 
 
 def example_states(cell: Cell, count: int = 30) -> States:
-    """Return states drawn at random, the same ones every time, in arrays that cannot be changed.
-
-    Times in s, temperatures in °C.
-    """
+    """Return states drawn at random, the same ones every time, in arrays that cannot be changed."""
     rng, n = np.random.default_rng(0), cell.arm.n
     q = rng.uniform(-1.5, 1.5, (count, n))
     wrench = rng.normal(size=(count, 6)) * [60, 60, 60, 8, 8, 8]
@@ -102,14 +96,7 @@ def example_situation(cell: Cell, states: States) -> Situation:
 NAME = re.compile(r"[a-z][a-z0-9_]*")
 JOINTS = (6, 7)
 """Arms to try an effect on; it has to pass on one, since it may be made for that arm alone."""
-NEEDS = (
-    "time",
-    "load_time",
-    "air_temperature",
-    "joint_temperature",
-    "approach",
-    "q_actual",
-)
+NEEDS = ("time", "load_time", "air_temperature", "joint_temperature", "approach", "q_actual")
 """Columns of `States` that readings may lack."""
 AGREES = 1e-3
 """Share of the largest value by which a derivative may be outside of the difference quotients of

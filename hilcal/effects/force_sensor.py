@@ -66,10 +66,7 @@ class ForceSensorEffect(Effect):
 
 
 def recorded(s: Situation, axes: Floats = ALONG_FLANGE) -> Floats:
-    """Return the recorded wrench (N, 6) in sensor axes, N and N·m.
-
-    axes: (3, 3) the sensor's axes in flange axes.
-    """
+    """Return the recorded wrench (N, 6) in sensor axes (3, 3) of the flange, N and N·m."""
     return _turned(np.swapaxes(_sensor(s, axes), 1, 2), s.states.wrench)
 
 

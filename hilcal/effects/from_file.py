@@ -18,8 +18,7 @@ _OWN = "hilcal."
 def failure_of(error: Exception) -> InputError | None:
     """Return the error of a method of a user's effect as one line; None where it is not one.
 
-    The line names the file, the line in it, the effect, the method that hilcal called, and the
-    exception. It is found from the traceback, so that calls of effects need no guard.
+    It is found from the traceback, so that calls of effects need no guard.
     """
     for frame, _ in traceback.walk_tb(error.__traceback__):
         effect = frame.f_locals.get("self", frame.f_locals.get("cls"))
@@ -50,10 +49,7 @@ class EffectFile:
 
 
 def read_effects(path: Path) -> EffectFile:
-    """Run a Python file and return the effects that it defines.
-
-    These are all classes derived from `Effect` in it, but for those whose name begins with "_".
-    """
+    """Run a Python file and return the effects in it; names that begin with "_" do not count."""
     return effects_of(_content(path), path)
 
 

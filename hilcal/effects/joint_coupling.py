@@ -70,10 +70,7 @@ class JointCoupling(Effect):
         )
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:
-        """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis.
-
-        Not a displacement of drive j, which turns others along where joints are coupled.
-        """
+        """Controller's values: ∂dq_j/∂k_ji = q_i, a turn of slot j − 1 about the joint's axis."""
         turned, by = self._pairs.T
         moved = np.where(self.cell.arm.slides[turned, None], ALONG, ABOUT)
         twist = s.values[:, by, None] * moved

@@ -59,10 +59,7 @@ def choice(effect: str, options: Options, key: str, valid: tuple[str, ...]) -> s
 
 
 def rated_torques(cell: Cell) -> Floats:
-    """(n,) rated torques, of slides forces: the measure of how stiff a joint is built.
-
-    150 N·m and 1500 N where unknown.
-    """
+    """(n,) rated torques, of slides forces; 150 N·m and 1500 N where unknown."""
     return cell.arm.ratings
 
 

@@ -39,8 +39,7 @@ class JointGroups:
 def joint_groups(effect: str, options: Options, count: int) -> JointGroups:
     """Read the option `joints` for an arm of `count` joints.
 
-    Groups are separated by "/", the joints of a group by "+" or as a range: "2/3/4-6" is one
-    parameter for joint 2, one for 3 and one for 4 to 6; a joint that is not named has none.
+    Groups are separated by "/", the joints of a group by "+" or as a range.
     """
     given = options["joints"]
     text = str(given) if type(given) is int else given

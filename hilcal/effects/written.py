@@ -24,16 +24,11 @@ _TRUTH = {"true": True, "false": False}
 
 
 def read_effects_text(text: str, where: str, catalogue: Catalogue) -> dict[str, dict[str, object]]:
-    """Read names of effects, with their options in parentheses, separated by commas.
+    """Read names of effects, with their options in parentheses, separated by commas, by name.
 
-    Options are separated by "," or ";". A value is a number, true or false, a word, text in
-    quotes, or a list of them in brackets.
-
-    text: e.g. "joint_compliance, transmission_error(harmonics=20)".; where: begins the message,
-    e.g. "--effects"..
-
-    Returns:
-        Options by name of the effect, in order.
+    E.g. "joint_compliance, transmission_error(harmonics=20)". Options are separated by "," or ";".
+    A value is a number, true or false, a word, text in quotes, or a list of them in brackets.
+    `where` begins a refusal, e.g. "--effects".
     """
     out: dict[str, dict[str, object]] = {}
     for part in _split(text, ",", f"{where} {text!r}", EXAMPLE):
@@ -73,10 +68,7 @@ def written(value: object) -> str:
 
 
 def chosen_options(effect: Effect, states: States, m: int) -> dict[str, object]:
-    """Options of an effect other than it has by itself on these states, without its priors.
-
-    effect: the effect; states: those that it was made for; m: 3 for positions, 6 for poses.
-    """
+    """Options of an effect other than it has by itself on its states, without its priors."""
     usual = type(effect)(effect.cell, states, effect.usual_options(m)).options
     return {
         key: value

@@ -77,8 +77,8 @@ def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
 def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[SlotResponse]:
     """Compliance of the chain's joints, from that of the drives: D C Dᵀ by torques.
 
-    Forces and moments across an axis are those of the slot itself. `borne`: the component that the
-    drive of each joint bears.
+    Forces and moments across an axis are those of the slot itself; drives bear the components
+    `borne`.
     """
     if not b.joint:
         yield b
@@ -100,11 +100,7 @@ def _of_joints(b: SlotResponse, drive: Floats, borne: list[int]) -> Iterator[Slo
 def at_equilibrium(
     moves: ReadingDerivative, stiffness: GeometricStiffness, blocks: list[SlotResponse]
 ) -> ReadingDerivative:
-    """Add to the motions of a reading how the arm yields to the change of the wrenches.
-
-    moves: derivatives of the reading with the wrenches held as they are; stiffness: of the chain
-    under its load.
-    """
+    """Add to the motions of a reading, wrenches held, how the arm yields to their change."""
     term = wrench_form(moves, blocks)
     form, whole = dict(term), _norm(term)
     before = whole
@@ -134,10 +130,7 @@ def wrench_form(
 
 
 def by_wrench_changes(form: Mapping[tuple[int, bool], Floats], change: Floats, m: int) -> Floats:
-    """Motion (N, m, P) of a reading by P changes (N, P, n + 1, 6) of the slot wrenches.
-
-    form: derivatives by the wrenches, see `wrench_form`.
-    """
+    """Motion (N, m, P) of a reading by changes (N, P, n + 1, 6) of the wrenches; `wrench_form`."""
     out = zeros(len(change), m, change.shape[1])
     for (slot, moment), rows in form.items():
         half = change[:, :, slot, MOMENT if moment else FORCE]
@@ -149,8 +142,6 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
     """Derivative (N, m, 6) of a reading by the load's wrench at the load point, base axes.
 
     A force f and a moment t there are R_kᵀ f and R_kᵀ (t + d_k × f) in slot k, d_k the lever.
-
-    form: derivatives by the slot wrenches, see `wrench_form`.
     """
     point = chain.point(load.point)
     out = zeros(len(point), m, 6)
@@ -169,10 +160,7 @@ def by_wrenches(
     # (N, m, E) by a range of the elements of the twist of a slot
     by_slot: Callable[[int, slice], Floats],
 ) -> dict[tuple[int, bool], Floats]:
-    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot.
-
-    From those by the deviation; those that are zero are left out.
-    """
+    """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot, without zeros."""
     used: dict[int, slice] = {}
     for b in blocks:
         if not b.joint:
@@ -267,10 +255,7 @@ class ReadingColumns:
         self._loads: list[tuple[Floats, Ints]] = []
 
     def add(self, c: Columns, place: Ints) -> None:
-        """Add one block of an effect's columns.
-
-        place: which of the L each parameter of the effect is; −1 for none.
-        """
+        """Add columns of an effect; `place`: which of the L each parameter is, −1 for none."""
         c = c.only(place[c.parameter] >= 0)
         at = place[c.parameter]
         self._columns.append((c if self._scale is None else _scaled(c, self._scale[at]), at))

@@ -203,11 +203,7 @@ class Model(Brief):
         )
 
     def jacobian(
-        self,
-        prediction: Prediction,
-        theta: Floats,
-        m: int,
-        live: Ints | None = None,
+        self, prediction: Prediction, theta: Floats, m: int, live: Ints | None = None
     ) -> Floats:
         """Derivative (N, m, P) of the readings by all parameters, sensor axes.
 
@@ -294,8 +290,7 @@ class Model(Brief):
     def _following(self, s: Situation, theta: Floats) -> Floats | None:
         """Derivative (N, 6, 6) of the acting wrench by displacement and turn of the flange.
 
-        By central differences, of the corrections alone: they are a small part of the wrench,
-        and it is their change with a small motion.
+        By central differences, of the corrections alone, which are a small part of the wrench.
         """
         parts = [(e, t) for e, t in self._parts(theta) if e.wrench_change(t, s) is not None]
         if not parts:

@@ -148,11 +148,9 @@ def _sensed(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingDerivative:
-    """Derivative of the reading by each field of the deviation, sensor axes.
+    """Derivative of the reading by each field of the deviation, sensor axes; the first m rows.
 
-    Only the first m rows (position, or position and rotation) are kept. Without
-    `yielding` the wrenches stay as they are; with it the arm yields to their change where it moves
-    (see `equilibrium`).
+    Without `yielding` the wrenches stay as they are; with it the arm yields to their change.
     """
 
     cell: Cell
@@ -269,11 +267,7 @@ class SlotFrames:
     known: dict[int, tuple[Floats, Floats | None]] = field(default_factory=dict)
 
     def by_twist(self, slot: int, v: Floats | None, w: Floats, elements: slice = ALL) -> Floats:
-        """Rows (N, m, E) by the twist, from rows by v (None for zero) and ω (N, m, 3), base axes.
-
-        v: rows by the displacement; w: rows by the turn; elements: range of the elements of the
-        twist.
-        """
+        """Rows (N, m, E) by elements of the twist, from rows by v (None for zero) and ω."""
         turned, shift = self._blocks(slot)
         start, stop = elements.start, elements.stop
         out = empty(*w.shape[:2], stop - start)

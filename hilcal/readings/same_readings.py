@@ -28,20 +28,13 @@ _APART = 10.0  # Distance of loaded from unloaded readings, in units of the tole
 
 
 def already(readings: Readings, others: Readings) -> Bools:
-    """(N,) which readings are among others.
-
-    readings: N readings; where one of both has positions alone, these are compared; others: any
-    number of readings.
-    """
+    """(N,) which readings are among others; by positions where one of both has these alone."""
     attitude = readings.m == others.m == 6
     return _near(_coordinates(readings, attitude), _coordinates(others, attitude))
 
 
 def prints(readings: Readings) -> Floats:
-    """(N, n + 4) what a reading is known by without its attitude: joints, position, whether loaded.
-
-    To be kept where the readings themselves are not; see `among`.
-    """
+    """(N, n + 4) what a reading is known by, to be kept: joints, position, whether loaded."""
     return _coordinates(readings, attitude=False)
 
 
@@ -61,10 +54,7 @@ def _near(own: Floats, others: Floats) -> Bools:
 
 
 def shared(campaigns: Sequence[Floats]) -> tuple[int, int] | None:
-    """Return the numbers of two campaigns that share readings; None where all are their own.
-
-    campaigns: (N, n + 4) `prints` of each; of another number of joints are other arms.
-    """
+    """Return the numbers of two campaigns, by their `prints`, that share readings; else None."""
     from scipy.spatial import cKDTree  # slow to import
 
     for width in sorted({of.shape[1] for of in campaigns}):
@@ -93,9 +83,6 @@ def never_fitted(readings: Readings, fitted: Readings, deflections: bool) -> tup
     """Return (N,) which readings were fitted, and (N,) which can be predicted as unseen ones.
 
     A deflection is unseen if neither its loaded nor an unloaded reading of it was fitted.
-
-    readings: N readings; fitted: those that a model was fitted to; deflections: whether deflections
-    are to be predicted.
     """
     known = already(readings, fitted)
     if not deflections:

@@ -55,8 +55,8 @@ def arrival_groups(readings: Readings) -> list[Group]:
 def deflection_groups(readings: Readings) -> list[Group]:
     """Group loaded readings with the unloaded ones of their pose, cycle, target and observer.
 
-    Targets that share the scatter of an arrival are in one group. A loaded reading whose target,
-    of several, was not read unloaded in its pose and cycle makes no deflection.
+    Targets that share the scatter of an arrival are in one group. A loaded reading whose target was
+    not read unloaded in its pose and cycle makes no deflection.
     """
     if len(readings) and readings.unloaded.all():
         raise InputError("readings = deflection: there is no loaded reading; use absolute")
@@ -96,11 +96,7 @@ def deflection_groups(readings: Readings) -> list[Group]:
 
 
 def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
-    """Join groups to runs along `Readings.along`, each in its order.
-
-    groups: those that share another error; none is divided; most: measurements in a run, but for
-    its last group.
-    """
+    """Join groups to runs of about so many measurements along `Readings.along`; none is divided."""
     each = [
         (loaded, reference, weights)
         for of_shape, references, weights in groups
@@ -208,8 +204,7 @@ def _triangular_roots(covariance: Floats, per_std: Floats) -> Floats:
     """S⁻¹ (N, k, k) by Cholesky's factor; by eigenvalues where the rule may leave something out.
 
     The correlation matrix has trace k, so that λ_max ≤ k, and the product of the k − 1 largest
-    eigenvalues is at most (k/(k − 1))^(k − 1) < e: λ_min > det/e. Blocks with
-    det > e k `RANK_TOLERANCE` have no eigenvalue that the rule leaves out.
+    eigenvalues is below e: with det > e k `RANK_TOLERANCE` the rule leaves nothing out.
     """
     k = covariance.shape[-1]
     correlation = covariance * per_std[:, :, None] * per_std[:, None, :]
@@ -321,11 +316,7 @@ def whitening(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Whiten
 
 
 def _innovations(covariance: Floats) -> Floats:
-    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule.
-
-    The rule for rank-deficient V is kept for elements without variance; for directions without,
-    C has `RANK_TOLERANCE` more on its diagonal, in place of leaving out what has no row of its own.
-    """
+    """S⁻¹ (1, k, k) of a run, S = D L with C = L Lᵀ; a small share of C's diagonal for the rule."""
     std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     seen = std > 0
     per = np.where(seen, 1.0, 0.0) / np.where(seen, std, 1.0)
@@ -366,18 +357,12 @@ def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
 
 
 def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:
-    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling.
-
-    readings: those of the scaling, with any covariance.
-    """
+    """Return the covariance (G, L·m, L·m) of the measurements of each bucket of a scaling."""
     return [measurement_covariance(readings, b.loaded, b.reference, b.weights) for b in w.buckets]
 
 
 def usual_mode(readings: Readings, planned: Mode = "deflection") -> Mode:
-    """Deflections where every loaded reading has an unloaded one in its pose and cycle.
-
-    planned: `[planning] readings` of the cell; where it is "absolute", so is what is fitted.
-    """
+    """Deflections, unless planned otherwise, where every loaded reading has an unloaded one."""
     if planned == "absolute" or readings.unloaded.all():
         return "absolute"
     return "deflection" if has_unloaded(readings).all() else "absolute"

@@ -47,18 +47,15 @@ def missing(
 class Arm(Brief):
     """A serial arm of n joints, revolute or prismatic (rails, columns, gantries).
 
-    The chain from base to flange is
-
         T_base_flange(q) = L_0 M_1(q_1) L_1 M_2(q_2) ... M_n(q_n) L_n,   M = Rz or Tz
 
-    with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k
-    (k = 0..n) is the frame right after L_k: for k < n its origin is a point of the axis of joint
-    k + 1 and its z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves;
-    its frame is slot i - 1 moved by joint i.
+    with constant rigid transforms L_k; coupled joints move by `chain_angles`. *Slot* k (k = 0..n)
+    is the frame right after L_k: for k < n its origin is a point of the axis of joint k + 1 and its
+    z is that axis; slot n is the flange. Body i (i = 1..n) is what joint i moves; its frame is slot
+    i - 1 moved by joint i.
 
-    What is an angle of a revolute joint (rad) is a displacement of a prismatic one (m), and what is
-    a torque (N·m) is a force along its axis (N); speeds and tolerances in the configuration are the
-    same number in m for a prismatic joint as in rad for a revolute one.
+    Of a prismatic joint, angles (rad) are displacements (m), and torques (N·m) forces along its
+    axis (N); speeds and tolerances in the configuration are the same number in m as in rad.
     """
 
     name: str  # catalogue name or file stem
@@ -116,29 +113,20 @@ class Arm(Brief):
 
     @property
     def ratings(self) -> Floats:
-        """(n,) rated torques or forces; where unknown those of a joint of middle size.
-
-        150 N·m and 1500 N: guesses.
-        """
+        """(n,) rated torques or forces; where unknown 150 N·m and 1500 N, a middle size."""
         rated = np.asarray(self.torque_max, dtype=float)
         known = np.isfinite(rated) & (rated > 0)
         return np.where(known, rated, np.where(self.slides, UNKNOWN_FORCE, UNKNOWN_TORQUE))
 
     def along(self, wrench: Floats) -> Floats:
-        """Loads (..., n) along the joints, of wrenches (..., n + 1, 6) through the slots.
-
-        The torque about the axis, of a prismatic joint the force along it.
-        """
+        """Torques or forces (..., n) along the joints, of wrenches (..., n + 1, 6)."""
         torque = wrench[..., :-1, 5]
         if self.prismatic is None:
             return torque
         return np.where(self.prismatic, wrench[..., :-1, 2], torque)
 
     def phases(self, q: Floats) -> Floats:
-        """Phases (..., n) that periodic laws depend on, rad, from the controller's values.
-
-        The angle of the drive; of a prismatic joint one turn over its whole travel.
-        """
+        """Phases (..., n) that periodic laws depend on, rad; of a slide a turn over its travel."""
         angle = self.drive_angles(q)
         if self.prismatic is None:
             return angle
@@ -150,10 +138,7 @@ class Arm(Brief):
         return q if self.coupling is None else q @ self.coupling.T
 
     def drive_angles(self, q: Floats) -> Floats:
-        """Angles (..., n) that the drives have turned by, from the controller's values.
-
-        φ with D φ = C q; the controller's values themselves where all couplings are mechanical.
-        """
+        """Angles (..., n) φ of the drives: D φ = C q; q where all couplings are mechanical."""
         if self.drive is None:
             return self.chain_angles(q)
         if self.coupling is not None and np.array_equal(self.drive, self.coupling):
@@ -165,10 +150,7 @@ class Arm(Brief):
         return dq if self.drive is None else np.asarray(dq @ self.drive.T)
 
     def drive_torques(self, torque: Floats) -> Floats:
-        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes.
-
-        By virtual work: τ · D dδ = (Dᵀ τ) · dδ.
-        """
+        """Torques (..., n) that the drives carry, Dᵀ τ, from those about the joints' axes."""
         return torque if self.drive is None else np.asarray(torque @ self.drive)
 
     @property
@@ -179,10 +161,7 @@ class Arm(Brief):
         return np.asarray(np.diag(self.mimic) != 0)
 
     def complete(self, q: Floats) -> Floats:
-        """Return joint values (..., n) with those of mimic joints as they follow from the others.
-
-        What stands in their place is not used, it may be NaN.
-        """
+        """Return joint values (..., n) with those of mimic joints from the others."""
         if self.mimic is None:
             return q
         given = np.where(self.own, q, 0.0)

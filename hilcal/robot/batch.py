@@ -49,10 +49,7 @@ def along_states(x: Floats) -> Floats:
 
 
 def chunks(count: int, numbers: int = 0) -> Iterator[slice]:
-    """Yield slices that cover `count` states; one empty slice where there is none.
-
-    numbers: that are computed for each state, where they are many: chunks are smaller then.
-    """
+    """Yield slices that cover `count` states, at least one; smaller for many numbers each."""
     size = CHUNK if numbers == 0 else max(LEAST_CHUNK, min(CHUNK, BUDGET // numbers))
     for start in range(0, max(count, 1), size):
         yield slice(start, min(start + size, count))

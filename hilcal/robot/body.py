@@ -93,8 +93,8 @@ def _has_figures(arm: Arm) -> bool:
 def capsules(arm: Arm) -> tuple[Capsule, ...]:
     """Return the capsules of base and bodies, those of one body side by side.
 
-    Real housings are cylinders with rounded ends; the capsules hold them but for a rim of at
-    most an eighth of the radius, which the margins of collision checks cover.
+    They hold the real housings but for a rim of at most an eighth of the radius, which the margins
+    of collision checks cover.
     """
     if arm.sign is None:
         return _of_ur(arm, _FIGURES[arm.name]) if _has_figures(arm) else _of_any(arm)
@@ -107,15 +107,9 @@ def capsules(arm: Arm) -> tuple[Capsule, ...]:
 
 
 def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
-    """Poses T_base_body of base and bodies, and of the flange.
+    """Poses T_base_body (N, n + 2, 4, 4) of base, bodies and flange at joint values (N, n).
 
     T_base_body0 = 1, T_base_bodyi = L_0 M_1(θ_1) ... L_{i-1} M_i(θ_i).
-
-    q: (N, n) the controller's joint values, rad; chain: the chain at q where it is evaluated
-    already.
-
-    Returns:
-        (N, n + 2, 4, 4): base, the n bodies, flange.
     """
     chain = evaluate(arm, q) if chain is None else chain
     out = np.tile(np.eye(4), (len(q), arm.n + 2, 1, 1))
@@ -135,10 +129,7 @@ def body_poses(arm: Arm, q: Floats, chain: Chain | None = None) -> Floats:
 
 
 def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: float) -> Capsule:
-    """Return a capsule that the flange carries.
-
-    start: (3,) one end, flange axes, m; end: (3,) the other end, flange axes, m; radius: m.
-    """
+    """Return a capsule that the flange carries, between two ends (3,) in its axes, m."""
     axes, origin = arm.links[arm.n][:3, :3], arm.links[arm.n][:3, 3]
     return Capsule(name, arm.n, origin + axes @ start, origin + axes @ end, radius)
 

@@ -101,17 +101,12 @@ def arm_from_dh(path: Path) -> Arm:
     constant transforms L_0 = Rz(offset_1), L_i = Tz(d_i) Tx(a_i) Rx(alpha_i) Rz(offset_{i+1}).
     Centres of mass come in DH frame i; in the body frame they are Tz(d) Tx(a) Rx(alpha) com.
 
-    Modified rows (Craig, *Introduction to Robotics*, section 3.4): T_base_flange = Π_i
-    Rx(alpha_i) Tx(a_i) Rz(q_i + offset_i) Tz(d_i), with alpha and a of the link before the joint;
-    L_0 = Rx(alpha_1) Tx(a_1) Rz(offset_1), L_i = Tz(d_i) Rx(alpha_{i+1}) Tx(a_{i+1})
-    Rz(offset_{i+1}), L_n = Tz(d_n); in the body frame centres of mass are Tz(d) com.
+    Modified rows (Craig, *Introduction to Robotics*, section 3.4): T_base_flange = Π_i Rx(alpha_i)
+    Tx(a_i) Rz(q_i + offset_i) Tz(d_i), with alpha and a of the link before the joint; L_n =
+    Tz(d_n); in the body frame centres of mass are Tz(d) com.
 
-    A prismatic joint has Tz(d_i + q_i) and Rz(offset_i) instead: M_i = Tz(q_i) between the same L.
-
-    With `base_m_rad` = B and `flange_m_rad` = E, as calibrated arms have, T_base_flange = B Π … E.
-
-    What a row may leave out is said in `Arm.notes`, as of a URDF: masses (none), limits (±360°),
-    torques (infinite).
+    A prismatic joint has Tz(d_i + q_i) and Rz(offset_i). With `base_m_rad` = B and `flange_m_rad` =
+    E, as calibrated arms have, T_base_flange = B Π … E. What rows leave out is said in `Arm.notes`.
     """
     table = load_section(path, DhTable)
     rows = table.joints
@@ -175,11 +170,7 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def configs_dir() -> Path:
-    """Return the directory of the configurations that come with the program.
-
-    It is `hilcal/configs` in an installed wheel, and `configs` beside the package in a
-    checkout or an editable installation.
-    """
+    """Return the directory of configurations: in the package, or beside it in a checkout."""
     inside = _PACKAGE / "configs"
     return inside if inside.is_dir() else _PACKAGE.parent / "configs"
 

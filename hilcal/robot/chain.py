@@ -84,10 +84,7 @@ def _turned(nominal: Turns, dq: Floats, prismatic: Bools | None) -> Turns:
 def evaluate(
     arm: Arm, q: Floats, deviation: Deviation | None = None, nominal: Turns | None = None
 ) -> Chain:
-    """Evaluate the deviated chain at the controller's values q (N, n); exact, batched.
-
-    `nominal`: `turns` at q where they are known.
-    """
+    """Evaluate the deviated chain at the controller's values q (N, n), `turns` there if known."""
     deviation = deviation or Deviation()
     moved = turns(arm, q) if nominal is None else nominal
     if deviation.dq is not None:
@@ -133,10 +130,7 @@ def evaluate(
 
 
 def _combine(axes: Floats, weights: Sequence[float], out: Floats) -> None:
-    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, and weights (3,), to (N, 3).
-
-    Links turn by quarter turns mostly: most weights are zero.
-    """
+    """Write Σ_j w_j axes_j of axes (N, 3, 3), in their columns, to (N, 3); most w are zero."""
     first, *others = [j for j in range(3) if weights[j]] or [0]
     np.multiply(axes[..., first], weights[first], out=out)
     for j in others:
@@ -152,11 +146,9 @@ def _offset(p: Floats, axes: Floats, offset: Sequence[float]) -> Floats:
 
 
 def joint_jacobian(chain: Chain, x: Floats) -> Floats:
-    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), base axes.
+    """Geometric Jacobian (N, 6, n) of a flange-fixed point now at x (N, 3), by the chain's angles.
 
-    By the angles of the chain; `drive_jacobian` is that by the drives.
-
-    Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); rows are m/rad and rad/rad.
+    Column j is (z_j × (x − p_j), z_j), of a prismatic joint (z_j, 0); base axes, m/rad and rad/rad.
     """
     n = len(chain.com)
     z = np.swapaxes(chain.rotation[:n, :, :, 2], 0, 1)
@@ -180,9 +172,8 @@ def twist_jacobian(r: Floats, lever: Floats, twist: Floats | None) -> Floats:
 
         (v, ω) = [R, −[l]× R; 0, R] [J(ξ), Q(ξ); 0, J(ξ)] dξ
 
-    with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from
-    its origin to the point, and the blocks J, Q of the right Jacobian (`se3`). v, ω and l are
-    in the axes that R leads to.
+    with R (N, 3, 3) the frame's orientation after its twist ξ (N, 6), l (N, 3) the lever from its
+    origin to the point, and J, Q of the right Jacobian (`se3`), in the axes that R leads to.
     """
     out = empty(len(lever), 6, 6)
     shift: Floats | float = 0.0

@@ -62,21 +62,15 @@ def as_counted(arm: Arm, by: Conventions) -> Arm:
 def with_conventions(
     arm: Arm, sign: Floats, offset: Floats, coupling: Floats, counted: Floats | float = 0.0
 ) -> Arm:
-    """Return the arm whose joint values are the controller's.
+    """Return the arm whose joint values are the controller's: (n,) s and o, (n, n) k.
 
     Signs and zeros go into the constant links:
 
         M(s q + o) = M(o) X M(q) X⁻¹,  X = Rx(π) for s = −1, else 1;  M = Rz or Tz
 
-    Limits are those of the controller's values and stay.
-
-    Couplings C that the arm has already are applied to the converted values: θ = C (S q + o + K q).
-
-    Args:
-        sign: (n,) s.
-        offset: (n,) o, rad; m where a joint slides.
-        coupling: (n, n) k, zero on the diagonal.
-        counted: (n, n) the part of it that is not mechanical.
+    Limits are those of the controller's values and stay. Couplings C that the arm has already are
+    applied to the converted values: θ = C (S q + o + K q). `counted` is the part of K that is not
+    mechanical.
     """
     links, coms = arm.links.copy(), arm.coms.copy()
     own = np.eye(arm.n) if arm.coupling is None else arm.coupling

@@ -99,12 +99,7 @@ def of_dict(told: Any, source: str) -> FactoryKinematics:
 
 
 def read_factory(path: Path, nominal: Arm, text: str | None = None) -> FactoryKinematics:
-    """Read a file of one arm's kinematics.
-
-    path: the file; its ending says of which kind it is; nominal: the arm as its maker designed it,
-    to which a calibration.conf adds; text: what the file holds, as a campaign keeps it; then none
-    is read.
-    """
+    """Read a file of one arm's kinematics; a calibration.conf adds to the nominal arm."""
     kind = path.suffix.lower()
     reader = {".conf": _of_conf, ".yaml": _of_yaml, ".yml": _of_yaml, ".toml": _of_toml}.get(kind)
     if reader is None:

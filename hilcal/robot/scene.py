@@ -19,9 +19,9 @@ FLANGE = "flange"
 def pinocchio_model(arm: Arm) -> pin.Model:
     """Build a Pinocchio model with the same chain, masses and limits.
 
-    Joint i is a revolute joint about z, or a prismatic one along z, with the placement L_{i-1} in
-    body i - 1; bodies are point masses at their centres of mass; the frame "flange" has the
-    placement L_n in the last body. Gravity is Pinocchio's default.
+    Joint i turns about z or slides along it, with the placement L_{i-1} in body i - 1; bodies are
+    point masses at their centres of mass; the frame "flange" has the placement L_n in the last
+    body.
     """
     model = pin.Model()
     model.name = arm.name
@@ -63,16 +63,14 @@ class Segment:
 class Scene:
     """Parts of the arm, what it carries, and obstacles, as Coal's shapes on a Pinocchio model.
 
-    Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which
-    the crude shapes touch in a large share of all states, as those about a spherical wrist.
+    Pairs within one body and of neighbouring bodies are not checked, nor are pairs of which the
+    crude shapes touch in a large share of all states, as those about a spherical wrist.
 
     Attributes:
         parts: capsules of the arm, then what the flange carries.
-        rates: (P, n) by part and joint: no point of the part goes farther than this per radian,
-            m.
+        rates: (P, n) no point of a part goes farther than this per radian of a joint, m.
         itself: pairs of parts.
-        around: parts and obstacles; base and shoulder stand where the arm is mounted, and are
-            not checked.
+        around: parts and obstacles; base and shoulder stand where the arm is mounted.
         free: parts and obstacles against a segment that is given with the states.
     """
 
@@ -104,15 +102,10 @@ class Scene:
         self.free = self._pairs([(a, last) for a in range(last)])
 
     def towards(self, point: Floats) -> Floats:
-        """Return how fast parts and obstacles near what hangs from a point of the flange, m/rad.
+        """Return (P + obstacles, n) how fast all near what hangs from a point of the flange, m/rad.
 
         It moves with the point and does not turn. A joint that turns a part turns the point with
         it, so that they near each other by no more than their distance per radian.
-
-        point: (3,) flange axes, m.
-
-        Returns:
-            (P + obstacles, n), by joint.
         """
         arm, fixed = self._arm, len(self._things)
         at = on_flange(arm, point)
@@ -128,10 +121,7 @@ class Scene:
         return out
 
     def _apart(self, a: int, b: int, far: Floats) -> Floats:
-        """(n,) how fast two parts near each other by a joint between them, m/rad.
-
-        Their distance is the same whichever of them stands still: the slower one counts.
-        """
+        """(n,) how fast two parts near each other by a joint between them, m/rad."""
         low, high = sorted((self.parts[a].body, self.parts[b].body))
         joint = np.arange(1, self._arm.n + 1)
         between = (joint > low) & (joint <= high)
@@ -195,11 +185,7 @@ class Pairs:
     def touching(
         self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
     ) -> Bools:
-        """Return (N,) in which states (N, n) any pair is closer than its margin, m.
-
-        q: (N, n) joint angles, rad; margin: of all pairs, or (K,) of each; negative where shapes
-        may overlap; segment: what is given with the states, of `Scene.free`.
-        """
+        """Return (N,) in which states (N, n) any pair is closer than its margin, m."""
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
             return out
@@ -213,10 +199,7 @@ class Pairs:
     def named(
         self, q: Floats, margin: float = 0.0, segment: Segment | None = None
     ) -> dict[tuple[str, str], float]:
-        """Return the pairs closer than a margin in any state (N, n), and their least distance, m.
-
-        It is negative where they overlap.
-        """
+        """Return the pairs closer than a margin in any state (N, n), and their distance, m."""
         out: dict[tuple[str, str], float] = {}
         hit = np.flatnonzero(self.touching(q, margin, segment))
         if not len(hit):
@@ -275,15 +258,11 @@ class Pairs:
 
 
 def from_axis(arm: Arm, body: int, points: Floats, joint: int) -> float:
-    """Return a bound on how far points of a body are from the axis of a joint, m, in every state.
+    """Return a bound on how far points (K, 3) of a body are from the axis of a joint, m.
 
-    So far they go at most per radian of the joint, or it per radian seen from them; 1 of a joint
-    that slides. It is the
-    length of the way along the links, |L_k| each; exact for a body that the joint carries, or
-    that carries the joint.
-
-    body: 0 the base, i what joint i moves; points: (K, 3) points in the body's frame, m; joint: 1
-    to n.
+    So far they go at most per radian of the joint; 1 of a joint that slides. It is the length of
+    the way along the links, |L_k| each; exact for a body that the joint carries, or that carries
+    it. Bodies count from 0, the base; joints from 1.
     """
     if arm.slides[joint - 1]:
         return 1.0
@@ -323,8 +302,7 @@ def _along(arm: Arm, body: int, points: Floats, last: int) -> float:
 def _spread(count: int, n: int) -> Floats:
     """(count, n) points that fill the unit cube evenly: frac(1/2 + k φ^-i), φ^(n+1) = φ + 1.
 
-    Source: Roberts (2018), The unreasonable effectiveness of quasirandom sequences. SciPy has
-    others, which take half a second to load.
+    Source: Roberts (2018), The unreasonable effectiveness of quasirandom sequences.
     """
     phi = 2.0
     for _ in range(60):

@@ -71,9 +71,8 @@ def rotation(w: Floats) -> Floats:
 def rotation_vector(r: Floats) -> Floats:
     """Rotation vector of a rotation matrix, angle in [0, π]; (..., 3, 3) -> (..., 3).
 
-    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ, whose elements are sums of those of R, the
-    row with the largest diagonal element is taken, so that nothing cancels at any angle
-    (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
+    By the unit quaternion (v, w): of 4 (v, w)(v, w)ᵀ the row with the largest diagonal element is
+    taken, so that nothing cancels (Shepperd 1978, J. Guidance and Control 1); θ = 2 atan2(|v|, w).
     """
     m = r.reshape(-1, 3, 3)
     square = np.empty((len(m), 4, 4))
@@ -179,8 +178,7 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
         Q = dJ(ω + ε v)/dε = −b [v]× + c (v ωᵀ + ω vᵀ) − 2 c d I
                              + 2 d (−b' [ω]× + c' (ω ωᵀ − θ² I)),   d = ω · v
 
-    with b', c' the slopes of b and c over θ². Q is the slope of J along v because a twist is
-    the dual number ω + ε v and J an analytic function of it.
+    with b', c' the slopes of b and c over θ²: a twist is the dual number ω + ε v.
     """
     v, w = twist[..., :3], twist[..., 3:]
     t2 = _square(w)

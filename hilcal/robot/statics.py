@@ -84,11 +84,7 @@ def _add_moment(t: Floats, lever: Floats, force: Floats) -> None:
 
 
 def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of the slot wrenches by changes of the wrench at the flange.
-
-    force: (N, P, 3) change of the force, base axes, N; moment: (N, P, 3) change of the moment about
-    the flange's origin, base axes, N·m.
-    """
+    """Change (N, P, n + 1, 6) of slot wrenches by forces and moments (N, P, 3) at the flange."""
     slots, count = chain.position.shape[:2]
     out = empty(count, force.shape[1], slots, 6)
     for k in range(slots):
@@ -100,10 +96,7 @@ def slot_wrench_change(chain: Chain, force: Floats, moment: Floats) -> Floats:
 
 
 def load_wrench_change(chain: Chain, load: Load, change: Floats) -> Floats:
-    """Change (N, P, n + 1, 6) of the slot wrenches by changes (N, P, 6) of the load's wrench.
-
-    The changes are at the load point, in base axes, N and N·m.
-    """
+    """Change (N, P, n + 1, 6) of slot wrenches by changes (N, P, 6) of the load's, base axes."""
     lever = (chain.point(load.point) - chain.position[-1])[:, None, :]
     force = change[..., :3]
     return slot_wrench_change(chain, force, change[..., 3:] + se3.cross(lever, force))
@@ -146,10 +139,7 @@ class GeometricStiffness:
     following: Floats | None = None
 
     def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
-        """Gradient by the motions of a linear form of the slot wrenches.
-
-        form: its coefficients (N, m, 3) by the force (False) and moment (True) of slots.
-        """
+        """Gradient by the motions of a linear form (N, m, 3) of slots' force and moment."""
         chain, slots = self.chain, len(self.force)
         still: list[Floats | None] = [None]
         along: list[Floats | None] = [None] * (slots + 1)

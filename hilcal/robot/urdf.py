@@ -31,20 +31,15 @@ DEFAULTS = (("multiplier", "1"), ("offset", "0"))
 
 
 def arm_from_urdf(path: Path, base_link: str | None = None, tip_link: str | None = None) -> Arm:
-    """Read the arm between two links of a URDF.
+    """Read the arm between two links of a URDF; by default the root and the only leaf.
 
-    With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to
-    the joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1,
-    L_k = R_kᵀ M_{k+1} R_{k+1} and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link
-    are merged into it; joints outside the chain (fingers of a gripper) are held at zero.
-    A continuous joint gets the range ±2π, also one whose limits are both 0; an effort of 0 means
-    unknown (infinite); a URDF names no payload (infinite). What is missing is said in `Arm.notes`.
-    A joint outside of the chain that mimics another is held at zero as well. One of the chain turns
-    by multiplier · q_i + offset of the joint i of the chain that it follows: that is a coupling of
-    the arm (`Arm.coupling`, `Arm.drive`), and the joint has no value of its own (`Arm.mimic`).
-
-    base_link: link whose frame is the base; the root link if None; tip_link: link whose frame is
-    the flange; the only leaf link if None.
+    With M_k the placement of joint k in its predecessor and R_k a rotation that takes z to the
+    joint's axis, the constant transforms are L_0 = T_base_root M_1 R_1, L_k = R_kᵀ M_{k+1} R_{k+1}
+    and L_n = R_nᵀ M_tip. Masses rigidly attached to a moving link are merged into it; joints
+    outside the chain are held at zero. A continuous joint gets the range ±2π, also one whose limits
+    are both 0; an effort of 0 means unknown (infinite). What is missing is said in `Arm.notes`. A
+    joint of the chain that mimics another turns by multiplier · q_i + offset: that is a coupling of
+    the arm, and the joint has no value of its own (`Arm.mimic`).
     """
     model = _read(path)
     names = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
@@ -269,13 +264,7 @@ def mimics(path: Path) -> dict[str, Mimic]:
 
 
 def with_mimics(arm: Arm, given: Mapping[str, Mimic], where: str) -> Arm:
-    """Return the arm whose joints follow others as a URDF says.
-
-    The motor of joint i turns the joint along, so that the coupling is mechanical.
-
-    arm: the arm with every joint by itself; given: what joints of the file follow; those that the
-    arm does not have do not count.
-    """
+    """Return the arm whose joints follow others as a URDF says, turned along by their motors."""
     names, n = list(arm.joint_names), arm.n
     follows = {names.index(name): m for name, m in given.items() if name in names}
     if not follows:

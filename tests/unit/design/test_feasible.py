@@ -206,10 +206,7 @@ NOTHING = {
     ),
     "no regular pose": ({"planning": {"singularity": 0.9}}, r"0 are not singular \(\[planning\] "),
     "weak": ({"limits": {"torque_share": 0.001}}, r"0 keep the joint torques \(\[limits\] torque_"),
-    "a tool too heavy": (
-        {"tool": {"mass_kg": 13.0}},
-        r"0 keep the payload \(\[tool\] mass_kg",
-    ),
+    "a tool too heavy": ({"tool": {"mass_kg": 13.0}}, r"0 keep the payload \(\[tool\] mass_kg"),
     "no range": ({"limits": {"joint_margin_rad": 3.2}}, "joint_margin_rad leaves joint 1 no range"),
     "payload too large": (
         {"loads": [{"name": "20kg", "mass_kg": 20.0}]},

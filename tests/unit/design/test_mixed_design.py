@@ -20,11 +20,7 @@ from hilcal.design.information import (
 )
 from hilcal.design.mixed_design import MixedDesign, balanced, mixed_design, other_effects
 from hilcal.design.nominal_model import after, nominal_model
-from hilcal.design.predicted import (
-    PredictionPoses,
-    position_derivative,
-    prediction_poses,
-)
+from hilcal.design.predicted import PredictionPoses, position_derivative, prediction_poses
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.readings.whitening import Mode

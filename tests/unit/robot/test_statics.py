@@ -25,8 +25,7 @@ def case(arm: Arm, gravity: tuple[float, ...]) -> tuple[Floats, Deviation, Load]
     rng = np.random.default_rng(5)
     q = rng.uniform(-np.pi, np.pi, (COUNT, arm.n))
     d = Deviation(
-        dq=0.1 * rng.normal(size=(COUNT, arm.n)),
-        twist=0.1 * rng.normal(size=(COUNT, arm.n + 1, 6)),
+        dq=0.1 * rng.normal(size=(COUNT, arm.n)), twist=0.1 * rng.normal(size=(COUNT, arm.n + 1, 6))
     )
     load = Load(
         wrench=rng.normal(size=(COUNT, 6)) * [80, 80, 80, 9, 9, 9],
