@@ -15,7 +15,6 @@ from hilcal.design.criterion import (
     best_first,
     prices,
     square,
-    total_information,
     upper_bound,
 )
 from hilcal.errors import CannotAnswerError, InputError
@@ -34,8 +33,7 @@ class BarrierProgram:
     """Maximise φ(M0 + Σ w_k A_kᵀA_k) over w with Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most."""
 
     criterion: Criterion  # φ
-    rows: Floats  # (n, R, P) A
-    cost: Floats  # (n,) c
+    units: CandidateSet  # n of them
     budget: float  # B
     most: float  # bound of each weight; infinity for none
     prior: Floats  # (P, P) M0
@@ -46,9 +44,10 @@ class BarrierProgram:
 
     def change(self, weight: Floats) -> Floats:
         """Return (P, P) Σ w_k A_kᵀA_k; weights of either sign."""
-        flat = self.rows.reshape(-1, self.rows.shape[2])
+        rows = self.units.rows
+        flat = rows.reshape(-1, rows.shape[2])
         if self._grams is None:
-            return np.asarray((flat * np.repeat(weight, self.rows.shape[1])[:, None]).T @ flat)
+            return np.asarray((flat * np.repeat(weight, rows.shape[1])[:, None]).T @ flat)
         out = np.zeros((flat.shape[1], flat.shape[1]))
         up, across = np.triu_indices(len(out))
         out[up, across] = out[across, up] = weight @ self._grams
@@ -57,33 +56,36 @@ class BarrierProgram:
     @cached_property
     def _grams(self) -> Floats | None:
         """(n, P (P + 1) / 2) upper triangles of A_kᵀA_k; None where they are too large to keep."""
-        up, across = np.triu_indices(self.rows.shape[2])
-        if len(self.rows) * len(up) > _KEPT:
+        up, across = np.triu_indices(self.units.size)
+        if len(self.units) * len(up) > _KEPT:
             return None
-        out = np.empty((len(self.rows), len(up)))
-        for k, a in enumerate(self.rows):
+        out = np.empty((len(self.units), len(up)))
+        for k, a in enumerate(self.units.rows):
             out[k] = (a.T @ a)[up, across]
         return out
 
-    def bound(self, smooth: Smooth) -> float:
-        """Return the bound of φ over these units."""
-        above = prices(self.rows, smooth.above)
-        below = None if smooth.below is None else prices(self.rows, smooth.below)
-        return upper_bound(smooth, self.prior, above, self.cost, self.budget, self.most, below)
+    def scan(self, smooth: Smooth) -> tuple[Floats, float]:
+        """Return tr(Z A_kᵀA_k) of all units, and the bound of φ over them."""
+        rows = self.units.rows
+        above = prices(rows, smooth.above)
+        below = None if smooth.below is None else prices(rows, smooth.below)
+        cost = self.units.cost
+        return above, upper_bound(smooth, self.prior, above, cost, self.budget, self.most, below)
 
     def curvature(self, smooth: Smooth) -> Floats:
         """Return (n, n) −∂²f/∂w_k∂w_l, positive semidefinite."""
-        n, size, p = self.rows.shape
-        flat = self.rows.reshape(-1, p)
+        rows = self.units.rows
+        n, size, p = rows.shape
+        flat = rows.reshape(-1, p)
         out = np.zeros((n, n))
         for c, x, y in smooth.products:
-            out -= c * _product(self.rows, x, y)
+            out -= c * _product(rows, x, y)
         for factor, v in smooth.squares:
             if isinstance(factor, np.ndarray):
                 each = np.sum((flat @ v).reshape(n, size, -1) ** 2, axis=1)
                 out -= each @ factor @ each.T
             else:
-                price = prices(self.rows, v)
+                price = prices(rows, v)
                 out -= factor * np.outer(price, price)
         return np.asarray(0.5 * (out + out.T))
 
@@ -165,7 +167,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
         if smooth is None:
             break
         value = float(program.criterion.value(m))
-        found = Optimum(w, smooth, value, program.bound(smooth), mu)
+        found = Optimum(w, smooth, value, program.scan(smooth)[1], mu)
         if best is None or found.gap < best.gap:
             best = found
         if found.gap <= tolerance or step == _STEPS - 1:
@@ -175,7 +177,7 @@ def solve(program: BarrierProgram, start: Floats, tolerance: float, order: float
             central, z, y = False, 0.2 * z, 0.2 * y
             surrogate = program.criterion.surrogate(m, mu)
             smooth = surrogate(m) or smooth
-        slope = prices(program.rows, smooth.gradient)
+        slope = prices(program.units.rows, smooth.gradient)
         top = program.most - w if capped else np.ones(n)
         lean = slope + mu / w - (mu / top if capped else 0.0)
         move = _newton(program, program.curvature(smooth) + np.diag(z / w + y / top), lean, w)
@@ -220,10 +222,12 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
             factor = sl.cho_factor(matrix, lower=True, check_finite=False)
         except (np.linalg.LinAlgError, ValueError):
             continue
-        both = sl.cho_solve(factor, np.column_stack([lean, program.cost]), check_finite=False)
+        both = sl.cho_solve(factor, np.column_stack([lean, program.units.cost]), check_finite=False)
         if np.isfinite(both).all():
-            short = program.budget - float(program.cost @ w)
-            price = (float(program.cost @ both[:, 0]) - short) / float(program.cost @ both[:, 1])
+            short = program.budget - float(program.units.cost @ w)
+            price = (float(program.units.cost @ both[:, 0]) - short) / float(
+                program.units.cost @ both[:, 1]
+            )
             return np.asarray(both[:, 0] - price * both[:, 1])
     return None
 
@@ -326,7 +330,7 @@ def relax(
     cap = np.inf if most is None else float(most)
     prior = checked(units, budget, prior, most)
     share = min(budget / float(units.cost.sum()), cap)
-    spread = prior + total_information(units, np.full(len(units), share))
+    spread = prior + units.information(np.full(len(units), share))
     criterion.require(spread, names)
     criterion = criterion.relevant(units, prior, budget)
     if share == cap and criterion.monotone:
@@ -336,9 +340,9 @@ def relax(
             all_of_them, np.full(len(units), cap), value, value, np.ones(len(units)), spread
         )
     most_spent = (1.0 - 1e-9) * cap * float(units.cost.sum())
-    scan = _Scan(units, criterion, min(budget, most_spent), cap, prior)
+    whole = BarrierProgram(criterion, units, min(budget, most_spent), cap, prior)
     if start is None:
-        active, weight = _first(scan, spread)
+        active, weight = _first(whole, spread)
         order = 0.3
     else:
         active, weight, order = start.index, start.weight, 0.03
@@ -347,8 +351,10 @@ def relax(
     for _ in range(_ROUNDS):
         last = len(active) == len(units)
         goal = 0.3 * tolerance if last else max(0.3 * tolerance, 0.1 * order)
-        found = scan.solve(active, weight, goal, order)
-        rate, bound = scan.all(found.smooth)
+        found = _solved(whole, active, weight, goal, order)
+        price, bound = whole.scan(found.smooth)
+        if found.smooth.below is not None:
+            price = prices(units.rows, found.smooth.gradient)
         best = min(best, bound)
         if top is None or found.value > top[0].value:
             top = found, active
@@ -356,11 +362,11 @@ def relax(
         gaps.append(gap)
         if gap <= tolerance or last or (len(gaps) > _STALE and gap > 0.8 * min(gaps[:-_STALE])):
             break
-        active, weight = _exchanged(scan, active, found.weight, rate)
+        active, weight = _exchanged(whole, active, found.weight, price / units.cost)
         order = max(min(0.5 * gap, order), tolerance)
     if top is None or not top[0].value > 0.0:
         raise CannotAnswerError("the candidates determine too little: the criterion stays 0")
-    return _pruned(scan, top[1], top[0].weight, best)
+    return _pruned(whole, top[1], top[0].weight, best)
 
 
 def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int | None) -> Floats:
@@ -383,37 +389,19 @@ def checked(units: CandidateSet, budget: float, prior: Floats | None, most: int 
     return prior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Scan:
-    """All units of a relaxation."""
-
-    units: CandidateSet
-    criterion: Criterion
-    budget: float
-    cap: float
-    prior: Floats
-
-    def all(self, smooth: Smooth) -> tuple[Floats, float]:
-        """Return the price per cost (K,) of all units, up to a factor, and the bound."""
-        u = self.units
-        above = prices(u.rows, smooth.above)
-        below = None if smooth.below is None else prices(u.rows, smooth.below)
-        bound = upper_bound(smooth, self.prior, above, u.cost, self.budget, self.cap, below)
-        net = above if below is None else prices(u.rows, smooth.gradient)
-        return net / u.cost, bound
-
-    def solve(self, active: Ints, weight: Floats, goal: float, order: float) -> Optimum:
-        """Return the optimum over some units; what is not monotone may leave budget."""
-        rows, cost = self.units.rows[active], self.units.cost[active]
-        start = _feasible(weight, cost, self.budget, self.cap)
-        if not self.criterion.monotone:  # one more unit without information
-            rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
-            cost = np.append(cost, self.budget)
-            left = min(max(1.0 - float(weight @ cost[:-1]) / self.budget, 0.01), 0.99)
-            start = np.append((1.0 - left) * start, left)
-        program = BarrierProgram(self.criterion, rows, cost, self.budget, self.cap, self.prior)
-        found = solve(program, start, goal, order)
-        return replace(found, weight=found.weight[: len(active)])
+def _solved(
+    whole: BarrierProgram, active: Ints, weight: Floats, goal: float, order: float
+) -> Optimum:
+    """Return the optimum over some units; what is not monotone may leave budget."""
+    rows, cost = whole.units.rows[active], whole.units.cost[active]
+    start = _feasible(weight, cost, whole.budget, whole.most)
+    if not whole.criterion.monotone:  # one more unit without information
+        rows = np.concatenate([rows, np.zeros((1, *rows.shape[1:]))])
+        cost = np.append(cost, whole.budget)
+        left = min(max(1.0 - float(weight @ cost[:-1]) / whole.budget, 0.01), 0.99)
+        start = np.append((1.0 - left) * start, left)
+    found = solve(replace(whole, units=CandidateSet(rows, cost)), start, goal, order)
+    return replace(found, weight=found.weight[: len(active)])
 
 
 def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats:
@@ -425,15 +413,15 @@ def _feasible(weight: Floats, cost: Floats, budget: float, cap: float) -> Floats
     return np.asarray(w + (budget - spent) / float((cap - w) @ cost) * (cap - w))
 
 
-def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
+def _first(whole: BarrierProgram, spread: Floats) -> tuple[Ints, Floats]:
     """Return units that a few multiplicative steps give the most weight.
 
     w_k <- w_k (price_k / mean price)^(2/3). Silvey, Titterington & Torsney (1978), Comm. Statistics
     A7.
     """
-    units, budget = scan.units, scan.budget
-    count = min(len(units), max(_SHORT, int(4 * budget / (scan.cap * float(units.cost.min())))))
-    smooth = scan.criterion.surrogate(spread, 0.1)(spread)
+    units, budget = whole.units, whole.budget
+    count = min(len(units), max(_SHORT, int(4 * budget / (whole.most * float(units.cost.min())))))
+    smooth = whole.criterion.surrogate(spread, 0.1)(spread)
     if smooth is None or count == len(units):
         some = np.arange(len(units))
     else:
@@ -441,56 +429,60 @@ def _first(scan: _Scan, spread: Floats) -> tuple[Ints, Floats]:
         even = np.linspace(0, len(units) - 1, count // 4).astype(np.int64)
         some = np.union1d(best_first(rate, count - len(even)), even)
     rows, cost = units.rows[some], units.cost[some]
-    program = BarrierProgram(scan.criterion, rows, cost, budget, scan.cap, scan.prior)
+    program = replace(whole, units=CandidateSet(rows, cost))
     w = np.full(len(some), budget / float(cost.sum()))
     for _ in range(_WARM):
         m = program.information(w)
-        smooth = scan.criterion.surrogate(m, 0.1)(m)
+        smooth = whole.criterion.surrogate(m, 0.1)(m)
         if smooth is None:
             break
         rate = np.maximum(prices(rows, smooth.gradient) / cost, 0.0)
         w = w * (rate + 1e-3 * float(rate.max())) ** (2 / 3)
         w *= budget / float(w @ cost)
-    needed = budget / scan.cap
+    needed = budget / whole.most
     order = np.argsort(-w * cost, kind="stable")
     size = max(units.size, int(np.searchsorted(np.cumsum(cost[order]), 2 * needed)) + 1)
     while size < len(some):
         chosen = order[:size]
         m = program.information(np.where(np.isin(np.arange(len(w)), chosen), w, 0.0))
-        smooth = scan.criterion.surrogate(m, 0.1)(m)
-        if smooth is not None and float(scan.criterion.value(m)) > 0.0:
+        smooth = whole.criterion.surrogate(m, 0.1)(m)
+        if smooth is not None and float(whole.criterion.value(m)) > 0.0:
             break
         size *= 2
     chosen = np.sort(order[:size])
     return some[chosen], w[chosen]
 
 
-def _exchanged(scan: _Scan, active: Ints, weight: Floats, rate: Floats) -> tuple[Ints, Floats]:
+def _exchanged(
+    whole: BarrierProgram, active: Ints, weight: Floats, rate: Floats
+) -> tuple[Ints, Floats]:
     """Return the units without those of no weight, with those of the best prices, and weights."""
-    cost = scan.units.cost
-    inner = weight < 0.99 * scan.cap if np.isfinite(scan.cap) else np.ones(len(weight), np.bool_)
+    cost = whole.units.cost
+    inner = (
+        weight < 0.99 * whole.most if np.isfinite(whole.most) else np.ones(len(weight), np.bool_)
+    )
     price = float(rate[active[inner]].max()) if inner.any() else float(rate[active].min())
-    share = weight * cost[active] / scan.budget
+    share = weight * cost[active] / whole.budget
     kept = (share > 1e-5 / len(active)) | (rate[active] > 0.999 * price)
     outside = rate.copy()
     outside[active] = -np.inf
-    new = best_first(outside, 2 * scan.units.size)
+    new = best_first(outside, 2 * whole.units.size)
     new = new[outside[new] > price * (1.0 + 1e-12)]
-    little = 0.02 * scan.budget / (cost[new] * max(len(new), 1))
+    little = 0.02 * whole.budget / (cost[new] * max(len(new), 1))
     index = np.concatenate([active[kept], new])
     order = np.argsort(index)
     return index[order], np.concatenate([weight[kept], little])[order]
 
 
-def _pruned(scan: _Scan, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
+def _pruned(whole: BarrierProgram, active: Ints, weight: Floats, bound: float) -> ApproximateDesign:
     """Return the optimum without weights that change nothing."""
-    units, criterion = scan.units, scan.criterion
-    share = weight * units.cost[active] / scan.budget
+    units, criterion = whole.units, whole.criterion
+    share = weight * units.cost[active] / whole.budget
     kept = share > 1e-8 * float(share.max())
     index, w = active[kept], weight[kept]
     if criterion.monotone:
-        w = np.minimum(w * (scan.budget / float(w @ units.cost[index])), scan.cap)
-    m = scan.prior + units.information(w, index)
+        w = np.minimum(w * (whole.budget / float(w @ units.cost[index])), whole.most)
+    m = whole.prior + units.information(w, index)
     smooth = criterion.surrogate(m, 1e-3)(m)
     value = float(criterion.value(m))
     price = np.ones(len(units)) if smooth is None else prices(units.rows, smooth.gradient)

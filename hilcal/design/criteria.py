@@ -16,7 +16,6 @@ from hilcal.design.criterion import (
     inverse,
     soft_least,
     square,
-    total_information,
 )
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.regression.schur import (
@@ -33,7 +32,6 @@ from hilcal.types import Floats, Ints
 class SmoothCriterion(Criterion):
     """A differentiable criterion: it is its own surrogate, f = log φ."""
 
-    monotone = True
     kinked = False
 
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
@@ -166,8 +164,6 @@ class E(Criterion):
 
     interest: Ints | None = None  # indices of the parameters of interest; all by default
     name = "E"
-    monotone = True
-    kinked = True
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -181,13 +177,7 @@ class E(Criterion):
 
         def smooth(m: Floats) -> Smooth | None:
             part = _least(differentiable_schur_complement(m, self.interest), order * scale)
-            return Smooth(
-                part.value / scale,
-                part.gradient / scale,
-                tuple((c / scale, x, y) for c, x, y in part.products),
-                tuple((c / scale, v) for c, v in part.squares),
-                part.gradient,
-            )
+            return part.scaled(1.0 / scale)
 
         return smooth
 
@@ -203,7 +193,6 @@ class K(Criterion):
 
     name = "K"
     monotone = False
-    kinked = True
 
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) matrices."""
@@ -223,20 +212,11 @@ class K(Criterion):
             values, vectors = np.linalg.eigh(m)
             least = _part(values, vectors, order * scale)
             largest = _part(-values, vectors, order * most)  # F_max(M) = −F_min(−M)
+            a, b = least.scaled(1.0 / scale), largest.scaled(ratio / scale)
             return Smooth(
-                (least.value + ratio * largest.value) / scale,
-                (least.gradient - ratio * largest.gradient) / scale,
-                (
-                    *((c / scale, x, y) for c, x, y in least.products),
-                    *((ratio * c / scale, x, y) for c, x, y in largest.products),
-                ),
-                (
-                    *((c / scale, v) for c, v in least.squares),
-                    *((ratio * c / scale, v) for c, v in largest.squares),
-                ),
-                least.gradient,
-                largest.gradient,
-            )
+                a.value + b.value, a.gradient - b.gradient, a.products + b.products,
+                a.squares + b.squares, least.gradient, largest.gradient,
+            )  # fmt: skip
 
         return smooth
 
@@ -316,8 +296,6 @@ class Separate(Criterion):
 
     pairs: tuple[Pair, ...]  # what is to be separated
     name = "separate"
-    monotone = True
-    kinked = True
 
     def __post_init__(self) -> None:
         """Refuse an empty list."""
@@ -427,9 +405,7 @@ class Separate(Criterion):
         No plan brings the weakest pair over the least of the bounds uᵀ M0 u + B max |A_k u|² / c_k
         of single pairs, and no pair falls below its value at M0.
         """
-        spread = prior + total_information(
-            units, np.full(len(units), budget / float(units.cost.sum()))
-        )
+        spread = prior + units.information(np.full(len(units), budget / float(units.cost.sum())))
         us = self._solved(spread)[0]
         seen = (units.rows.reshape(-1, units.size) @ us.T).reshape(len(units), -1, len(us))
         gain = np.sum(seen**2, axis=1) / units.cost[:, None]
@@ -480,7 +456,7 @@ def condensed(
     model = pairs[0].nuisance
     for pair in pairs:
         model = np.intersect1d(model, pair.nuisance)
-    m = prior + total_information(units, np.full(len(units), 1.0 / float(units.cost.sum())))
+    m = prior + units.information(np.full(len(units), 1.0 / float(units.cost.sum())))
     blocks = {model.tobytes(): model}
     for pair in pairs:
         for block in (pair.effect, np.setdiff1d(pair.nuisance, model)):

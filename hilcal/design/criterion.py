@@ -1,14 +1,16 @@
 """The protocol of a design criterion: concave in the information, with a smooth surrogate."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.regression.schur import DETERMINED
 from hilcal.types import Bools, Floats, Ints
+
+_CHUNK = 2048
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,9 +38,12 @@ class CandidateSet:
 
     def information(self, weight: Floats, which: Ints | None = None) -> Floats:
         """Return (P, P) Σ w_k A_kᵀ A_k of all units, or of those of some indices."""
-        rows = self.rows if which is None else self.rows[which]
-        root = (rows * np.sqrt(weight)[:, None, None]).reshape(-1, self.size)
-        return np.asarray(root.T @ root)
+        rows, out = self.rows if which is None else self.rows[which], np.zeros((self.size,) * 2)
+        for start in range(0, len(rows), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            root = (rows[part] * np.sqrt(weight[part])[:, None, None]).reshape(-1, self.size)
+            out += root.T @ root
+        return out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,29 +71,32 @@ class Smooth:
     above: Floats  # (P, P) Z such that φ(N) ≤ tr(Z N) for every information N ⪰ 0,
     below: Floats | None = None  # or with Y (P, P): φ(N) ≤ tr(Z N) / tr(Y N)
 
+    def scaled(self, by: float) -> "Smooth":
+        """Return a multiple of f, with the same bound."""
+        products = tuple((by * c, x, y) for c, x, y in self.products)
+        squares = tuple((by * c, v) for c, v in self.squares)
+        return replace(
+            self, value=by * self.value, gradient=by * self.gradient, products=products,
+            squares=squares,
+        )  # fmt: skip
 
-class Criterion(Protocol):
+
+class Criterion(ABC):
     """φ(M) of an information matrix M (P, P): more is better.
 
     Concave and positively homogeneous of degree 1, so that φ(N) ≤ tr(G(M) N) for all M, N; only the
     ratio of eigenvalues (`K`) is quasi-concave and of degree 0.
     """
 
-    @property
-    def name(self) -> str:
-        """Name by which a configuration calls it."""
+    name: str  # by which a configuration calls it
+    monotone = True  # whether more information is never worse
+    kinked = True  # whether φ has kinks, so that the surrogate depends on its order
 
-    @property
-    def monotone(self) -> bool:
-        """Whether more information is never worse."""
-
-    @property
-    def kinked(self) -> bool:
-        """Whether φ has kinks, so that the surrogate depends on its order."""
-
+    @abstractmethod
     def value(self, m: Floats) -> Floats:
         """Return φ of (..., P, P) information matrices; 0 where they are singular."""
 
+    @abstractmethod
     def surrogate(self, m: Floats, order: float) -> Callable[[Floats], Smooth | None]:
         """Return f near φ / φ(m), or log φ, and nearer as `order` tends to 0; None if undefined."""
 
@@ -195,9 +203,6 @@ def square(m: Floats, what: str, size: int | None = None) -> Floats:
     return 0.5 * (m + m.T)
 
 
-_CHUNK = 2048
-
-
 def prices(rows: Floats, matrix: Floats) -> Floats:
     """Return (K,) tr(G A_kᵀA_k) of (K, R, P) rows, for a symmetric (P, P) matrix G.
 
@@ -218,17 +223,6 @@ def prices(rows: Floats, matrix: Floats) -> Floats:
         if minus is not None and len(minus):
             total -= 2.0 * np.einsum("ij,ij->i", part[:, minus], part[:, minus])
         out[start : start + _CHUNK] = total.reshape(-1, size).sum(axis=1)
-    return out
-
-
-def total_information(units: CandidateSet, weight: Floats) -> Floats:
-    """Return (P, P) Σ w_k A_kᵀA_k over all units, in chunks."""
-    out = np.zeros((units.size, units.size))
-    for start in range(0, len(units), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        root = units.rows[part] * np.sqrt(weight[part])[:, None, None]
-        root = root.reshape(-1, units.size)
-        out += root.T @ root
     return out
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from hilcal.config import CellConfig
-from hilcal.design.criterion import CandidateSet, inverse, total_information
+from hilcal.design.criterion import CandidateSet, inverse
 from hilcal.design.information import (
     Candidates,
     DesignProblem,
@@ -89,7 +89,7 @@ def balanced(of: MixedDesign) -> MixedDesign:
     and rounding would decide. Where they determine nothing of one it stays as it is, by its name.
     """
     units = of.units
-    every = of.prior + total_information(units, np.full(len(units), 1.0 / len(units)))
+    every = of.prior + units.information(np.full(len(units), 1.0 / len(units)))
     size = np.sqrt(np.diag(every))
     if not np.all(size > 0):
         return of

@@ -254,7 +254,7 @@ class Model(Brief):
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
-        columns = ReadingColumns(moves, blocks, s.load, scale)
+        columns = ReadingColumns(moves, blocks, s.load, out.shape[2])
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             if not (place >= 0).any():
@@ -272,7 +272,7 @@ class Model(Brief):
                 columns.add_load_changes(change, place)
             elif (change := e.wrench_columns(at, s)) is not None:
                 columns.add_wrench_changes(change, place)
-        columns.write(out)
+        columns.write(out, scale)
 
     def _motion(
         self, prediction: Prediction, theta: Floats, m: int
