@@ -316,8 +316,7 @@ def relax(
     *,
     most: int | None = None,  # how often a unit may be taken; any number of times by default
     names: Sequence[str] | None = None,
-    # relative gap at which to stop; 1e-7, or 1e-3 of criteria with kinks
-    tolerance: float | None = None,
+    tolerance: float | None = None,  # relative gap to stop at; by default 1e-7, of kinks 1e-3
     start: ApproximateDesign | None = None,  # optimum of a similar problem over the same units
 ) -> ApproximateDesign:
     """Return the continuous optimum of φ(M0 + Σ w_k A_kᵀA_k), Σ w_k c_k ≤ B, 0 ≤ w_k ≤ most.

@@ -48,8 +48,7 @@ class Objective:
     units: CandidateSet  # the units by the parameters that φ is of
     prior: Floats  # (P, P) prior information of these
     names: tuple[str, ...]  # of the parameters; none where they are combinations
-    # the pairs of effects that "separate" is of; None of other criteria
-    apart: DiscriminatedPairs | None = None
+    apart: DiscriminatedPairs | None = None  # the pairs of "separate"; None of others
 
     def relaxed(
         self, budget: float, tolerance: float = LOOSE, start: ApproximateDesign | None = None

@@ -51,8 +51,7 @@ class D(SmoothCriterion):
     Research 10(6). With a model that may be complete, φ(M) = det(M)^(1/2P) · det(M_ss)^(1/2s).
     """
 
-    # s of a model whose parameters come first; None where all are taken for unknown
-    model: int | None = None
+    model: int | None = None  # s of a model that comes first; None where all are unknown
     name = "D"
 
     def blocks(self, size: int) -> tuple[tuple[float, Ints], ...]:
@@ -100,8 +99,7 @@ class MeanVariance(SmoothCriterion):
 
     c: Floats  # (P, P) C, positive semidefinite
     name: str = "I"  # name by which a configuration calls it
-    # (s, s) C_s of a model whose parameters come first; None where all are unknown
-    model: Floats | None = None
+    model: Floats | None = None  # (s, s) C_s of a model that comes first; None for none
 
     def __post_init__(self) -> None:
         """Refuse a matrix that is no mean of squares."""

@@ -50,8 +50,7 @@ class DiscriminatedPairs:
     # (P, P) information before, without the priors of potential terms: neither must an effect be
     # found by what was supposed of it, nor a rival be held small
     prior: Floats
-    # names of the pairs that no measurement separates; they are left out
-    not_separable: tuple[tuple[str, str], ...] = ()
+    not_separable: tuple[tuple[str, str], ...] = ()  # names of pairs that are left out
 
 
 def discriminated_pairs(problem: DesignProblem) -> DiscriminatedPairs:

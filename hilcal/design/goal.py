@@ -83,14 +83,10 @@ class Goal:
 
     def met(
         self,
-        # standard uncertainty of each parameter by name, SI; infinite where it is not identifiable
-        stds: Mapping[str, float],
+        stds: Mapping[str, float],  # of each parameter, SI; infinite where not identifiable
         values: Mapping[str, float],
-        # standard uncertainty of what is predicted where the robot will work, m; infinite where the
-        # readings do not determine it
-        position: float | None = None,
-        # what that is, e.g. "deflection under 5kg at 100 poses in the work box".
-        predicted: str = "",
+        position: float | None = None,  # of what is predicted, m; infinite if undetermined
+        predicted: str = "",  # what that is, e.g. "deflection under 5kg at 100 poses"
     ) -> GoalStatus:
         """Judge standard uncertainties."""
         if self.of_position:
@@ -189,8 +185,7 @@ class GoalRule:
         text: str,  # the goal, e.g. "joint std < 2 %".
         cell: Cell,
         config: CellConfig,  # `[planning]`, loads, repeatability
-        # the effects that a model can have; the installed ones unless given
-        catalogue: Catalogue | None = None,
+        catalogue: Catalogue | None = None,  # the installed effects by default
         now: Callable[[], float] = time.monotonic,  # seconds that pass for people
     ) -> None:
         """Read a goal, and check it against the cell's model."""

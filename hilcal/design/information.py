@@ -76,9 +76,7 @@ class ReadingDerivatives:
     """What would be read of a chunk of N poses under 1 + L loads."""
 
     rows: slice
-    # (N, 1 + L, m, P) derivative by the parameters, in their scales; m are the elements of all
-    # targets that are read in one arrival
-    jacobian: Floats
+    jacobian: Floats  # (N, 1 + L, m, P) by the parameters; m of all that one arrival reads
     covariance: Floats  # (N, 1 + L, m, m) of them
 
 
@@ -245,9 +243,7 @@ class DesignTerm:
     effect: str  # canonical name of its effect
     name: str  # as identification prints it, e.g. "joint_compliance.j1".
     unit: str  # physical unit, SI
-    # what one unit of the problem's parameter is, SI: an ordinary magnitude, or τ of a potential
-    # term
-    scale: float
+    scale: float  # of one unit of the problem's, SI: an ordinary magnitude, or τ if potential
     value: float  # at which it is assumed, SI
     potential: bool  # whether it belongs to an effect that is not in the model
 
@@ -260,9 +256,7 @@ class DesignProblem:
     mode: Mode  # "deflection" or "absolute"
     candidates: Candidates
     units: CandidateSet  # K units; their parameters are those of the model, then potential terms
-    # pose and loads of each unit; "none" is the unloaded reading of absolute positions, that of
-    # deflections goes without saying
-    what: tuple[tuple[int, tuple[str, ...]], ...]
+    what: tuple[tuple[int, tuple[str, ...]], ...]  # pose and loads of each; "none" is unloaded
     terms: tuple[DesignTerm, ...]
     families: tuple[Effect, ...]  # effects of the potential terms
     prior: Floats  # (P, P) what is known before: priors, and what was measured already

@@ -43,9 +43,7 @@ class PairPower:
     rival: str  # the one that is fitted in its stead
     now: float  # chance that the readings so far reject the rival, by a test at 1 %
     then: float  # the same with the planned readings
-    # whether no measurement in this cell would do: neither these readings nor
-    # `discriminated_pairs.MANY` others reach a power of `LEAST_POWER`
-    not_separable: bool
+    not_separable: bool  # neither these readings nor `MANY` others reach `LEAST_POWER`
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,13 +64,10 @@ def measure_next(
     config: CellConfig,
     fit: Fit,  # what has been measured, in scaling gc, of a model without the suspects
     suspects: Sequence[str],  # two effects or more
-    # how many readings, or as many as so many poses take under every load: which poses and loads
-    # tell most of a difference is what the plan chooses
-    request: Request,
+    request: Request,  # readings, or as many as so many poses take under every load
     rng: np.random.Generator,
     say: Say = lambda words: None,
-    # (n,) joints of the campaign's reference pose, rad; a new one where None
-    reference: Floats | None = None,
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Next:
     """Plan the measurements that separate suspects.
 
@@ -234,8 +229,7 @@ def measure_poses(
     poses: int,
     rng: np.random.Generator,
     say: Say = lambda words: None,
-    # (n,) joints of the campaign's reference pose, rad; a new one where None
-    reference: Floats | None = None,
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Planned:
     """Plan distinct poses spread evenly over the joint space, each read once without a load.
 

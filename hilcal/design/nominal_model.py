@@ -43,9 +43,7 @@ class NominalModel:
     m: int  # elements of a reading: 3 or 6
     fit: Fit | None  # of what has been measured already; None at first
     notes: tuple[str, ...]  # what was assumed, one line each
-    # (L, L) information of a prior that is carried over from another campaign, 1/SI²; None without
-    # one. Those parameters have no other prior.
-    carried: Floats | None = None
+    carried: Floats | None = None  # (L, L) information of a carried prior, 1/SI²
 
     @property
     def elements(self) -> int:
@@ -78,8 +76,7 @@ def nominal_model(
     cell: Cell,
     config: CellConfig,
     m: int = 3,  # 3 for positions, 6 for poses
-    # the effects that a model can have; the installed ones unless given
-    catalogue: Catalogue | None = None,
+    catalogue: Catalogue | None = None,  # the installed effects by default
     # what another campaign taught. Its effects are in the model, too, but for families that share a
     # prior, which a plan is not made for unless they are named, and those that need what a plan
     # does not fix.

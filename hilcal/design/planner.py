@@ -54,9 +54,7 @@ class UndeterminedParameter:
     name: str  # as identification prints it, e.g. "joint_compliance.j1".
     unit: str  # SI
     value: float  # at which it is assumed, SI
-    # other parameters that the readings do not separate it from; none where no reading changes with
-    # it at all
-    confounded: tuple[str, ...] = ()
+    confounded: tuple[str, ...] = ()  # not separated from these; none where nothing changes
     joint: str = ""  # "joint 1" or "joints 1-2" where it is the compliance of these; else empty
 
     @property
@@ -166,12 +164,8 @@ class Request:
     """Size and criterion of a plan."""
 
     poses: int = 20  # just so many, each read once unloaded and under every load that it bears
-    # or this many readings, those at the reference and repeats not counted, spread over as many
-    # poses, and under those loads, as determine most
-    readings: int | None = None
-    # of `[planning]` where None; that has I for absolute readings and D for deflections unless it
-    # states one
-    criterion: str | None = None
+    readings: int | None = None  # or this many, but for reference and repeats
+    criterion: str | None = None  # of `[planning]` by default, else I, or D for deflections
     effort: int = EFFORT  # of the search for whole numbers
     unloaded: Literal["around", "first"] = "around"  # "around" or "first", see `Ordering`
 
@@ -182,8 +176,7 @@ class Planned:
 
     ordered: Ordered  # the plan in order, with what the order costs
     design: Design  # the units that were chosen, with the certificate
-    # loads that cost more than they tell, with what leaving each out would gain
-    costly: tuple[tuple[str, float], ...]
+    costly: tuple[tuple[str, float], ...]  # loads not worth their change, and the gain
     problem: DesignProblem
     asked: Objective  # the design problem with its criterion
     usable: Bools  # (K,) which units were to choose from
@@ -192,8 +185,7 @@ class Planned:
     budget: float  # readings of the design
     criterion: str
     predicted: PredictedUncertainty  # standard uncertainties that a fit to the readings will have
-    # parameters of the model that no reading of the cell determines
-    undetermined: tuple[UndeterminedParameter, ...]
+    undetermined: tuple[UndeterminedParameter, ...]  # by no reading of the cell
     asked_poses: int | None  # poses that were asked for, see `Request`; None where readings were
 
     @property
@@ -211,13 +203,9 @@ def make(
     rng: np.random.Generator,
     known: Fit | None = None,  # fit of what has been measured already
     say: Say = lambda words: None,
-    # the effects that a model can have; the installed ones unless given, or those of `known`
-    catalogue: Catalogue | None = None,
-    # what another campaign taught, where nothing has been measured yet
-    prior: CarriedPrior | None = None,
-    # (n,) joints of the reference pose of the campaign that the plan is appended to, rad; a new one
-    # where None
-    reference: Floats | None = None,
+    catalogue: Catalogue | None = None,  # those of `known`, or the installed effects
+    prior: CarriedPrior | None = None,  # what another campaign taught, if nothing is known
+    reference: Floats | None = None,  # (n,) the campaign's joints, rad; else a new one
 ) -> Planned:
     """Return the plan."""
     usual = "I" if config.planning.readings == "absolute" else "D"

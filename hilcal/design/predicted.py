@@ -45,8 +45,7 @@ def prediction_poses(
     nominal: NominalModel,
     config: CellConfig,  # `[planning] work_*`, loads
     feasible: Floats,  # (N, n) states that are feasible, rad; test poses are drawn from them
-    # predicate of feasible states (N, n), for a box that needs more of them
-    may: Callable[[Floats], Bools] | None = None,
+    may: Callable[[Floats], Bools] | None = None,  # which (N, n) are feasible, for a box
 ) -> PredictionPoses:
     """Return the test poses of `[planning]`: named, within a box, or of the candidates.
 
@@ -154,8 +153,7 @@ class PredictedUncertainty:
     values: Floats  # at which they are assumed, SI
     std: Floats  # with the model complete, SI; infinite where not identifiable
     std_open: Floats  # with the potential terms, SI
-    # with the model complete, RMS where the robot will work, m; None without any
-    position: float | None
+    position: float | None  # with the model complete, RMS where the robot works, m
     position_open: float | None  # the same with the potential terms
     positions: Floats  # (T,) per such pose, with the model complete
 
@@ -168,8 +166,7 @@ def predicted(
     problem: DesignProblem,
     counts: Floats | None = None,  # (K,) how often each unit is taken
     *,
-    # (P, P) instead, prior included; of the prior alone where neither is given
-    information: Floats | None = None,
+    information: Floats | None = None,  # (P, P) instead, prior included; else the prior
     work: PredictionPoses | None = None,
 ) -> PredictedUncertainty:
     """Predict the standard uncertainties that a plan reaches."""

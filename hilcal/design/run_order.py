@@ -95,22 +95,17 @@ class Confounding:
     A deflection's lag is the time from its unloaded to its loaded reading.
     """
 
-    # number of deflections outside the reference pose; 0 where none is planned, and what follows is
-    # then of the readings and their time
-    deflections: int
+    deflections: int  # beside the reference pose; 0: what follows is of readings and their time
     # the largest |correlation| ρ of the lag with a regressor; ρ² is the share of its information
     # that a parameter with this regressor loses where a drift has to be estimated as well
     correlation: float
     regressor: str  # which one, e.g. "fz cos q3".
-    # mean lag, s; a constant drift times this is what all deflections have in common
-    lag_mean_s: float
+    lag_mean_s: float  # times a constant drift this is common to all deflections
     lag_rms_s: float  # root mean square of the lag, s
     drift: float  # rate of the stated drift in one coordinate, m/s
     error_m: float  # rms error of a deflection from that drift, m
     bias_m: float  # mean error, m
-    # standard uncertainty of a drift rate estimated from the readings at the reference pose, in one
-    # coordinate, m/s; None where they do not determine it
-    drift_std: float | None
+    drift_std: float | None  # of a rate estimated by the reference poses, m/s
 
     @property
     def returned_m(self) -> float | None:
@@ -430,8 +425,7 @@ class OrderDraws:
     rng: np.random.Generator
     stops: dict[str, list[PlannedStop]] = field(default_factory=dict)  # by load
     ways: dict[str, Ways] = field(default_factory=dict)  # between the stops under each load
-    # shortest order of the stops under each load, counted from 1
-    short: dict[str, list[int]] = field(default_factory=dict)
+    short: dict[str, list[int]] = field(default_factory=dict)  # order of the stops, from 1
 
     @property
     def pace(self) -> Pace:

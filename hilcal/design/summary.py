@@ -114,8 +114,7 @@ class PlanSummary:
 
     poses: int  # number of poses beside the reference
     readings: int  # of all, those at the reference included
-    # readings by load, "none" among them, in the order in which they are hung
-    loads: dict[str, int]
+    loads: dict[str, int]  # readings by load, "none" among them, in their order
     duration: Duration
     criterion: str
     efficiency: float | None  # certified lower bound of the efficiency; None without a certificate
@@ -128,12 +127,10 @@ class PlanSummary:
     curve: tuple[CurvePoint, ...] = ()  # sample-size curve, fewest poses first
     detectable: tuple[DetectableEffect, ...] = ()  # minimum detectable effects
     longer: float = 0.0  # share of time beyond the shortest order
-    # of the plan's order with a linear drift; None where it is not known
-    confounding: Confounding | None = None
+    confounding: Confounding | None = None  # of the order with a linear drift
     shortest: Confounding | None = None  # confounding of the shortest order
     remarks: tuple[str, ...] = ()  # assumptions and omissions, one sentence each
-    # poses that were asked for, see `planner.Request`; None where readings were
-    asked_poses: int | None = None
+    asked_poses: int | None = None  # see `planner.Request`; None where readings were
 
     @property
     def quantity(self) -> str:

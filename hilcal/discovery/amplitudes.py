@@ -46,8 +46,7 @@ class Variable:
     unit: str  # SI; °C for temperatures, "1" for a number
     code: str  # how an effect reads it of its situation s; the search reads it so, too
     need: str = ""  # column of the readings that it needs; empty for none
-    # slot and component of the transmitted wrench that it is; None for none
-    slot: tuple[int, int] | None = None
+    slot: tuple[int, int] | None = None  # slot and component of the wrench that it is
     joint: int = -1  # index of the joint that it belongs to; −1 for none
     vector: str = ""  # what it is a component of; empty for none
     axis: int = -1  # along which; −1 for none
@@ -377,8 +376,7 @@ def different(a: Factor, b: Factor) -> bool:
 class Composed(Variable):
     """A weighted sum of products, as a quantity."""
 
-    # (weight, product); the first weight is 1, and all products have one unit
-    terms: tuple[tuple[float, Amplitude], ...] = ()
+    terms: tuple[tuple[float, Amplitude], ...] = ()  # weights, the first 1, and products
 
     def read(self, s: Situation) -> Floats:
         """(N,) it in the states."""

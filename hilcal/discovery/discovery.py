@@ -81,21 +81,15 @@ class Discovery(Shown):
     laws: tuple[Law, ...] = ()  # simplest first of those that predict as well as any
     attainable: float = 0.0  # share of the misfit that anything recorded predicts on poses left out
     searched_share: float = 0.0  # that of the laws that the search without each pose finds
-    # effects of the catalogue that explain the misfit, where they do
-    catalogue: tuple[str, ...] = ()
+    catalogue: tuple[str, ...] = ()  # effects that explain the misfit, where they do
     candidates: int = 0  # number of candidates that were tried
     after: Fit | None = None  # the fit with the first law
     source: str = ""  # of the first law's effect, as a Python file
     curves: tuple[Curve, ...] = ()  # the first law over what it depends on, with the readings
-    # where no law is found, recorded variables that the misfit depends on
-    carried: tuple[Dependence, ...] = ()
-    # laws that predict the misfit and are not proposed, and why: their exact refits failed
-    refused: tuple[tuple[str, str], ...] = ()
-    # effects of the catalogue that the exact model could not be fitted with, and why
-    unfitted: tuple[tuple[str, str], ...] = ()
-    # likely laws with their posterior probabilities, the likeliest first, and the best of each
-    # complexity; see `structures`
-    structures: tuple[Structure, ...] = ()
+    carried: tuple[Dependence, ...] = ()  # recorded variables it depends on, without a law
+    refused: tuple[tuple[str, str], ...] = ()  # laws whose exact refits failed, and why
+    unfitted: tuple[tuple[str, str], ...] = ()  # effects that could not be refitted, why
+    structures: tuple[Structure, ...] = ()  # likely laws, and the best of each complexity
 
     def __repr__(self) -> str:
         """Return the reason, and the formulas with their probabilities."""

@@ -179,11 +179,8 @@ class Grammar:
     values: Floats  # (F, N) their values, single precision, each with root mean square 1
     size: Floats  # (F,) what they were divided by
     cost: Ints  # (F,) complexities
-    # (F,) the amplitude with sine for cosine in its first periodic factor; −1 for none
-    partner: Ints
-    # (2, F) the amplitude without the first and without the second factor of a product of two; −1
-    # for no product
-    less: Ints
+    partner: Ints  # (F,) with sine for cosine in the first periodic factor; −1 for none
+    less: Ints  # (2, F) of a product of two without its first, and its second factor; else −1
     situation: Situation
     singles: tuple[Factor, ...]  # the functions of one quantity from which products are made
     _more: list[tuple[Amplitude, Floats, float]] = field(default_factory=list)

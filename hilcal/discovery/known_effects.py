@@ -65,10 +65,8 @@ def known_effects(fit: Fit) -> KnownEffects:
 class Instead:
     """What the catalogue has in the place of a law."""
 
-    # effects that explain the misfit as well; none where the law is preferred
-    names: tuple[str, ...] = ()
-    # effects that the exact model could not be fitted with, and why
-    unfitted: tuple[tuple[str, str], ...] = ()
+    names: tuple[str, ...] = ()  # that explain as well; none where the law is preferred
+    unfitted: tuple[tuple[str, str], ...] = ()  # that could not be refitted, and why
 
 
 def instead_of_law(

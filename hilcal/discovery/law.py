@@ -243,17 +243,14 @@ class Law:
     name: str  # of its effect
     form: Form  # where it acts, and how
     parameters: tuple[Coefficient, ...]
-    # of the joint test of its columns, times the number of candidates that were tried
-    p_value: float
+    p_value: float  # of the joint test of its columns, times the number of candidates
     odds: float  # logarithm of the odds against no law, the search paid for
     holdout_share: float  # share of the misfit that it explains on poses left out
     left: float  # variance factor that is left
     probability: float  # posterior, of its structure
     resembles: tuple[Resemblance, ...]  # effects of the catalogue that are near, the nearest first
-    # least and largest of each quantity in the readings
-    ranges: tuple[tuple[str, float, float, str], ...]
-    # for each site and its quantities, the share of them that find these
-    again: tuple[Again, ...] = ()
+    ranges: tuple[tuple[str, float, float, str], ...]  # of each quantity in the readings
+    again: tuple[Again, ...] = ()  # how often each site and its quantities were found
 
     @property
     def formula(self) -> str:

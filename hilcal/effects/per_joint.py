@@ -142,15 +142,11 @@ class PerJoint(Effect):
     def group_parameters(
         self,
         unit: str,  # of joints that turn; that of slides has m for rad, N for N·m
-        # (n,) ordinary magnitude at each joint; that of a group is the geometric mean of its
-        # joints'
-        ordinary: Floats,
+        ordinary: Floats,  # (n,) magnitudes; a group has the geometric mean
         meaning: str,  # with "{joint}" and "{kind}" where they belong
-        # suffixes of the parameters of one group, as ".cos2", each with its words
-        kinds: Mapping[str, str] | None = None,
+        kinds: Mapping[str, str] | None = None,  # suffixes, as ".cos2", with their words
         *,
-        # whether it is of what the drive moves; else slides have the same unit
-        of_drive: bool = True,
+        of_drive: bool = True,  # of what the drive moves; else slides have the same unit
     ) -> tuple[Parameter, ...]:
         """Parameters of all groups, one for each, or one for each of `kinds`."""
         g = self.shared

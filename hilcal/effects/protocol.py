@@ -46,18 +46,13 @@ class Changeable:
     # change by themselves.
     kind: Kind
     part: str = ""  # what people call it; empty for joints and links
-    # what has changed, e.g. "the tracker's scale"; of a joint or a link e.g. "zero".
-    words: str = ""
+    words: str = ""  # what has changed, e.g. "the tracker's scale", of a joint e.g. "zero"
     cause: str = ""  # what may have done it, as a question; empty where there is nothing to say
-    # whether the smallest change that would have been seen is listed, joint by joint
-    listed: bool = False
+    listed: bool = False  # whether the smallest change that shows is listed by joint
     by_frame: bool = False  # whether a frame that is estimated anew may absorb it
-    # with which the effect stands for its change
-    options: Mapping[str, object] = field(default_factory=dict)
-    # whether a repair of the joint changes it together with the others of the joint that say so
-    with_others: bool = False
-    # returns what changes where that is not each parameter
-    directions: "Callable[[Effect], Directions] | None" = None
+    options: Mapping[str, object] = field(default_factory=dict)  # of the effect of a change
+    with_others: bool = False  # whether a repair changes it together with the others
+    directions: "Callable[[Effect], Directions] | None" = None  # if not each parameter
 
 
 Field = Literal["dq", "twist", "base", "station", "target", "scale", "observer"]
@@ -72,9 +67,7 @@ class Parameter:
 
     name: str  # within the effect, e.g. "j2" or "j3.cos4".
     unit: str  # physical unit, SI
-    # a magnitude that would be ordinary in practice; it defines when a direction counts as
-    # identifiable and how parameters of one effect compare
-    scale: float
+    scale: float  # an ordinary magnitude, by which identifiability is judged
     meaning: str = ""  # one phrase for people
 
 
@@ -92,11 +85,8 @@ class Situation:
     # (N, n + 1, 6) wrench transmitted through each slot, slot axes; element (j, 5) is the torque τ
     # about the axis of joint j + 1, (j, 2) the force along it
     wrench: Floats
-    # the recorded wrench (`states.wrench`) as the model corrects it, where it acts, and the weights
-    load: Load
-    # (n,) joint compliances, rad/(N·m): those of the model, or typical ones where no effect of it
-    # has any
-    compliance: Floats
+    load: Load  # the recorded wrench as the model corrects it, where it acts, and weights
+    compliance: Floats  # (n,) of joints, rad/(N·m): the model's, or typical ones
 
     @property
     def values(self) -> Floats:
@@ -134,9 +124,7 @@ class Columns:
     """Derivative of one field of the deviation by P of an effect's parameters."""
 
     field: Field  # the field of `Deviation` that moves
-    # (P,) indices of the parameters within the effect; one that moves several elements occurs
-    # several times
-    parameter: Ints
+    parameter: Ints  # (P,) indices within the effect, also several times the same
     element: Ints  # (P,) joint (for dq) or slot (for twist) that moves; ignored otherwise
     values: Floats  # (N, P) for dq and scale, (N, P, 6) for the others; N may be 1 (constant)
 
@@ -169,9 +157,7 @@ class LoadChange:
     """Change of the load on the arm, in axes that move with it."""
 
     point: Floats | None = None  # (3,) shift of the load point, flange axes, m; None for none
-    # (n, 3) change of each link's mass × centre of mass, link axes (as `Arm.coms`), kg·m; None for
-    # none
-    first_moment: Floats | None = None
+    first_moment: Floats | None = None  # (n, 3) of links, mass × centre, link axes, kg·m
 
 
 class Effect(ABC):

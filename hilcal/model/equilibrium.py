@@ -157,8 +157,7 @@ def by_load(form: Mapping[tuple[int, bool], Floats], chain: Chain, load: Load, m
 def by_wrenches(
     blocks: list[SlotResponse],
     by_joint: Callable[[int], Floats],  # (N, m) by the displacement of a joint
-    # (N, m, E) by a range of the elements of the twist of a slot
-    by_slot: Callable[[int, slice], Floats],
+    by_slot: Callable[[int, slice], Floats],  # (N, m, E) by elements of a slot's twist
 ) -> dict[tuple[int, bool], Floats]:
     """Derivatives (N, m, 3) by the force (False) and moment (True) of each slot, without zeros."""
     used: dict[int, slice] = {}

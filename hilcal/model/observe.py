@@ -28,16 +28,13 @@ ALL = slice(0, 6)  # All elements of a twist
 class Observation(Brief):
     """What the sensor would read without noise."""
 
-    # (N, 3) what is read of the target: its position, sensor axes, m; or see above
-    position: Floats
+    position: Floats  # (N, 3) what is read of the target, sensor axes, m; or see above
     rotation: Floats  # (N, 3, 3) target axes in sensor axes
     base_position: Floats  # (N, 3) target position in the base axes of the chain, m
     # (N, 3, 3) orientation of the chain's base axes in sensor axes: the derivative of `position` by
     # displacements of the target, base axes
     axes: Floats
-    # (N, 3) target position, sensor axes, m; this and the rest only where there are several
-    # observers
-    sensor: Floats | None = None
+    sensor: Floats | None = None  # (N, 3) target, sensor axes, m; as below of several observers
     own: Floats | None = None  # (N, 3) the same in the axes of the observer
     read: Floats | None = None  # (N, 3, 3) derivative of `position` by `own`
     by_sensor: Floats | None = None  # (N, 3, 3) derivative of `position` by `sensor`
@@ -160,8 +157,7 @@ class ReadingDerivative:
     m: int
     frames: "SlotFrames"
     dq: Floats  # (N, m, n) derivative by displacements of the chain's joints
-    # derivative by motions of the chain of what the arm yields to them
-    yielding: MotionGradient | None = None
+    yielding: MotionGradient | None = None  # of what the arm yields to the motions
     _known: dict[int, tuple[Floats, Floats]] = field(default_factory=dict, repr=False)
 
     @property

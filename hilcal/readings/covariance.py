@@ -55,8 +55,7 @@ class TrackerNoise:
     range_std_per_m: float  # its growth with distance, m/m
     transverse_std: float  # across the beam at zero distance, m
     transverse_std_per_m: float  # its growth with distance (an angle), m/m
-    # of a small rotation about any axis, rad; 0 where only positions are read
-    orientation_std: float = 0.0
+    orientation_std: float = 0.0  # of a small rotation about any axis, rad; 0 if not read
 
     def __post_init__(self) -> None:
         """Refuse what no instrument can have."""

@@ -72,9 +72,7 @@ class States(Brief):
 class ObserverName:
     """What observes the target."""
 
-    # "station" reads positions or poses, "point" the distance from a point, "gauge" the height over
-    # a plane
-    kind: ObserverKind
+    kind: ObserverKind  # of positions or poses, of distances, or of heights over a plane
     name: str
 
     def __str__(self) -> str:

@@ -223,9 +223,7 @@ class Bucket:
     loaded: Ints  # (G, L) rows of the readings
     reference: Ints  # (G, U) rows of the unloaded readings; U = 0 for absolute readings
     factor: Floats  # (G, L·m, L·m) scaling matrices
-    # (L, U) of the unloaded readings in the mean that each deflection is taken from: those of its
-    # target
-    weights: Floats
+    weights: Floats  # (L, U) of the unloaded in the mean that each is taken from
 
     def difference(self, x: Floats) -> Floats:
         """(G·L, ...) loaded minus the mean of the unloaded of x (N, ...)."""

@@ -78,12 +78,9 @@ class Arm(Brief):
     # their own (`<mimic>` of a URDF): their rows say what it would be, those of the others are of
     # the identity; None where every joint has one
     mimic: Floats | None = None
-    # (n,) −1 where the axis is the drawn one turned round (`with_conventions`), else 1; None for 1
-    # everywhere
-    sign: Floats | None = None
+    sign: Floats | None = None  # (n,) −1 where the axis is the drawn one turned round
     notes: tuple[str, ...] = ()  # what its description lacks, and what that means, a sentence each
-    # pose repeatability RP of ISO 9283 as the maker states it, m; None if unknown
-    repeatability: float | None = None
+    repeatability: float | None = None  # pose repeatability RP of ISO 9283, m, as stated
     prismatic: Bools | None = None  # (n,) which joints slide; None where all turn
 
     @property

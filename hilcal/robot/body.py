@@ -39,8 +39,7 @@ class Figures:
 
     shoulder: float  # offset of the upper arm's tube along the shoulder's axis
     elbow: float  # offset of the forearm's tube along the same direction
-    # radii of the housings on joints 1, 2, 3 and on the wrists
-    housings: tuple[float, float, float, float]
+    housings: tuple[float, float, float, float]  # radii on joints 1, 2, 3 and the wrists
     tubes: tuple[float, float]  # radii of the tubes of upper arm and forearm
 
 

@@ -190,13 +190,11 @@ def other_arms(arm: Arm) -> Iterator[Arm]:
 
 def load_arm(
     model: str,  # catalogue name, or a path relative to `base_dir`
-    # directory of the cell configuration; the working directory if None
-    base_dir: Path | None = None,
+    base_dir: Path | None = None,  # directory of the cell; the working directory if None
     *,
     base_link: str | None = None,  # first link of a URDF's chain
     tip_link: str | None = None,  # last link of a URDF's chain
-    # what the file holds, as a campaign keeps it; then no file of that path is read
-    text: str | None = None,
+    text: str | None = None,  # what the file holds, as a campaign keeps it
 ) -> Arm:
     """Load an arm by catalogue name, or from a file: `.urdf`, or `.toml` with a DH table."""
     path = (base_dir or Path()) / model

@@ -23,14 +23,12 @@ from hilcal.types import Bools, Floats
 class Deviation:
     """Departure of N states from the nominal chain; None stands for zero."""
 
-    # (N, n) joint displacements, rad: of the drives where joints are coupled (`Arm.drive`)
-    dq: Floats | None = None
+    dq: Floats | None = None  # (N, n) of the drives' joints, rad, where coupled `Arm.drive`
     # (N, n + 1, 6) small rigid displacement of everything beyond slot k, in the axes of slot k, m
     # and rad
     twist: Floats | None = None
     base: Floats | None = None  # (N, 6) twist of the base relative to its registration, base axes
-    # (N, 6) twist of the readings about the sensor's origin, sensor axes
-    station: Floats | None = None
+    station: Floats | None = None  # (N, 6) twist of the readings about the sensor's origin
     target: Floats | None = None  # (N, 6) displacement of the tracked target, flange axes
     scale: Floats | None = None  # (N,) relative scale error of the sensor's ranges
     # (N, 6) twist of the position in the axes of what observes it, where there are several; of a

@@ -51,11 +51,9 @@ class FactoryKinematics:
     """The kinematics of one arm."""
 
     links: Floats  # (7, 4, 4) constant transforms L_k, see `Arm`; their frames may be far away
-    # (4, 6) θ, a, d, α of classic rows, rad and m; None where transforms are given
-    rows: Floats | None
+    rows: Floats | None  # (4, 6) θ, a, d, α of classic rows, rad and m; None if not given
     status: int  # of the calibration, 2 where the factory has measured the arm
-    # of the joints, as the controller tells it; empty where it is not known
-    checksum: tuple[int, ...]
+    checksum: tuple[int, ...]  # of the joints by the controller; empty where not known
     source: str  # where they come from
 
     def to_dict(self) -> dict[str, object]:

@@ -37,9 +37,7 @@ class Load:
     tool_mass: float  # mass carried permanently, kg
     tool_com: Floats  # (3,) its centre of mass, flange axes, m
     gravity: Floats  # (3,) acceleration, base axes, m/s²
-    # (n, 3) what the bodies' mass × centre of mass is beyond that of the arm, body axes, kg·m; None
-    # for nothing
-    first_moment: Floats | None = None
+    first_moment: Floats | None = None  # (n, 3) of the bodies beyond the arm's, kg·m
 
 
 def slot_wrenches(arm: Arm, chain: Chain, load: Load) -> Floats:
@@ -134,9 +132,7 @@ class GeometricStiffness:
     carried: list[Floats]  # (n + 1,) list of (N, 3, 3) D_k − [m]×, N·m, m the load's moment
     spun: list[Floats]  # (n,) list of (N, 3) D_j z_j, N·m
     load_point: Floats  # (N, 3) where the load acts, m
-    # (N, 6, 6) change of the load's wrench at the load point by a displacement and a turn of the
-    # flange; None where it stays as it is
-    following: Floats | None = None
+    following: Floats | None = None  # (N, 6, 6) of the load's wrench by the flange's motion
 
     def gradient(self, form: Mapping[tuple[int, bool], Floats]) -> "MotionGradient":
         """Gradient by the motions of a linear form (N, m, 3) of slots' force and moment."""
@@ -180,11 +176,8 @@ class MotionGradient:
     # (n + 2,) sums (N, m, 3) over the slots i < k of the moments' coefficients, base axes; None for
     # zero, here and below
     still: list[Floats | None]
-    # (n + 2,) gradients (N, m, 3) by a turn that carries the slots i ≥ k along
-    along: list[Floats | None]
-    # (N, m, 6) gradient by a displacement and a turn of the flange, of what the load's wrench does
-    # with it
-    flange: Floats | None
+    along: list[Floats | None]  # (n + 2,) gradients (N, m, 3) by a turn with slots i ≥ k
+    flange: Floats | None  # (N, m, 6) of the load's wrench by the flange's motion
 
     def joint(self, j: int) -> Floats:
         """(N, m) gradient by the displacement of joint j + 1."""
