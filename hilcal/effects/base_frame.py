@@ -4,9 +4,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import PRIOR_HELP, prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
-from hilcal.types import Floats
 
 
 class BaseFrame(Effect):
@@ -30,7 +29,3 @@ class BaseFrame(Effect):
         """Unit twists of the base."""
         index = np.arange(6)
         return (Columns("base", index, 0 * index, np.eye(6)[None]),)
-
-    def prior_std(self) -> Floats | None:
-        """Prior of displacement and rotation, where given."""
-        return prior_of_lengths_and_turns(self.name, self.options, 6)

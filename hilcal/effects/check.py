@@ -131,7 +131,8 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
     except InputError as error:
         raise InputError(f"{where}: class {kind.__name__} {error}") from None
     problems = []
-    for example in _examples(kind) if cell is None else (cell,):
+    slides = cell is None and not kind.applies(example_cell())
+    for example in [example_cell(n, slides=slides) for n in JOINTS] if cell is None else [cell]:
         try:
             _try(kind, example)
         except HilcalError as error:
@@ -142,12 +143,6 @@ def check_effect(kind: type[Effect], cell: Cell | None = None) -> None:
         else:
             return
     raise problems[0]
-
-
-def _examples(kind: type[Effect]) -> tuple[Cell, ...]:
-    """Arms to try an effect on, with a slide where it is of slides."""
-    slides = not kind.applies(example_cell())
-    return tuple(example_cell(joints, slides=slides) for joints in JOINTS)
 
 
 def _need(good: object, wrong: str) -> None:
@@ -165,42 +160,30 @@ def _class(kind: type[Effect]) -> None:
     _need(not missing, f"lacks {' and '.join(missing)}")
     own = kind.deviation is Effect.deviation
     _need(own, "overrides deviation; give columns, in whose parameters the law is linear")
-    rules: tuple[tuple[str, str, Callable[[Any], bool]], ...] = (
-        (
-            "name",
+    flag = "True, False", lambda v: isinstance(v, bool)
+    positive = (
+        "a number of ordinary magnitudes, more than 0",
+        lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
+    )
+    rules: dict[str, tuple[str, Callable[[Any], bool]]] = {
+        "name": (
             "lower-case letters, digits and _, a letter first",
             lambda v: isinstance(v, str) and bool(NAME.fullmatch(v)),
         ),
-        ("summary", "the law in one line", _is_text),
-        ("elastic", "True, False", lambda v: isinstance(v, bool)),
-        ("local_response", "True, False", lambda v: isinstance(v, bool)),
-        ("of_setup", "True, False", lambda v: isinstance(v, bool)),
-        (
-            "needs",
+        "summary": ("the law in one line", _is_text),
+        **dict.fromkeys(("elastic", "local_response", "of_setup"), flag),
+        "needs": (
             f"a tuple of some of {', '.join(NEEDS)}",
             lambda v: isinstance(v, tuple) and _columns_of(v) <= set(NEEDS),
         ),
-        (
-            "option_help",
+        "option_help": (
             "the meaning of each option by its name",
             lambda v: isinstance(v, dict) and all(map(_is_text, (*v, *v.values()))),
         ),
-        ("role", ", ".join(get_args(Role)), lambda v: v in get_args(Role)),
-        (
-            "plausible",
-            "a number of ordinary magnitudes, more than 0",
-            lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
-        ),
-        *(
-            (
-                key,
-                "a number of ordinary magnitudes, more than 0",
-                lambda v: isinstance(v, int | float) and not isinstance(v, bool) and v > 0,
-            )
-            for key in ("drift", "spread")
-        ),
-    )
-    for key, valid, good in rules:
+        "role": (", ".join(get_args(Role)), lambda v: v in get_args(Role)),
+        **dict.fromkeys(("plausible", "drift", "spread"), positive),
+    }
+    for key, (valid, good) in rules.items():
         found = getattr(kind, key, None)
         _need(good(found), f"has {key} = {found!r}; valid: {valid}")
     has_priors = kind.role not in FRAME_ROLES or set(PRIOR_HELP) <= set(kind.option_help)

@@ -25,6 +25,7 @@ class Creep(PerJoint):
     """
 
     name = "creep"
+    unit, size, meaning = "1", 0.02, "creep of {joint} per decade of time"
     summary = "dq_j = k c_j τ_j log10(1 + t/1 s): joints go on giving way under the load"
     plausible = 10.0  # 20 % per decade of time: polymers; metals creep by less than 2 %. A choice.
     elastic = True
@@ -51,9 +52,8 @@ class Creep(PerJoint):
     def parameters(self) -> tuple[Parameter, ...]:
         """The share of the elastic twist that every decade of time adds."""
         if self.shared.text == COMMON:
-            return (Parameter("k", "1", 0.02, "creep of all joints per decade of time"),)
-        ordinary = np.full(self.cell.arm.n, 0.02)
-        return self.group_parameters("1", ordinary, "creep of {joint} per decade of time")
+            return (Parameter("k", "1", self.size, "creep of all joints per decade of time"),)
+        return super().parameters
 
     def _decades(self, s: Situation) -> Floats:
         """(N, 1) log10(1 + t/1 s)."""

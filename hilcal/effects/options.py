@@ -1,6 +1,6 @@
 """Options of effects: small checked readers."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -78,8 +78,8 @@ def typical_compliances(cell: Cell) -> Floats:
     return np.where(cell.arm.slides, TYPICAL_SHIFT, TYPICAL_TWIST) / rated_torques(cell)
 
 
-def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floats | None:
-    """Prior (size,) from `prior_m` for the first three and `prior_rad` for the others."""
+def prior_of_units(effect: str, options: Options, units: Sequence[str]) -> Floats | None:
+    """(P,) `prior_m` of parameters in m, `prior_rad` of those in rad; None where not given."""
     keys = ("prior_m", "prior_rad")
     given = [k for k in keys if k in options]
     if not given:
@@ -91,4 +91,4 @@ def prior_of_lengths_and_turns(effect: str, options: Options, size: int) -> Floa
     values = [number(effect, options, k) for k in keys]
     if min(values) <= 0:
         raise InputError(f"effect {effect}: prior_m and prior_rad must be positive")
-    return np.repeat(values, 3)[:size]
+    return np.array([values[unit == "rad"] for unit in units])

@@ -16,7 +16,7 @@ from typing import ClassVar, Literal, Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.effects.options import Options
+from hilcal.effects.options import Options, prior_of_units
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.batch import zeros
@@ -358,8 +358,11 @@ class Effect(ABC):
         return mean + float(np.log(factor)), spread
 
     def prior_std(self) -> Floats | None:
-        """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one."""
-        return None
+        """(P,) standard deviations of a fixed zero-mean prior, or None for a flat one.
+
+        By default from the options `prior_m` and `prior_rad` of effects that have these.
+        """
+        return prior_of_units(self.name, self.options, [p.unit for p in self.parameters])
 
     def most(self) -> float:
         """Largest plausible standard deviation of the parameters, in ordinary magnitudes.

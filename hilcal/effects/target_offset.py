@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from hilcal.effects.options import PRIOR_HELP, Options, prior_of_lengths_and_turns
+from hilcal.effects.options import PRIOR_HELP, Options
 from hilcal.effects.protocol import Changeable, Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
@@ -75,8 +75,3 @@ class TargetOffset(Effect):
     def usual_options(cls, m: int) -> Options:
         """Return `rotation` where readings are poses."""
         return {"rotation": True} if m == 6 else {}
-
-    def prior_std(self) -> Floats | None:
-        """Prior of displacement and rotation, where given."""
-        one = prior_of_lengths_and_turns(self.name, self.options, self.size)
-        return None if one is None else np.tile(one, len(self.moved))

@@ -230,6 +230,9 @@ def _pruned(b: SlotResponse) -> SlotResponse | None:
     )
 
 
+WIDE = 64  # Successive parameters of one joint that are written as they are; a choice by timing
+
+
 class ReadingColumns:
     """The derivative (N, m, L) of a chunk of readings by L parameters, sensor axes.
 
@@ -238,11 +241,19 @@ class ReadingColumns:
     """
 
     def __init__(
-        self, moves: ReadingDerivative, blocks: list[SlotResponse], load: Load, size: int
+        self,
+        moves: ReadingDerivative,
+        blocks: list[SlotResponse],
+        load: Load,
+        out: Floats,  # (N, m, L), to be written
+        scale: Floats | None = None,  # (L,) units of the parameters, SI by default
     ) -> None:
         """Begin with zeros."""
-        self._moves, self._blocks, self._load = moves, blocks, load
-        self._sums = zeros(len(moves.dq), moves.m, size)
+        self._moves, self._blocks, self._load, self._out = moves, blocks, load, out
+        self._scale = np.ones(out.shape[2]) if scale is None else scale
+        self._sums = zeros(*out.shape)
+        # which columns were added to, and which of them are written already
+        self._used, self._written = np.zeros((2, out.shape[2]), dtype=np.bool_)
         self._known: dict[str | int, Floats] = {}
 
     def add(self, c: Columns, place: Ints) -> None:
@@ -250,10 +261,8 @@ class ReadingColumns:
         c = c.only(place[c.parameter] >= 0)
         at = place[c.parameter]
         if c.field == "dq":
-            moved = self._moves.drives
             for joint, mine in c.runs():
-                by = along_states(c.values[:, mine])[:, None]
-                self._add(moved[:, :, joint, None] * by, at[mine])
+                self._add_joint(self._moves.drives[:, :, joint, None], c.values[:, mine], at[mine])
         elif c.field == "twist":
             for slot, mine in c.runs():
                 moved = self._motion(slot, lambda k=slot: self._moves.by_slot(k))
@@ -274,9 +283,12 @@ class ReadingColumns:
         moved = by_load(self._form, self._moves.chain, self._load, self._moves.m)
         self._add(rows_times(moved, change[:, wanted], transposed=True), place[wanted])
 
-    def write(self, out: Floats, scale: Floats | None = None) -> None:
-        """Write the derivative (N, m, L) by all that was added, in units (L,) of the parameters."""
-        np.multiply(self._sums, 1.0 if scale is None else scale, out=out)
+    def write(self) -> None:
+        """Write the derivative by all that was added."""
+        ends = np.flatnonzero(np.diff(np.concatenate([[True], self._written, [True]])))
+        for start, stop in ends.reshape(-1, 2).tolist():
+            part = (slice(None), slice(None), slice(start, stop))
+            np.multiply(self._sums[part], self._scale[start:stop], out=self._out[part])
 
     @cached_property
     def _form(self) -> dict[tuple[int, bool], Floats]:
@@ -287,13 +299,23 @@ class ReadingColumns:
             self._known[key] = find()
         return self._known[key]
 
+    def _add_joint(self, moved: Floats, values: Floats, at: Ints) -> None:
+        """Add the motion (N, m, 1) by a joint, times (N or 1, P); many go where they belong."""
+        place = slice(int(at[0]), int(at[0]) + len(at))
+        if len(at) >= WIDE and np.all(np.diff(at) == 1) and not self._used[place].any():
+            np.multiply(moved, (values * self._scale[place])[:, None], out=self._out[:, :, place])
+            self._used[place] = self._written[place] = True
+        else:
+            self._add(moved * along_states(values)[:, None], at)
+
     def _add(self, block: Floats, at: Ints) -> None:
         """Add columns (N, m, P) at their places (P,), which may be the same."""
-        if len(at) and np.all(np.diff(at) == 1):
-            self._sums[:, :, at[0] : at[-1] + 1] += block
-            return
+        self._used[at] = True
         for k, column in enumerate(at.tolist()):
-            self._sums[:, :, column] += block[:, :, k]
+            if self._written[column]:
+                self._out[:, :, column] += self._scale[column] * block[:, :, k]
+            else:
+                self._sums[:, :, column] += block[:, :, k]
 
 
 def _times(moved: Floats, values: Floats) -> Floats:

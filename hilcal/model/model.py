@@ -1,6 +1,6 @@
 """A model is a cell and a tuple of effects; `model + effect` is a new model."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ from hilcal.model.observe import Observation, ReadingDerivative, motion, observe
 from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot import se3
-from hilcal.robot.batch import along_states, by_field, chunks, put, room, take, zeros
+from hilcal.robot.batch import along_states, by_field, chunks, take, zeros
 from hilcal.robot.chain import Chain, Deviation
 from hilcal.robot.statics import Load, geometric_stiffness, slot_wrenches
 from hilcal.shown import Brief
@@ -55,13 +55,21 @@ class Prediction(Brief):
         )
         return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
 
-    def put(self, rows: slice, part: "Prediction") -> None:
-        """Write the prediction of the chosen states; the chain's twists are the deviation's."""
-        s, of = self.situation, part.situation
-        put(self.deviation, rows, part.deviation)
-        put(self.observation, rows, part.observation)
-        put(s.chain, rows, replace(of.chain, twist=None), axis=1)
-        s.angle[rows], s.wrench[rows], s.load.wrench[rows] = of.angle, of.wrench, of.load.wrench
+    @staticmethod
+    def joined(states: States, parts: "Sequence[Prediction]") -> "Prediction":
+        """Return the prediction of all states from those of chunks of them."""
+        of = [p.situation for p in parts]
+        join, s = np.concatenate, of[0]
+        situation = replace(
+            s,
+            states=states,
+            angle=join([x.angle for x in of]),
+            chain=by_field([x.chain for x in of], lambda given: join(given, axis=1)),
+            wrench=join([x.wrench for x in of]),
+            load=replace(s.load, wrench=join([x.load.wrench for x in of])),
+        )
+        deviation = by_field([p.deviation for p in parts], join)
+        return Prediction(situation, deviation, by_field([p.observation for p in parts], join))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,16 +159,11 @@ class Model(Brief):
         Raises:
             CannotAnswerError: the deviations grow instead of settling.
         """
-        whole: Prediction | None = None
-        for rows in chunks(len(states)):
-            part = self._equilibrium(states[rows], theta, near[rows] if near else None)
-            if len(part.situation.angle) == len(states):
-                return part
-            # Written at once: chunks that are kept until the end take new memory each.
-            whole = _room(states, part) if whole is None else whole
-            whole.put(rows, part)
-        assert whole is not None  # noqa: S101 - there is always a chunk
-        return whole
+        parts = [
+            self._equilibrium(states[rows], theta, near[rows] if near else None)
+            for rows in chunks(len(states))
+        ]
+        return parts[0] if len(parts) == 1 else Prediction.joined(states, parts)
 
     def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
         """Return the equilibrium of a chunk of states."""
@@ -254,7 +257,7 @@ class Model(Brief):
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])
-        columns = ReadingColumns(moves, blocks, s.load, out.shape[2])
+        columns = ReadingColumns(moves, blocks, s.load, out, scale)
         mine = self._parts(theta)
         for e, place in zip(effects, places, strict=True):
             if not (place >= 0).any():
@@ -272,7 +275,7 @@ class Model(Brief):
                 columns.add_load_changes(change, place)
             elif (change := e.wrench_columns(at, s)) is not None:
                 columns.add_wrench_changes(change, place)
-        columns.write(out, scale)
+        columns.write()
 
     def _motion(
         self, prediction: Prediction, theta: Floats, m: int
@@ -361,22 +364,3 @@ def _flange_motion(a: Chain, b: Chain, reach: float) -> float:
     shift = np.abs(b.position[-1] - a.position[-1]).max(initial=0.0)
     turn = np.abs(b.rotation[-1] - a.rotation[-1]).max(initial=0.0)
     return float(max(shift, reach * turn))
-
-
-def _room(states: States, part: Prediction) -> Prediction:
-    """Return the prediction of all states, yet to be written, from that of a chunk of them."""
-    count, s = len(states), part.situation
-    deviation = by_field([part.deviation], lambda given: room(given[0], count))
-    observation = by_field([part.observation], lambda given: room(given[0], count))
-    chain = by_field([replace(s.chain, twist=None)], lambda given: room(given[0], count, axis=1))
-    if deviation.twist is not None:
-        chain = replace(chain, twist=np.swapaxes(deviation.twist, 0, 1))
-    situation = replace(
-        s,
-        states=states,
-        angle=room(s.angle, count),
-        chain=chain,
-        wrench=room(s.wrench, count),
-        load=replace(s.load, wrench=room(s.load.wrench, count)),
-    )
-    return Prediction(situation, deviation, observation)

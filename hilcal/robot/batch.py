@@ -61,20 +61,6 @@ def take(record: R, rows: slice, axis: int = 0) -> R:
     return by_field([record], lambda given: given[0][index])
 
 
-def room(part: Floats, count: int, axis: int = 0) -> Floats:
-    """Return an empty array for `count` states, otherwise like that of a chunk of them."""
-    shape = (*part.shape[:axis], count, *part.shape[axis + 1 :])
-    return np.empty_like(part, shape=shape)
-
-
-def put(whole: R, rows: slice, part: R, axis: int = 0) -> None:
-    """Write a record of the chosen states into one of all states."""
-    for f in fields(whole):
-        values = getattr(part, f.name)
-        if isinstance(values, np.ndarray):
-            getattr(whole, f.name)[(*(slice(None),) * axis, rows)] = values
-
-
 def by_field(records: Sequence[R], combine: Callable[[Sequence[Floats]], Floats]) -> R:
     """Combine records array by array, leaving out what is None; other fields are the first's."""
     combined = {}

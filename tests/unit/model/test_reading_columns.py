@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from hilcal.effects.protocol import Columns, Field
-from hilcal.model.equilibrium import ReadingColumns
+from hilcal.model.equilibrium import WIDE, ReadingColumns
 from hilcal.model.observe import ReadingDerivative
 from hilcal.types import Floats, Ints
 from tests.unit.model.test_observe import COUNT, FULL, NO_LOAD, motion_of
 
-SIZE = 94
+SIZE = WIDE + 30
 PER_ELEMENT = {"dq": 6, "twist": 7}
 
 
@@ -58,11 +58,11 @@ def expected(moves: ReadingDerivative, blocks: list[tuple[Columns, Ints]], scale
 def written(
     moves: ReadingDerivative, blocks: list[tuple[Columns, Ints]], scale: Floats | None
 ) -> Floats:
-    columns = ReadingColumns(moves, [], NO_LOAD, SIZE)
     out = np.full((COUNT, moves.m, SIZE), np.nan)
+    columns = ReadingColumns(moves, [], NO_LOAD, out, scale)
     for c, place in blocks:
         columns.add(c, place)
-    columns.write(out, scale)
+    columns.write()
     return out
 
 
@@ -71,6 +71,10 @@ def written(
 def test_columns_of_all_fields_together_are_those_one_by_one(seed: int, m: int) -> None:
     rng = np.random.default_rng(seed)
     moves, blocks = motion_of(FULL, m), drawn(rng)
+    if seed % 2:  # many of one joint, which are written at once
+        many = np.arange(WIDE)
+        wide = Columns("dq", many, np.full(WIDE, 4), rng.normal(size=(COUNT, WIDE)))
+        blocks.insert(seed, (wide, many + 20))
     scale = rng.uniform(0.5, 2.0, SIZE)
     for units in (None, scale):
         found = written(moves, blocks, units)
