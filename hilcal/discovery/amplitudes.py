@@ -8,10 +8,10 @@ two joints make together, is max(u − u0, 0) with u = cos q_5·cos q_6. A funct
 transmitted wrenches W by the chain rule, ∂f/∂W = f'(u) Σ w_i ∂φ_i/∂W.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import combinations
+from itertools import chain, combinations
 from types import CodeType
 from typing import Literal
 
@@ -83,17 +83,10 @@ def _compiled(code: str) -> CodeType:
 
 def variables(s: Situation) -> list[Variable]:
     """Return all quantities that vary over the states of a situation."""
-    found = ((v, v.read(s)) for v in _all(s))
-    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
-
-
-def _all(s: Situation) -> Iterator[Variable]:
     n = s.angle.shape[1]
-    yield from _angles(s)
-    yield from _wrenches(n)
-    yield from _attitude(n)
-    yield from _recorded(s, n)
-    yield from _places()
+    every = chain(_angles(s), _wrenches(n), _attitude(n), _recorded(s, n), _places())
+    found = ((v, v.read(s)) for v in every)
+    return [v for v, x in found if np.ptp(x) > VARIES * max(float(np.abs(x).max()), 1e-300)]
 
 
 def _angles(s: Situation) -> Iterator[Variable]:
@@ -233,21 +226,14 @@ class Factor:
         """Power of the variable's unit that the factor has."""
         return self.shape.power(self.numbers)
 
-    def text(self) -> str:
-        """Return it as text."""
-        return self.shape.text(self.variable.symbol, [f"{x:g}" for x in self.numbers])
-
-    def latex(self) -> str:
-        """Return it in LaTeX."""
-        return self.shape.latex(self.variable.latex, [f"{x:g}" for x in self.numbers])
-
-    def code(self) -> str:
-        """Return it as Python, of a situation s."""
-        return self.shape.code(self.variable.code, [repr(x) for x in self.numbers])
-
-    def slope_code(self) -> str:
-        """Return its derivative by the variable likewise."""
-        return self.shape.slope_code(self.variable.code, [repr(x) for x in self.numbers])
+    def written(self, way: str) -> str:
+        """Return it as "text", "latex", Python "code" of a situation s, or its "slope_code"."""
+        v = self.variable
+        if way in ("text", "latex"):
+            x, numbers = v.symbol if way == "text" else v.latex, [f"{x:g}" for x in self.numbers]
+        else:
+            x, numbers = v.code, [repr(x) for x in self.numbers]
+        return str(getattr(self.shape, way)(x, numbers))
 
 
 @dataclass(frozen=True)
@@ -299,15 +285,15 @@ class Amplitude:
 
     def text(self) -> str:
         """Return the product as text."""
-        return "·".join(f.text() for f in self.factors)
+        return "·".join(f.written("text") for f in self.factors)
 
     def latex(self) -> str:
         """Return the product in LaTeX."""
-        return r"\,".join(f.latex() for f in self.factors)
+        return r"\,".join(f.written("latex") for f in self.factors)
 
     def code(self) -> str:
         """Return the product as Python, of a situation s."""
-        parts = [f.code() for f in self.factors] or ["np.ones(len(s.angle))"]
+        parts = [f.written("code") for f in self.factors] or ["np.ones(len(s.angle))"]
         return parts[0] if len(parts) == 1 else " * ".join(f"({part})" for part in parts)
 
     def slopes(self) -> Iterator[tuple[tuple[int, int], str]]:
@@ -315,7 +301,7 @@ class Amplitude:
         for i, f in enumerate(self.factors):
             others = Amplitude((*self.factors[:i], *self.factors[i + 1 :]))
             for slot, inner in f.variable.slopes():
-                parts = [f.slope_code(), *([inner] if inner else [])]
+                parts = [f.written("slope_code"), *([inner] if inner else [])]
                 parts += [others.code()] if others.factors else []
                 yield slot, " * ".join(f"({part})" for part in parts)
 
@@ -325,28 +311,35 @@ class Amplitude:
 
     def of_joint(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
         """Return the same law of another joint's own quantities; None where it has none."""
-        out = []
-        for f in self.factors:
-            v = f.variable
-            if v.joint == old and v.kind != "sum":
-                same = [w for w in known if w.kind == v.kind and w.joint == new and _alike(w, v)]
-                if not same:
-                    return None
-                f = replace(f, variable=same[0])
-            out.append(f)
-        return Amplitude(tuple(out))
+        return self._with(
+            lambda v: v.joint == old and v.kind != "sum",
+            lambda v, w: w.kind == v.kind and w.joint == new and _alike(w, v),
+            known,
+        )
 
     def of_axis(self, old: int, new: int, known: list[Variable]) -> "Amplitude | None":
         """Return the same law of another axis: vectors' components along both change places."""
-        swap, out = {old: new, new: old}, []
+        swap = {old: new, new: old}
+        return self._with(
+            lambda v: bool(v.vector) and v.axis in swap,
+            lambda v, w: w.vector == v.vector and w.axis == swap[v.axis],
+            known,
+        )
+
+    def _with(
+        self,
+        changes: Callable[[Variable], bool],
+        same: Callable[[Variable, Variable], bool],
+        known: list[Variable],
+    ) -> "Amplitude | None":
+        """Return the product with other quantities where they change; None where there is none."""
+        out = []
         for f in self.factors:
             v = f.variable
-            if v.vector and v.axis in swap:
-                same = [w for w in known if w.vector == v.vector and w.axis == swap[v.axis]]
-                if not same:
-                    return None
-                f = replace(f, variable=same[0])
-            out.append(f)
+            found = next((w for w in known if same(v, w)), None) if changes(v) else v
+            if found is None:
+                return None
+            out.append(replace(f, variable=found))
         return Amplitude(tuple(out))
 
 
@@ -356,13 +349,8 @@ def _alike(a: Variable, b: Variable) -> bool:
 
 def unit_of(powers: dict[str, float]) -> str:
     """Return a product of units by their powers; "1" where there is none."""
-    return "·".join(_raised(u, p) for u, p in powers.items()) or "1"
-
-
-def _raised(unit: str, power: float) -> str:
-    if power == 1:
-        return unit
-    return f"({unit})^{power:g}" if "·" in unit else f"{unit}^{power:g}"
+    parts = {u: f"({u})" if "·" in u else u for u in powers}
+    return "·".join(u if p == 1 else f"{parts[u]}^{p:g}" for u, p in powers.items()) or "1"
 
 
 def different(a: Factor, b: Factor) -> bool:

@@ -227,12 +227,8 @@ class Grammar:
         """Return the amplitude with sine for cosine in its first periodic factor."""
         if k < len(self.amplitudes):
             return int(self.partner[k]) if self.partner[k] >= 0 else None
-        factors = list(self.at(k).factors)
-        for i, f in enumerate(factors):
-            if f.shape.name == "cos":
-                factors[i] = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
-                return self.index(Amplitude(tuple(factors)))
-        return None
+        other = _turned(self.at(k))
+        return None if other is None else self.index(other)
 
     def place(self, amplitude: Amplitude) -> int | None:
         """Return the index of an amplitude; None where it is not tried."""
@@ -350,8 +346,9 @@ def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
         Amplitude(tuple(singles[i] for i in pairs[k] if i >= 0)) for k in kept.tolist()
     )
     place = {pairs[k]: at for at, k in enumerate(kept.tolist())}
-    turned = _turned(singles)
-    partner = np.array([_partner(pairs[k], turned, place) for k in kept.tolist()])
+    named = {_key(a): k for k, a in enumerate(amplitudes)}
+    turned = (_turned(a) for a in amplitudes)
+    partner = np.array([-1 if t is None else named.get(_key(t), -1) for t in turned])
     alone = np.array([place.get((i, -1), -1) for i in range(-1, len(singles))])
     first, second = np.array(pairs)[kept].T
     less = np.where(second >= 0, [alone[second + 1], alone[first + 1]], -1)
@@ -389,23 +386,10 @@ def _products(value: Floats, pairs: Ints) -> tuple[Floats, Floats, Ints]:
     return out, size[kept], kept
 
 
-def _turned(singles: list[Factor]) -> dict[int, int]:
-    """Sine by cosine of the same quantity."""
-    place = {(id(f.variable), f.shape.name, f.numbers): k for k, f in enumerate(singles)}
-    return {
-        k: place[id(f.variable), "sin", f.numbers]
-        for k, f in enumerate(singles)
-        if f.shape.name == "cos"
-    }
-
-
-def _partner(
-    pair: tuple[int, int], turned: dict[int, int], place: dict[tuple[int, int], int]
-) -> int:
-    for at, k in enumerate(pair):
-        if k in turned:
-            other = [*pair]
-            other[at] = turned[k]
-            low, high = sorted(other, key=lambda i: (i < 0, i))
-            return place.get((low, high), -1)
-    return -1
+def _turned(a: Amplitude) -> Amplitude | None:
+    """Return the amplitude with sine for cosine in its first periodic factor; None without any."""
+    for i, f in enumerate(a.factors):
+        if f.shape.name == "cos":
+            sine = replace(f, shape=replace(shapes.SIN, cost=f.shape.cost))
+            return Amplitude((*a.factors[:i], sine, *a.factors[i + 1 :]))
+    return None

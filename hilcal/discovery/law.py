@@ -122,25 +122,19 @@ class Form:
 
     def text(self) -> str:
         """Return the formula as plain text, one equation per site."""
-        return "; ".join(
-            f"{symbol} = {' + '.join(terms)}"
-            for symbol, terms in self._equations(lambda s: s.symbol, _amplitude_text).items()
-        )
+        return "; ".join(self._equations("symbol", "·", Amplitude.text))
 
     def latex(self) -> str:
         """Return the formula in LaTeX."""
-        return r",\quad ".join(
-            f"{symbol} = {' + '.join(terms)}"
-            for symbol, terms in self._equations(lambda s: s.latex, _amplitude_latex).items()
-        )
+        return r",\quad ".join(self._equations("latex", r"\,", Amplitude.latex))
 
-    def _equations(
-        self, symbol: Callable[[Site], str], write: Callable[[str, Amplitude], str]
-    ) -> dict[str, list[str]]:
+    def _equations(self, symbol: str, times: str, write: Callable[[Amplitude], str]) -> list[str]:
         out: dict[str, list[str]] = {}
         for p in self.parts:
-            out.setdefault(symbol(p.site), []).append(write(LETTERS[p.coefficient], p.amplitude))
-        return out
+            letter, inner = LETTERS[p.coefficient], write(p.amplitude)
+            term = f"{letter}{times}{inner}" if inner else letter
+            out.setdefault(getattr(p.site, symbol), []).append(term)
+        return [f"{symbol} = {' + '.join(terms)}" for symbol, terms in out.items()]
 
     def motion(self, sites: tuple[Site, ...], motion: Floats, s: Situation) -> Floats:
         """(N, m, P) motion of each reading, by ordinary motions (N, m, S) of the sites."""
@@ -154,14 +148,6 @@ class Form:
         """(R, P) whitened columns by ordinary motions, at the fit of a screen."""
         w = screen.linear.fit.whitening
         return w.whiten_readings(self.motion(screen.sites, screen.motion, s))
-
-
-def _amplitude_text(letter: str, a: Amplitude) -> str:
-    return f"{letter}·{a.text()}" if a.factors else letter
-
-
-def _amplitude_latex(letter: str, a: Amplitude) -> str:
-    return rf"{letter}\,{a.latex()}" if a.factors else letter
 
 
 def form_of(screen: Screen, terms: tuple[LawTerm, ...]) -> Form:
