@@ -275,8 +275,7 @@ def _search(
 
 
 TOLERANCE = 1e-7  # Relative gap between the continuous optimum and its bound
-KINKED_TOLERANCE = 1e-3
-"""The same for criteria with kinks. A choice: the bound closes slowly there."""
+KINKED_TOLERANCE = 1e-3  # the same with kinks, where the bound closes slowly; a choice
 
 _ROUNDS = 200
 _STALE = 4  # rounds in which the gap must fall; this and the next two are choices

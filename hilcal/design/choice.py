@@ -29,9 +29,7 @@ from hilcal.types import Bools, Floats, Ints
 
 CRITERIA = ("D", "A", "E", "K", "I", "separate")
 LOOSE = 3e-3  # Relative gap at which sets of loads are compared. A choice.
-EFFORT = 200
-"""Of the exchange search. Read from the demo's plan: 98 % of the bound in a second; more effort
-gains a part per thousand."""
+EFFORT = 200  # of the exchange search: 98 % of the bound of the demo's plan in a second
 SAMPLE = 150  # Poses by which sets of loads are compared. A choice.
 
 

@@ -16,8 +16,7 @@ from hilcal.robot.chain import evaluate, joint_jacobian
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)
-"""What a planner keeps beyond the limits: choices, no study behind them."""
+PLANNED = Margins(joint=1e-6, inside=0.02, clear=0.02, itself=0.01, bear=0.98)  # choices
 
 REASONS = {
     "joint limits": ("keep the joint limits", "[limits] joint_margin_rad"),

@@ -34,8 +34,7 @@ FORMS = (
     '"position std < 20 um"',
     '"deflection std < 20 um"',
 )
-POSITIONS = ("position", "deflection")
-"""What is predicted where the robot will work: by absolute readings, and by deflections."""
+POSITIONS = ("position", "deflection")  # predicted where the robot will work
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(
     r"\s*(?P<what>[\w.]+)\s+std\s*(?:<=|<|≤)\s*(?P<number>[-+]?[\d.]+(?:[eE][-+]?\d+)?)\s*"

@@ -208,14 +208,11 @@ def _instrument(nominal: NominalModel, config: CellConfig, predicted: Prediction
     return out
 
 
-PAIRS_UP_TO = 4
-"""Pairs of loads are units of their own where there are no more loads than this. A choice."""
+PAIRS_UP_TO = 4  # pairs of loads are units of their own up to so many loads; a choice
 MOST_BYTES = 600_000_000  # Memory that the rows of all units may take. A choice.
 MOST_PARAMETERS = 200
 SAMPLE = 300  # Candidate poses by which strengths are judged. A choice.
-MOST_ORDINARY = 5.0
-"""A family that reaches one σ only with more than so many ordinary magnitudes is left out.
-A choice."""
+MOST_ORDINARY = 5.0  # ordinary magnitudes with which a family has to reach one σ; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -40,12 +40,9 @@ from hilcal.identification.mixed_fit import HARMONICS, SCATTER_RAD
 from hilcal.mixed.families import families_of
 from hilcal.types import Bools, Floats, Ints
 
-DIRECTIONS = 150
-"""Most directions Q. A choice: at the poses of a real UR10 (920 parameters) the others together
-move a reading by 0.5 of its noise (rms)."""
+DIRECTIONS = 150  # most of Q; a choice: of a real UR10 (920) the others move 0.5 σ (rms)
 SAMPLE = 300  # Candidate poses by which they are found. A choice.
-LEAST = 1e-3
-"""Directions that move the units by less than this in units of the noise (rms) are left out."""
+LEAST = 1e-3  # directions that move the units by less, in their noise (rms), are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)

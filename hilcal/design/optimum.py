@@ -12,9 +12,7 @@ from hilcal.design.criterion import CandidateSet, Criterion, best_first
 from hilcal.errors import CannotAnswerError
 from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-4
-"""Relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway. Study: the demo's
-plan and the benchmark's 40 of 100,000 states keep their certified efficiency to 0.01 %."""
+TOLERANCE = 1e-4  # relative gap of the continuous optimum: whole numbers lose 1 to 5 % anyway
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,13 +81,9 @@ def best(
     return Design(counts, value, max(relaxed.bound, value), information, cost, relaxed)
 
 
-EFFORT = 6000
-"""Units that are put into a plan before the search ends, at most; fewer of small plans.
-A choice: the 40 of 100,000 states of the benchmark are certified at 98 % within it."""
+EFFORT = 6000  # units that are put into a plan at most, fewer of small plans; a choice
 KINKED_EFFORT = 1500  # The same for criteria with kinks, whose values cost more
-ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99
-"""Share of the bound at which the search ends; for criteria with kinks. A choice: a percent of what
-separates two effects is a percent of the readings, and to find it takes as long as the rest."""
+ENOUGH, KINKED_ENOUGH = 1.0 - 1e-6, 0.99  # share of the bound to end at; with kinks, a choice
 
 # Choices for speed; the certificate does not depend on them.
 _POOL = 4000  # units of the best prices, among which a plan is sought

@@ -43,8 +43,7 @@ from hilcal.regression.schur import DETERMINED
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats, Ints
 
-SHARE = 0.1
-"""Parameters with a larger share of a singular direction than this are confounded. A choice."""
+SHARE = 0.1  # parameters with a larger share of a singular direction are confounded; a choice
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,9 +17,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Bools, Floats
 
-COUNT = 500
-"""Prediction poses that are drawn where the configuration names none. A choice: with 100 a plan
-learns the gears where these stand (one plan of 60 poses of a real UR10 left 0.163 mm for 0.150)."""
+COUNT = 500  # poses that are drawn where none is named; a choice: 100 are learnt by the plan
 _DRAWN = 4096
 _ROUNDS = 60
 _SEED = 20240608

@@ -215,12 +215,8 @@ def _slope_std(plan: Plan, times: Floats, reading_std: float) -> float | None:
 _SHRINK = 0.75  # of the time given to the walks, where a draw became too long; a choice
 _TRIES = 10  # draws of one order that may become too long; a choice
 _MOVES = 30  # steps of a random walk per stop; a choice: each stop is moved many times
-Passable = Callable[[Floats, Floats, str], Bools]
-"""passable(start (n,), ends (M, n), load) -> (M,): which straight motions in joint space are
-clear under a load."""
-NEAR = 24
-"""Neighbours of a pose to which motions are tested; to others the arm goes by the reference.
-A choice."""
+Passable = Callable[[Floats, Floats, str], Bools]  # start (n,), ends (M, n), load -> (M,)
+NEAR = 24  # neighbours to which motions are tested, else by the reference; a choice
 _ALL = 6  # loads up to which every order is tried
 
 

@@ -21,17 +21,14 @@ from hilcal.regression.spectrum import VISIBLE
 from hilcal.store.plan import REFERENCE
 from hilcal.types import Floats
 
-COMPARED = ("D", "A", "E", "K", "I")
-"""Criteria of the comparison: all but T-optimality, which needs suspects."""
-SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-"""Budgets of the sample-size curve by the plan's own. A choice."""
+COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
+SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
 WORTH = 0.9  # Efficiency of a plan below which it is said what another one would give; a choice
 _LEFT_OUT = {
     "deflection": "geometry, registration, repeatability and effects outside of the model",
     "position": "repeatability and effects outside of the model",
 }
-DRAWS = 5
-"""Random directions of an effect whose median is its minimum detectable strength. A choice."""
+DRAWS = 5  # random directions of an effect, of whose strengths the median counts; a choice
 _SEED = 20240611
 
 

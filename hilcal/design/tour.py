@@ -85,9 +85,7 @@ def improved(seconds: Floats, order: Sequence[int]) -> list[int]:
     return [int(k) for k in way[1:-1]]
 
 
-_Change = tuple[float, int, int, int, bool]
-"""Seconds gained (negative), first and last place of a part, after which place it is put (one
-outside of the part), and whether it is turned round."""
+_Change = tuple[float, int, int, int, bool]  # s gained, part, place to be put, turned
 
 
 def _turn_cost(p: Floats) -> Floats:

@@ -34,22 +34,18 @@ if TYPE_CHECKING:
     from hilcal.discovery.problem import Beside
     from hilcal.discovery.screen import LawTerm, ScreenedTerm
 
-BEST, EXTENDED = 10, 3
-"""Bends that are extended, and further products that are tried of each; a choice, by time."""
+BEST, EXTENDED = 10, 3  # bends, and further products of each, that are extended; a choice, by time
 LARGEST_SUM = 3  # Products of a sum at most; a choice
 QUANTITIES = 2  # Recorded quantities of an argument at most; a choice: sums of more are too many
 REFINED = 2  # Functions of single products, and of sums, that are refined; a choice, by time
 QUANTILES = tuple(k / 20 for k in range(1, 20))  # Levels tried, shares of the readings below
-TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)
-"""Levels, and weights by that of the linearisation, that are tried; a choice."""
+TIMES = (0.4, 0.7, 1.0, 1.5, 2.2)  # weights tried, by that of the linearisation; a choice
 EVALUATIONS = 60  # Of the sum of squares, for each number that is refined; a choice
 DIGITS = 3
 LEFT = 1e-3  # Share of a column's square that others must leave; a choice
 WORST = 1e12
 POWERS = {"above": shapes.ABOVE_POWER, "below": shapes.BELOW_POWER}
-LEAST_POWER, MOST_POWER = 0.5, 4.0
-"""Exponents of a bend; at least 1 where wrenches bend, as a slope without limit has no equilibrium.
-A choice."""
+LEAST_POWER, MOST_POWER = 0.5, 4.0  # exponents of a bend, from 1 on under wrenches; a choice
 LOG2 = float(np.log(2.0))
 
 
@@ -334,11 +330,9 @@ def _refined(beside: Beside, site: SiteSums, b: _Bent) -> Amplitude:
 
 MOST = 4  # Complexity of a product; a choice
 MOST_FACTORS = 3  # Factors of a product; a choice
-GROWN, VARIED = 12, 24
-"""Candidates that are multiplied, and whose numbers are varied; a choice, by time."""
+GROWN, VARIED = 12, 24  # candidates that are multiplied, and varied; a choice, by time
 KEPT = 24  # Of either the best that are scored in full; a choice
-FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)
-"""Values of a number that are tried, by the one of the grid; a choice."""
+FACTORS = (0.35, 0.5, 0.7, 0.85, 1.2, 1.4, 2.0, 2.8)  # of numbers of the grid; a choice
 
 
 def grown(beside: Beside, best: list[ScreenedTerm]) -> list[LawTerm]:

@@ -31,9 +31,7 @@ MOST_CURVES = 3
 BINS = 12
 LINE = 101  # Points of the drawn law; a choice, as the two above
 MOST_POINTS = 2000  # Readings that are drawn at most; a choice, by memory
-LEAST = 0.02
-"""Readings whose other factors are a smaller share of the largest say nothing of the curve; a
-choice."""
+LEAST = 0.02  # share of the largest of the other factors below which nothing is said; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,8 +154,7 @@ def binned(x: Floats, y: Floats, std: Floats) -> Floats:
 
 
 MOST_SITES = 2  # Sites of a law that are drawn, those that it moves most; a choice
-SMOOTH = 0.05
-"""Von Neumann's ratio below which the law is drawn as a line, above as means in bins; a choice."""
+SMOOTH = 0.05  # von Neumann's ratio below which the law is a line, else means in bins; a choice
 
 Way = tuple[Variable, Variable | None]  # What a law is drawn over, and what it is divided by
 

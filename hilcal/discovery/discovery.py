@@ -55,8 +55,7 @@ Reason = Literal["law", "adequate", "catalogue", "no_law", "unpredictable"]
   can be fitted with;
 - unpredictable: nothing recorded predicts it.
 """
-LEAST_SHARE = 0.1
-"""Share of the misfit on poses left out that a law must explain, searched for without them."""
+LEAST_SHARE = 0.1  # of the misfit on poses left out, that a law found without them explains
 NEAR = 0.7  # Cosine from which an effect of the catalogue is named as resembling; a choice
 
 

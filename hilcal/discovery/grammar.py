@@ -21,9 +21,7 @@ from hilcal.effects.protocol import Situation
 from hilcal.types import Floats, Ints
 
 HARMONICS = 4  # Multiples of an angle; as in the diagnosis
-FINEST = 512
-"""Highest multiple of a joint's angle, as of encoders and gears; a choice. Not more than there are
-poses: each order costs the search, and few poses do not tell hundreds of them apart."""
+FINEST = 512  # highest multiple of an angle, at most one per pose; a choice, as of encoders
 
 
 def fine_waves(v: Variable, finest: int) -> list[Factor]:
@@ -50,10 +48,8 @@ def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
     return [linear, *_CURVED[v.kind](v, x), *_bent(v, x, most)]
 
 
-WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}
-"""Multiples of an angle, by the kind of quantity; a choice."""
-BENDS = (0.3, 0.7)
-"""Shares of the readings below a bend to begin with; a refinement moves it. A choice."""
+WAVES = {"angle": HARMONICS, "sum": 2, "sight": 2}  # multiples of an angle; a choice
+BENDS = (0.3, 0.7)  # shares of the readings below a bend to begin with; a choice
 _Made = Callable[[Variable, Floats], list[Factor]]
 
 
@@ -153,8 +149,7 @@ def _round(x: float) -> float:
     return float(f"{x:.2g}")
 
 
-MOST = 3
-"""Complexity of a product; a choice, by the number of candidates (about 10⁶ with all sites)."""
+MOST = 3  # complexity of a product; a choice: about 10⁶ candidates with all sites
 MOST_FACTORS = 2  # Factors of a product; a choice, likewise
 SOME = 2000  # Products that are formed at a time; a choice, for memory
 ARGUMENT = 2  # Complexity of a product in a composed quantity; a choice, by the number of them
@@ -163,11 +158,8 @@ COMPOSED_OF = {
 }  # fmt: skip
 """Quantities of which others are composed; a choice: components in joint axes are too many."""
 WAVES_OF_ARGUMENT = 2  # Multiples of an angle in a composed quantity; a choice
-SHAPES = 5
-"""Functions of a composed quantity: bends to both sides, the same with an exponent, steps."""
-FLAT = 0.1
-"""Factors whose spread is a smaller share of their size are in no product: it would be the other
-factor's law to within that share. A choice."""
+SHAPES = 5  # of a composed quantity: bends to both sides, also with an exponent, steps
+FLAT = 0.1  # spread by size of factors that are in no product, as good as constant; a choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,12 +20,10 @@ from hilcal.types import Bools, Floats, Ints
 EXTENDED = 40  # Of these, those that are extended to other axes and joints; a choice
 
 
-LEFT = 1e-3
-"""Share of a column's square that chosen terms must leave for it to count as another; a choice."""
+LEFT = 1e-3  # share of a column's square that chosen terms must leave; a choice
 LOG2 = float(np.log(2.0))
 LOG_ZERO = 2 * LOG2  # Price of a free zero of one of two factors: for having one, and for which
-LEAST_RIDGE = 1e-6
-"""Least ridge of the model's directions, not all of which some rows determine; a choice."""
+LEAST_RIDGE = 1e-6  # of the model's directions, not all of which some rows determine; a choice
 
 
 class SearchProblem:

@@ -79,15 +79,10 @@ class Screening:
     across_one: Floats  # (S, F) xᵀ M x' with a constant at the site
 
 
-MOST_READINGS = 400
-"""Readings that the screening uses at most; a choice, by time: it takes their square."""
-SEEN = 1e-4
-"""Share that must be left of a column's square, of what the readings move each by itself. Less is
-explained by the model, or cancels in deflections, and single precision does not resolve it."""
+MOST_READINGS = 400  # that the screening uses; a choice, by time: it takes their square
+SEEN = 1e-4  # share of a column's square that must be left, for single precision
 ALIKE = 1 - 1e-9  # Cosine of two sites' motions from which on they are the same; rounding
-LEAST_MOTION = 1e-4
-"""Square of a column that counts as none, in units of the noise: all readings together move by less
-than 0.01 σ at an ordinary motion. As in `regression.evidence`."""
+LEAST_MOTION = 1e-4  # square of a column, in the noise, that counts as none
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -280,8 +275,7 @@ def _thinned(fit: Fit) -> tuple[Bools, Ints]:
 
 
 LEVELS = (0.2, 0.35, 0.5, 0.65, 0.8)
-STEPS = (0.25, 0.5, 0.75)
-"""Shares of the readings below a bend, and a step, to begin with; a choice, by time."""
+STEPS = (0.25, 0.5, 0.75)  # shares of the readings below a bend, and a step; a choice, by time
 WIDTH = 0.3  # Of a step, by the standard deviation of the argument; a choice
 MOST_ARGUMENTS = 4000  # Arguments at most, the simplest first; a choice, by memory
 

@@ -126,8 +126,7 @@ SIN = Shape(
     lambda x, p: f"{p[0]} * np.cos({_times(p[0], x, ' * ')})",
     lambda x, p: f"sin({_times(p[0], x)})",
 )  # fmt: skip
-FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)
-"""Of high orders, which are many to choose from."""
+FINE_COS, FINE_SIN = replace(COS, cost=3), replace(SIN, cost=3)  # of high orders
 ODD = Shape(
     "odd", 2,
     lambda x, p: f"{x} * {_root(x, p)} ** ({p[0]} - 1)",

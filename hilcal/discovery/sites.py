@@ -20,8 +20,7 @@ ORDINARY = {"rad": 1e-4, "m": 1e-4, "1": 1e-5, "N": 1.0, "N·m": 0.1}
 a force sensor; a choice. It only sets the range of strengths that the evidence tries, which is a
 million wide."""
 Place = Field | Literal["sensor"]
-SETUP = ("target", "tracker", "force sensor")
-"""What is set up anew for another campaign of the same arm."""
+SETUP = ("target", "tracker", "force sensor")  # set up anew for another campaign
 _AXES = "xyz"
 
 

@@ -45,8 +45,7 @@ from hilcal.types import Floats
 
 Terms = tuple[LawTerm, ...]
 MOST_LIKELY = 8  # Structures within Occam's window that are kept; a choice
-CLOSE = 12.0
-"""Log odds from the best within which a structure counts; a choice: others are e⁻¹² of it."""
+CLOSE = 12.0  # log odds from the best within which a structure counts; a choice
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,17 +94,14 @@ def example_situation(cell: Cell, states: States) -> Situation:
 
 
 NAME = re.compile(r"[a-z][a-z0-9_]*")
-JOINTS = (6, 7)
-"""Arms to try an effect on; it has to pass on one, since it may be made for that arm alone."""
+JOINTS = (6, 7)  # of arms to try an effect on; it has to pass on one
 NEEDS = ("time", "load_time", "air_temperature", "joint_temperature", "approach", "q_actual")
-"""Columns of `States` that readings may lack."""
 AGREES = 1e-3
 """Share of the largest value by which a derivative may be outside of the difference quotients of
 both sides, between which it lies, at a bend as well: max(τ, 0) has its own at τ = 0. A guess, far
 above rounding."""
 ROUNDING = 1e-9  # Share of the largest value that rounding may change; a guess, far above 1e-16
-STEP = 1e-4
-"""Step of difference quotients, in ordinary magnitudes; a guess between rounding and curvature."""
+STEP = 1e-4  # of difference quotients, in ordinary magnitudes; between rounding and curvature
 _FIELDS = Deviation.__slots__
 
 

@@ -32,8 +32,7 @@ class GuideError(Effect):
 
     name = "guide_error"
     summary = "carriage of a slide moves by Σ a_k P_k(travel): straightness, tilts and scale"
-    plausible = 50.0
-    """1 mm and 2.5 mrad at either end, as of a track that was laid by hand. A choice."""
+    plausible = 50.0  # 1 mm and 2.5 mrad at either end, as of a track laid by hand. A choice.
     option_help: ClassVar = {"orders": f"K, 1 to {MOST_ORDERS}; unless given, {USUAL_ORDERS}."}
 
     @classmethod

@@ -11,8 +11,7 @@ class Hysteresis(PerJoint):
     unit, size, meaning = "rad", 2e-5, "half hysteresis of {joint}"
     summary = "dq_j = h_j s_j: the joint stops short on the side from which it arrived"
     change = joint_change("lost motion", "wear or repair?", listed=True)
-    plausible = 50.0
-    """1 mrad; lost motion that makers of gears state is 0.3 mrad at most. A choice."""
+    plausible = 50.0  # 1 mrad; makers of gears state 0.3 mrad of lost motion. A choice.
     needs = ("approach",)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

@@ -10,8 +10,7 @@ from hilcal.errors import InputError
 from hilcal.readings.readings import States
 from hilcal.robot.conventions import may_follow
 
-ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]
-"""Twists of a slot by a turn about its z, the axis of its joint, and by a shift along it."""
+ABOUT, ALONG = np.eye(6)[5], np.eye(6)[2]  # twists of a slot about, along its joint's axis
 _PAIR = re.compile(r"([0-9]{1,3}):([0-9]{1,3})")
 
 

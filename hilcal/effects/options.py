@@ -15,8 +15,7 @@ TYPICAL_TWIST, TYPICAL_SHIFT = 2e-3, 7e-5
 """Twist of a joint at its rated torque where its compliance is unknown, rad, and shift of a slide
 at its rated force, m. Guesses within the 0.3 to 5 mrad of most arms, and for racks and screws of
 10 to 100 N/µm."""
-ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4
-"""The same as ordinary magnitudes of the compliance, rad and m."""
+ORDINARY_TWIST, ORDINARY_SHIFT = 3e-3, 1e-4  # ordinary ones, rad and m
 LEVER = 0.5  # Moment on a carriage per rated force of its drive, m: a choice
 
 PRIOR_HELP = dict.fromkeys(

@@ -13,9 +13,7 @@ from hilcal.types import Floats, Ints
 
 MOST_HARMONICS = 120
 FEWEST_HARMONICS = 4
-POSES_PER_HARMONIC = 5
-"""A harmonic has two amplitudes per joint, which every pose shows: five poses leave the data in the
-majority. A guess, as the bounds are: the upper one limits the cost."""
+POSES_PER_HARMONIC = 5  # leave the data in the majority over its two amplitudes; a guess
 ORDINARY, ORDINARY_M = 5e-5, 1e-5  # Ordinary amplitude of a harmonic, rad; of a slide m
 SCORED_HARMONICS = 40  # Bounds the cost of scoring; a guess
 
@@ -33,8 +31,7 @@ class TransmissionError(PerJoint):
     summary = "dq_j = Σ a_jk cos k q_j + b_jk sin k q_j: gear and encoder error"
     change = joint_change("transmission error", "another gear or encoder?", harmonics=4)
     """Few readings resolve no more than four harmonics; finer ones act as scatter. A choice."""
-    plausible = 30.0
-    """1.5 mrad per harmonic; strain wave gears state 0.3 mrad, spur gears 1 mrad. A choice."""
+    plausible = 30.0  # 1.5 mrad per harmonic; gears state 0.3 to 1 mrad. A choice.
     spread = 2.0**0.5  # Another gear errs as much, but elsewhere: the difference of two
     option_help: ClassVar = {
         **PerJoint.option_help,

@@ -31,9 +31,7 @@ from hilcal.robot.statics import (
 )
 from hilcal.types import Floats, Ints
 
-TOLERANCE = 1e-8
-"""Part of the derivative, root mean square over the states, that may be missing; a choice, with
-room for states whose loads are several times the mean."""
+TOLERANCE = 1e-8  # part of the derivative (rms) that may be missing; a choice
 MAX_TERMS = 40
 TORQUE, ALONG = 5, 2  # Components of a slot's wrench about the axis of its joint, and along it
 FORCE, MOMENT = slice(0, 3), slice(3, 6)  # Components of a slot's wrench

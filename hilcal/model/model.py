@@ -27,11 +27,9 @@ from hilcal.types import Floats, Ints
 if TYPE_CHECKING:  # a value that a model only carries along; fits know what it means
     from hilcal.identification.carried import CarriedPrior
 
-EQUILIBRIUM_TOLERANCE = 1e-13
-"""Motion of the flange that may be missing from the converged equilibrium, m."""
+EQUILIBRIUM_TOLERANCE = 1e-13  # motion of the flange that may be missing, m
 MAX_EQUILIBRIUM_STEPS = 30
-FLANGE_STEP = 1e-4
-"""Step of a difference quotient, m or rad: rounding 1e-12, higher terms 1e-9 of the quotient."""
+FLANGE_STEP = 1e-4  # of a quotient, m or rad: rounding 1e-12, higher terms 1e-9 of it
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -36,15 +36,12 @@ from hilcal.robot.chain import drive_jacobian, evaluate
 from hilcal.types import Bools, Floats, Ints
 
 COVERS = "covariance"  # Key among the texts about a campaign: what the stored covariances cover
-FROM = "covariance from"
-"""Key of `TRACKER` where they were made from the noise in [tracker]; absent elsewhere."""
+FROM = "covariance from"  # key of `TRACKER` where they were made from [tracker]
 TRACKER = "tracker"
 INSTRUMENT = "instrument"  # They cover the instrument alone, not the arm's repeatability
 WHOLE = "instrument+arm"  # They include the arm's repeatability
-ROUNDING = "+rounding"
-"""End of either word in a table, where the covariances also include the rounding of positions."""
-PRIOR_REPEATS = 20.0
-"""ν0: how many repeats the stated covariance is worth as a prior; a guess, no study set it."""
+ROUNDING = "+rounding"  # end of either word in a table, where rounding is included
+PRIOR_REPEATS = 20.0  # ν0, the repeats that the stated covariance is worth; a guess
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,9 +8,7 @@ import numpy as np
 from hilcal.readings.readings import States
 from hilcal.types import Bools, Floats
 
-MARGIN = 0.02
-"""Share of the fitted range by which a reading is beyond it; a choice: of two random halves, few
-readings are."""
+MARGIN = 0.02  # share of the fitted range by which a reading is beyond it; a choice
 FULL_TURN = 2.0 * np.pi
 
 

@@ -21,9 +21,7 @@ from hilcal.types import Bools, Floats
 LENGTH_M = 1e-7  # A table in mm with four decimals is off by half of that; a choice
 ANGLE_RAD = 1e-5  # A table in degrees with three decimals is off by 0.9e-5; a choice
 ATTITUDE_RAD = 2e-5  # Three such angles together make an attitude; a choice
-SHARED = 0.1
-"""Share of a campaign's readings that are another's, from which both are of one measurement; a
-choice: where a table's last digit is as coarse as the scatter, some hundredths agree by chance."""
+SHARED = 0.1  # share of the readings that makes two campaigns of one measurement; a choice
 _APART = 10.0  # Distance of loaded from unloaded readings, in units of the tolerance
 
 

@@ -30,8 +30,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 
-Group = tuple[Ints, Ints, Floats]
-"""Rows (G, L) of the measured and (G, U) of the unloaded readings, and weights (L, U)."""
+Group = tuple[Ints, Ints, Floats]  # measured (G, L), unloaded (G, U), weights (L, U)
 
 
 def arrival_groups(readings: Readings) -> list[Group]:
@@ -155,14 +154,9 @@ Mode = Literal["deflection", "absolute"]
 SCALINGS: tuple[Scaling, ...] = ("none", "gu", "gc")
 MODES: tuple[Mode, ...] = ("deflection", "absolute")
 RANK_TOLERANCE = 1e-10
-MANY = 1000
-"""Blocks from which on Cholesky's factor takes the place of eigenvectors where the rule for
-rank-deficient blocks does not come into play: a fifth of the time for 100,000 blocks; a choice by
-timing."""
+MANY = 1000  # blocks from which on Cholesky's factor is tried; a choice by timing
 TOGETHER = 1_000_000  # Numbers that are whitened at a time; a choice by memory
-RUN = 200
-"""Measurements in a run of correlated noise; a choice: a campaign of up to so many is exact, and of
-larger ones the whitening costs as much as predicting."""
+RUN = 200  # measurements in a run of correlated noise; a choice: of fewer all is exact
 
 
 def inverse_root(covariance: Floats, scaling: Scaling = "gc") -> Floats:

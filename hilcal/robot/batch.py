@@ -15,13 +15,9 @@ import numpy as np
 
 from hilcal.types import Floats
 
-CHUNK = 8200
-"""States of a chunk, at most; a choice by timing. No power of two: the components of an array would
-all fall into the same few lines of the processor's cache, and what is turned over in memory take
-four times as long."""
+CHUNK = 8200  # states, by timing; no power of two, which would all fall in few cache lines
 BUDGET = 1 << 20  # Numbers of a chunk's largest array, 8 MB; a choice by timing
-LEAST_CHUNK = 256
-"""States of a chunk, at least: Python's share of the time grows with the number of chunks."""
+LEAST_CHUNK = 256  # states of a chunk, at least: Python's share grows with their number
 
 
 class Record(Protocol):

@@ -18,8 +18,7 @@ _JOINTS = 6
 _RIM = 0.5  # of the radius: a housing's rounded end; so much shorter is the capsule's segment
 _THICK, _THIN = 0.047, 0.03  # radii of an unknown arm at base and flange, shares of its reach
 _SHORT = 1e-6  # m
-TURNED = np.array([1.0, -1.0, -1.0])
-"""Coordinates of a point in a frame that was turned round x by 180°."""
+TURNED = np.array([1.0, -1.0, -1.0])  # of a point in a frame turned round x
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -55,8 +55,7 @@ class Chain:
         return np.asarray(self.position[-1] + se3.apply(self.rotation[-1], offset))
 
 
-Turns = tuple[Floats, Floats, Floats | None]
-"""Cosines and sines (N, n) of the angles of the chain, and displacements (N, n) of its slides."""
+Turns = tuple[Floats, Floats, Floats | None]  # cos, sin (N, n); travel (N, n) of slides
 
 
 def turns(arm: Arm, q: Floats) -> Turns:

@@ -36,8 +36,7 @@ N = 6
 KINDS = "a calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration"
 SAME = 1e-6  # m; flanges that are nearer are of the same kinematics: files keep 12 digits and more
 LINEARISED = 2  # Calibration status of an arm that the factory has measured
-FAR = 0.05
-"""m; a factory's figures move the flange by some millimetres, those of another arm by more."""
+FAR = 0.05  # m, of another arm; a factory's figures move the flange by some millimetres
 _KEYS = ("theta_rad", "a_m", "d_m", "alpha_rad")
 _DELTAS = ("delta_theta", "delta_a", "delta_d", "delta_alpha")
 _BODIES = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")

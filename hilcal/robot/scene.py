@@ -310,8 +310,7 @@ def _spread(count: int, n: int) -> Floats:
     return np.asarray((0.5 + np.outer(np.arange(count), phi ** -np.arange(1.0, n + 1))) % 1.0)
 
 
-_Lies = tuple[Floats, Floats, Floats]
-"""Half lengths (N,), axes (N, 3, 3) and middles (N, 3) of a segment in N states."""
+_Lies = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), middles (N, 3)
 
 
 def _lies(segment: Segment, count: int) -> _Lies:
