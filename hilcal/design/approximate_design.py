@@ -111,7 +111,6 @@ def _product(rows: Floats, x: Floats | Root, y: Floats | Root) -> Floats:
 
 
 def _gram(t: Floats) -> Floats:
-    """Return T Tᵀ (n, n)."""
     upper = np.asarray(sl.blas.dsyrk(1.0, t.T, trans=1))
     return upper + np.triu(upper, 1).T
 
@@ -233,13 +232,11 @@ def _newton(program: BarrierProgram, matrix: Floats, lean: Floats, w: Floats) ->
 
 
 def _room(x: Floats, move: Floats) -> float:
-    """Return how long a step may be until x reaches 0."""
     with np.errstate(divide="ignore"):
         return float(np.min(np.where(move < 0.0, -x / move, np.inf), initial=np.inf))
 
 
 def _dual(z: Floats, move: Floats) -> Floats:
-    """Return duals after a step that keeps them over 0."""
     return np.asarray(z + min(1.0, _BACK * _room(z, move)) * move)
 
 

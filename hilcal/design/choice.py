@@ -215,7 +215,6 @@ def _value(
 
 
 def _mean_of(size: int, every: int) -> Floats:
-    """(P, P) C of the mean variance of the first s parameters."""
     return np.diag(np.where(np.arange(every) < size, 1.0 / size, 0.0))
 
 

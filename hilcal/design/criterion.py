@@ -133,7 +133,6 @@ def require_determined(m: Floats, names: Sequence[str] | None = None) -> None:
 
 
 def _listed(names: Sequence[str]) -> str:
-    """Return the first few names."""
     more = f" and {len(names) - 6} more" if len(names) > 6 else ""
     return ", ".join(names[:6]) + more
 

@@ -101,7 +101,6 @@ def supported_parameters(problem: DesignProblem, count: int) -> dict[str, Floats
 
 
 def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedPairs:
-    """Leave out the pairs that no measurement separates."""
     spread = of.prior + problem.units.information(
         np.full(len(problem.units), MANY / float(problem.units.cost.sum()))
     )

@@ -234,7 +234,6 @@ def _touching(space: Space, reason: str, lost: dict[str, Floats]) -> str:
 
 
 def _unusable(space: Space, q: Floats, load: str) -> str:
-    """Why no pose bears a load."""
     if (heavy := space.unbearable(load).get("payload")) is not None:
         return heavy
     told = []

@@ -153,7 +153,6 @@ def figures(fit: Fit) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def _ratio(std: float, limit: float) -> float:
-    """Return std / limit; infinite where std is not a number."""
     return float(np.inf) if np.isnan(std) else std / limit
 
 
@@ -248,7 +247,6 @@ class GoalRule:
         return bool((same & ~free).any())
 
     def _fit(self, readings: Readings) -> tuple[GoalStatus, Fit] | None:
-        """Fit and judge; None where that cannot be done yet."""
         try:
             readings, mode = self._fitted(readings)
             readings = with_joint_scatter(self._cell, readings, self._scatter)

@@ -144,7 +144,6 @@ class _AllColumns:
     scale: Floats
 
     def rows(self, candidates: Candidates, step: int = 1) -> Iterator[tuple[Ints, Floats]]:
-        """Yield units and their whitened rows (k, R, P), of every `step`-th candidate pose."""
         of, some = self.of, candidates[slice(None, None, step)]
         parts = reading_derivatives(of.nominal, self.config, some, self.more, self.scale)
         yield from unit_rows(parts, of.candidates.loads, of.what, of.mode, step)
@@ -160,7 +159,6 @@ class _Coordinates:
     prior: Floats  # (b, b) F − G H⁻¹ Gᵀ
 
     def columns(self, rows: Floats) -> Floats:
-        """(..., b + r) of rows (..., P)."""
         return np.concatenate([rows @ self.flat, rows @ self.random], axis=-1)
 
     def whitened(self, rows: Floats) -> Floats:

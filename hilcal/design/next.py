@@ -124,7 +124,6 @@ def expected(
 def _pair_powers(
     problem: DesignProblem, of: DiscriminatedPairs, names: tuple[str, ...], then: Floats
 ) -> Iterator[PairPower]:
-    """Yield all pairs of the suspects."""
     seen = {e.name for e in problem.families}
     supported = supported_parameters(problem, DRAWS)
     for e in names:

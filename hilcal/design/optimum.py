@@ -116,7 +116,6 @@ class _Search:
         relaxed: ApproximateDesign,
         most: int | None,
     ) -> None:
-        """Prepare the table of the pool."""
         most_of_one = budget / float(units.cost.min())
         fits = 2 * _TABLE // (units.size * (units.size + 1))
         count = max(min(_POOL, fits), 3 * int(np.ceil(most_of_one)))
@@ -160,7 +159,6 @@ class _Search:
         return out
 
     def _information(self, counts: Ints) -> Floats:
-        """Return (P, P) M of whole numbers."""
         used = np.flatnonzero(counts)
         return np.asarray(self.prior + self.pool.information(counts[used], used))
 

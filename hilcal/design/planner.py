@@ -276,7 +276,6 @@ def make(
 
 
 def _budget(request: Request, of: DesignProblem) -> float:
-    """Readings that are to be taken."""
     if request.readings is not None:
         if request.readings < 1:
             raise InputError(f"{request.readings} readings; valid: a whole number from 1")
@@ -350,7 +349,6 @@ def ordered(
 
 
 def _reading_std(space: Space, of: DesignProblem) -> float:
-    """Typical standard uncertainty of a reading in one coordinate, m."""
     model, theta = of.nominal.model, of.nominal.theta
     some = of.candidates[slice(0, SAMPLE)].states()
     covariance = reading_covariance(of.nominal, space.config, model.predict(some, theta))

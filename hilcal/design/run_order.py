@@ -193,7 +193,6 @@ def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str],
 
 
 def _cosines(lag: Floats, columns: Floats) -> Floats:
-    """(k,) |cosine| of the lag with each column, 0 for columns that are zero."""
     size = np.linalg.norm(lag) * np.linalg.norm(columns, axis=0)
     tiny = 1e-12 * np.linalg.norm(lag) * np.sqrt(max(len(lag), 1))
     return np.asarray(np.abs(lag @ columns) / np.where(size > tiny, size, np.inf))
@@ -367,7 +366,6 @@ def order_plan(
 def _check(
     config: CellConfig, names: Sequence[str], chosen: Sequence[Chosen], how: Ordering
 ) -> None:
-    """Refuse what cannot be."""
     if not chosen:
         raise InputError("no reading is chosen; a plan needs at least one")
     if how.slack < 0 or how.reference_every_s <= 0 or how.repeats < 0:
@@ -493,7 +491,6 @@ class OrderDraws:
         return self._plan(orders, half=half, mixed=True)
 
     def _part(self, seconds: Floats, part: list[int]) -> list[int]:
-        """Return a short tour of some of the stops."""
         at = [0, *part]
         return [at[k] for k in tour.improved(seconds[np.ix_(at, at)], range(1, len(at)))]
 

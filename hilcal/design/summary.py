@@ -215,7 +215,6 @@ def position_note(quantity: str) -> str:
 
 
 def _parameters(planned: Planned) -> tuple[PredictedParameter, ...]:
-    """Return the predicted precision of each parameter, in the order of the model."""
     knows, frames = planned.predicted, _prefixes(planned.problem, *FRAME_ROLES)
     known = {
         name: PredictedParameter(name, float(std), float(value) or None, unit)
@@ -286,7 +285,6 @@ def _finite(value: float | None) -> float | None:
 def _criteria(
     planned: Planned, config: CellConfig, rng: np.random.Generator
 ) -> Iterator[CriterionResult]:
-    """Yield the design of each criterion with as many readings."""
     of = planned.problem
     for name in dict.fromkeys((*COMPARED, planned.criterion)):
         if name == planned.criterion:
@@ -328,12 +326,10 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
 
 
 def _prefixes(of: DesignProblem, *roles: Role) -> tuple[str, ...]:
-    """Return what the names of the parameters of some roles begin with."""
     return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
 
 
 def _joint_share(knows: PredictedUncertainty, joints: tuple[str, ...]) -> float | None:
-    """Largest relative standard uncertainty of a joint compliance."""
     shares = [
         std / abs(value)
         for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
@@ -343,7 +339,6 @@ def _joint_share(knows: PredictedUncertainty, joints: tuple[str, ...]) -> float 
 
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:
-    """Yield the sample-size curve, of continuous optima."""
     of = planned.problem
     asked, usable = only(planned.asked, planned.usable), np.flatnonzero(planned.usable)
     own = len({of.what[k][0] for k in np.flatnonzero(planned.counts)})

@@ -43,7 +43,6 @@ def shortest(seconds: Floats, rng: np.random.Generator, kicks: int = 20) -> list
 
 
 def _by_trial(seconds: Floats) -> list[int]:
-    """Return the best of all orders."""
     count = len(seconds) - 1
     if count == 0:
         return []
@@ -196,7 +195,6 @@ def loops(
 
 
 def _parts(order: Sequence[int], cut: Ints) -> list[list[int]]:
-    """Follow the cuts from the end."""
     out, j = [], len(order)
     while j > 0:
         i = int(cut[j])

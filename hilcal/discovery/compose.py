@@ -63,7 +63,6 @@ class _Bent:
 
     @property
     def odds(self) -> float:
-        """Evidence less what the argument costs."""
         return self.evidence - self.price
 
 
@@ -385,7 +384,6 @@ def _other_values(factor: Factor, n: int, x: Floats) -> list[float]:
 
 
 def _best_terms(beside: Beside, made: list[tuple[int, Amplitude, float]]) -> list[LawTerm]:
-    """Return the best of products and variants."""
     screen = beside.problem.screen
     ranked: list[tuple[float, int, Amplitude, float]] = []
     for s in dict.fromkeys(s for s, _, _ in made):

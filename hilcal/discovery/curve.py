@@ -72,7 +72,6 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
 
 
 def _key(p: LawPart, symbol: str) -> list[tuple[object, ...]]:
-    """Return the other factors of a part."""
     return [
         (f.variable.symbol, f.shape.name, f.numbers)
         for f in p.amplitude.factors

@@ -195,7 +195,6 @@ def _laws(
     say: Callable[[str], None],
     name: str,
 ) -> Discovery:
-    """Refit the laws, and order them."""
     found = problem.screen
     before = left_out_by_pose(fit)
     rank = fit.whitening.rank

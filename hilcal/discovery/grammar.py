@@ -112,7 +112,6 @@ def _temperature(v: Variable, x: Floats) -> list[Factor]:
 
 
 def _grown(v: Variable, x: Floats) -> list[Factor]:
-    """Powers of what is never negative."""
     if x.min() < 0:
         return [Factor(v, shapes.EVEN, (2.0, _round(0.01 * _middle(x))))]
     return [Factor(v, shapes.POWER, (p,)) for p in (0.5, 2.0)]
@@ -145,7 +144,6 @@ _CURVED: dict[str, _Made] = {
 
 
 def _round(x: float) -> float:
-    """Two digits."""
     return float(f"{x:.2g}")
 
 

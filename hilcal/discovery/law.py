@@ -396,7 +396,6 @@ def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
 
 
 def _moving(form: Form) -> Iterator[str]:
-    """Yield the lines of what moves parts of the arm, or the frames."""
     parts = [(k, p) for k, p in enumerate(form.parts) if p.site.field != "sensor"]
     if not parts:
         yield "        return ()"
@@ -408,7 +407,6 @@ def _moving(form: Form) -> Iterator[str]:
 
 
 def _misread(form: Form) -> Iterator[str]:
-    """Yield the lines of what the force sensor reads beside the true wrench."""
     for p in form.parts:
         if p.site.field == "sensor":
             yield f"        by = {p.amplitude.code()}"
@@ -424,7 +422,6 @@ def _columns(k: int, p: LawPart) -> str:
 
 
 def _responses(form: Form) -> Iterator[str]:
-    """Yield the lines that add what each wrench component does to each part."""
     for p in form.parts:
         for (slot, component), slope in p.amplitude.slopes():
             to = f"dq[:, :, {p.site.element}]"

@@ -151,7 +151,6 @@ class Beside:
 
     @cached_property
     def _known(self) -> tuple[frozenset[int], frozenset[str]]:
-        """Sites and quantities of the chosen terms."""
         screen = self.problem.screen
         parts = [part for t in self.chosen for part in t.parts]
         names = (n for _, f in parts for n in screen.grammar.at(f).names)

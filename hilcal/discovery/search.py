@@ -146,14 +146,12 @@ def _better(problem: SearchProblem, s: Selection, other: Selection) -> bool:
 
 
 def _sure(c: Scored, problem: SearchProblem) -> bool:
-    """Whether chance would not do the same, over the whole search."""
     return c.odds > LEAST and np.log(max(c.score.p_value, 1e-300)) + c.term.price < np.log(
         FALSE_ALARM
     )
 
 
 def _distinct(problem: SearchProblem, found: list[Scored], count: int) -> list[Scored]:
-    """Return the best terms that are not the same law."""
     out: list[Scored] = []
     units: list[Floats] = []
     for c in found[:SHORT_LIST]:

@@ -152,7 +152,6 @@ def _is_text(value: object) -> bool:
 
 
 def _class(kind: type[Effect]) -> None:
-    """Check the attributes of a class."""
     missing = sorted(getattr(kind, "__abstractmethods__", ()))
     _need(not missing, f"lacks {' and '.join(missing)}")
     own = kind.deviation is Effect.deviation
@@ -188,12 +187,10 @@ def _class(kind: type[Effect]) -> None:
 
 
 def _columns_of(needs: tuple[str, ...]) -> set[str]:
-    """Return the columns that needs name, each alone or as one of several, "a or b"."""
     return {column for need in needs for column in str(need).split(" or ")}
 
 
 def _try(kind: type[Effect], cell: Cell) -> None:
-    """Compute an effect on an arm, and check what it returns."""
     states = example_states(cell)
     effect, s = kind(cell, states), example_situation(cell, states)
     _parameters(effect)
@@ -226,7 +223,6 @@ def _parameters(effect: Effect) -> None:
 
 
 def _columns(effect: Effect, s: Situation) -> None:
-    """Check fields, indices, shapes and values of the columns."""
     found: Any = effect.columns(s)
     good = isinstance(found, tuple) and all(isinstance(c, Columns) for c in found)
     _need(good, f"columns returns {type(found).__name__}; expected a tuple of Columns")
@@ -248,7 +244,6 @@ def _columns(effect: Effect, s: Situation) -> None:
 
 
 def _results(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Check types, shapes and values of what the other methods return."""
     (count, n), size = s.angle.shape, len(theta)
     step, prior = np.zeros((count, 2, n + 1, 6)), effect.prior_std()
     change: Any = effect.load_change(theta)
@@ -276,7 +271,6 @@ def _results(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _array(what: str, found: Any, *shapes: tuple[int, ...]) -> None:
-    """Check an array: its type, its shape, and that all values are finite."""
     good = isinstance(found, np.ndarray) and found.dtype.kind in "fiub"
     _need(good, f"{what} of type {type(found).__name__}; expected an array of numbers")
     expected = " or ".join(str(shape) for shape in dict.fromkeys(shapes))
@@ -299,7 +293,6 @@ def _states(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _elastic(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Compare `elastic` and `response` with how the deviation follows the wrenches."""
     rng = np.random.default_rng(2)
     step = STEP * rng.normal(size=s.wrench.shape) * [60, 60, 60, 20, 20, 20]
     up, down = (replace(s, wrench=w) for w in (s.wrench + step, s.wrench - step))
@@ -334,7 +327,6 @@ def _local(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
-    """Compare `compliance_columns` with how the deviation follows the joint compliances."""
     step = STEP * s.compliance * np.random.default_rng(4).normal(size=len(s.compliance))
     up, down = (replace(s, compliance=c) for c in (s.compliance + step, s.compliance - step))
     found = total(effect.compliance_columns(theta, s), step, s)
@@ -344,7 +336,6 @@ def _compliance(effect: Effect, theta: Floats, s: Situation) -> None:
 
 
 def _load(effect: Effect, theta: Floats, s: Situation, scale: Floats) -> None:
-    """Compare `wrench_columns` with how the effect changes the load."""
     step = STEP * scale * np.random.default_rng(3).normal(size=len(scale))
     up, at, down = (_transmitted(effect, t, s) for t in (theta + step, theta, theta - step))
     found = effect.wrench_columns(theta, s)
@@ -368,7 +359,6 @@ def _transmitted(effect: Effect, theta: Floats, s: Situation) -> Floats:
 
 
 def _needs(kind: type[Effect], cell: Cell, states: States) -> None:
-    """Check that an effect uses no column that it does not name."""
     for column in (c for c in NEEDS if c not in _columns_of(kind.needs)):
         nothing: dict[str, Any] = {column: None}
         fewer = replace(states, **nothing)
@@ -394,7 +384,6 @@ def _field(deviation: Deviation, key: str) -> Floats:
 
 
 def _agree(method: str, of_what: str, found: Floats, above: Floats, below: Floats) -> None:
-    """Compare a derivative with the difference quotients of both sides."""
     outside = found - np.clip(found, np.minimum(above, below), np.maximum(above, below))
     size = float(max(np.abs(x).max() for x in (found, above, below)))
     off = float(np.abs(outside).max()) / size if size > 0 else 0.0

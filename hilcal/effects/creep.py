@@ -56,7 +56,6 @@ class Creep(PerJoint):
         return super().parameters
 
     def _decades(self, s: Situation) -> Floats:
-        """(N, 1) log10(1 + t/1 s)."""
         assert s.states.load_time is not None  # noqa: S101 - checked at construction
         return np.asarray(np.log10(1 + s.states.load_time / SECOND))[:, None]
 

@@ -85,6 +85,5 @@ class GuideError(Effect):
         return (Columns("twist", np.arange(len(element)), element, values),)
 
     def _share(self, q: Floats, j: int) -> Floats:
-        """Place within the travel, −1 to 1."""
         low, high = self.cell.arm.q_min[j], self.cell.arm.q_max[j]
         return np.asarray((2 * q - low - high) / (high - low))

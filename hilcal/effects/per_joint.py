@@ -89,7 +89,6 @@ def _read(text: str, count: int) -> tuple[list[list[int]], str]:
 
 
 def _label(group: list[int]) -> str:
-    """Write ascending joint indices, as "1+4-6"."""
     starts = [j for j in group if j - 1 not in group]
     ends = [j for j in group if j + 1 not in group]
     pairs = zip(starts, ends, strict=True)

@@ -67,7 +67,6 @@ class ThermalGrowth(Effect):
         return (Columns("twist", slots if self.each else 0 * slots, slots, values),)
 
     def _temperature(self, states: States) -> Floats:
-        """(N,) temperature of the arm, °C."""
         air, joints = states.air_temperature, states.joint_temperature
         if self.source == "air" and air is not None:
             return air

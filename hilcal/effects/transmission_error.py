@@ -66,7 +66,6 @@ class TransmissionError(PerJoint):
 
     @property
     def _ordinary(self) -> Floats:
-        """(n,) ordinary amplitudes of a harmonic."""
         return np.where(self.cell.arm.slides, ORDINARY_M, ORDINARY)
 
     def columns(self, s: Situation) -> tuple[Columns, ...]:

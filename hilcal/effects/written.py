@@ -104,7 +104,6 @@ def _options(text: str, where: str) -> dict[str, object]:
 
 
 def _value(text: str, where: str) -> object:
-    """Read a value, or a list of values."""
     if text.startswith("[") and text.endswith("]"):
         return [_single(v, where) for v in _split(text[1:-1], ",;", where, f"valid: {_VALUES}")]
     return _single(text, where)

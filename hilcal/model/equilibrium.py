@@ -62,7 +62,6 @@ def compliance(parts: Sequence[tuple[Effect, Floats]], s: Situation) -> list[Slo
 
 
 def _halves(b: SlotResponse) -> Iterator[SlotResponse]:
-    """Yield the parts of a block by the force and by the moment."""
     first, last = b.components.start, b.components.stop
     if first >= MOMENT.start or last <= FORCE.stop:
         yield b
@@ -192,7 +191,6 @@ def _by_twist(gradient: MotionGradient, frames: SlotFrames, slot: int, elements:
 
 
 def _norm(form: Mapping[tuple[int, bool], Floats]) -> float:
-    """Root of the sum of squares of the coefficients of the wrenches, in SI units."""
     flat = (b.ravel(order="K") for b in form.values())
     return math.sqrt(sum(float(b @ b) for b in flat))
 

@@ -134,7 +134,6 @@ class Model(Brief):
         return replace(self, effects=(*self.effects, effect))
 
     def _with(self, spec: EffectSpec) -> "Model":
-        """Return the model with an effect that is built for its cell and readings."""
         if self.readings is None:
             raise InputError(
                 f"effect {spec.name}: this model was made without readings; add an effect that is "
@@ -164,7 +163,6 @@ class Model(Brief):
         return parts[0] if len(parts) == 1 else Prediction.joined(states, parts)
 
     def _equilibrium(self, states: States, theta: Floats, near: Prediction | None) -> Prediction:
-        """Return the equilibrium of a chunk of states."""
         cell = self.cell
         angle = states.q if states.q_actual is None else states.q_actual
         angle = along_states(angle)
@@ -312,7 +310,6 @@ class Model(Brief):
         return out
 
     def _parts(self, theta: Floats) -> list[tuple[Effect, Floats]]:
-        """Each effect with its parameters."""
         return [(e, theta[s]) for e, s in zip(self.effects, self.slices(), strict=True)]
 
     def _compliance(self, theta: Floats) -> Floats:
@@ -321,7 +318,6 @@ class Model(Brief):
         return found[0] if found else typical_compliances(self.cell)
 
     def _load(self, states: States, theta: Floats) -> Load:
-        """Load as recorded, where it acts, and the weights."""
         cell, point = self.cell, self.cell.load_point
         moments: Floats | None = None
         for e, t in self._parts(theta):

@@ -117,7 +117,6 @@ def _in_own_axes(
 
 
 def _distances(observers: Sequence[Observer], number: Ints) -> Bools:
-    """(N,) whether distances are read."""
     return np.array([o.name.kind == "point" for o in observers])[number]
 
 

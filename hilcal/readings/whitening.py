@@ -120,7 +120,6 @@ def runs(readings: Readings, groups: Sequence[Group], most: int) -> list[Group]:
 
 
 def _numbered(keys: Sequence[Ints]) -> Ints:
-    """(N,) number of the combination of keys (N,)."""
     return np.unique(np.stack(keys, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
 
 
@@ -130,7 +129,6 @@ def has_unloaded(readings: Readings) -> Bools:
 
 
 def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
-    """(N,) whether an unloaded reading has the same keys."""
     group = _numbered(keys)
     has = np.zeros(int(group.max()) + 1, dtype=bool)
     has[group[readings.unloaded]] = True
@@ -138,7 +136,6 @@ def _has_unloaded(readings: Readings, keys: Sequence[Ints]) -> Bools:
 
 
 def _refuse_without_unloaded(readings: Readings) -> None:
-    """Refuse a pose and cycle without any unloaded reading."""
     has = has_unloaded(readings)
     if not has.all():
         row = int(np.argmin(has))

@@ -133,7 +133,6 @@ def flange_capsule(arm: Arm, name: str, start: Floats, end: Floats, radius: floa
 
 
 def _of_ur(arm: Arm, figures: Figures) -> tuple[Capsule, ...]:
-    """Housings about the joint axes and tubes between them."""
     r1, r2, r3, r4 = figures.housings
     upper, fore = figures.tubes
     d1, d4 = (float(arm.links[k][2, 3]) for k in (1, 4))

@@ -249,7 +249,6 @@ class Pairs:
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
     def _place(self, turned: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
-        """Put all shapes where they are at angles of the chain (n,); a segment as in state i."""
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if lies is not None:
             half, turn, middle = lies
@@ -314,7 +313,6 @@ _Lies = tuple[Floats, Floats, Floats]  # half lengths (N,), axes (N, 3, 3), midd
 
 
 def _lies(segment: Segment, count: int) -> _Lies:
-    """How a segment lies in every state."""
     shape = (count, 3)
     start, end = np.broadcast_to(segment.start, shape), np.broadcast_to(segment.end, shape)
     way = end - start

@@ -197,12 +197,10 @@ def right_jacobian_blocks(twist: Floats) -> tuple[Floats, Floats]:
 
 
 def _shape(a: tuple[int, ...], b: tuple[int, ...]) -> tuple[int, ...]:
-    """Shape of the result; where they are the same, at once."""
     return a if a == b else np.broadcast_shapes(a, b)
 
 
 def _square(w: Floats) -> Floats:
-    """Squared length over the last axis."""
     x, y, z = w[..., 0], w[..., 1], w[..., 2]
     return np.asarray(x * x + y * y + z * z)
 
@@ -234,7 +232,6 @@ def coefficients(t2: Floats) -> tuple[Floats, Floats]:
 
 
 def _slopes(t2: Floats, b: Floats, c: Floats) -> tuple[Floats, Floats]:
-    """Return db/dθ² and dc/dθ²."""
     near = t2 < _NEAR
     far = np.where(near, 1.0, 2 * t2)
     b_slope, c_slope = (1 - c * t2 - 2 * b) / far, (b - 3 * c) / far

@@ -270,14 +270,12 @@ def _rows_dot(rows: Floats, vector: Floats) -> Floats:
 
 
 def _sum(a: Floats | None, b: Floats | None) -> Floats | None:
-    """Sum of what may be None for zero."""
     if a is None or b is None:
         return b if a is None else a
     return np.asarray(a + b)
 
 
 def _outer(a: Floats, b: Floats) -> Floats:
-    """Dyads a bᵀ (N, 3, 3)."""
     return np.einsum("ni,nj->nij", a, b, out=empty(len(a), 3, 3))
 
 

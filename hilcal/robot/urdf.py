@@ -105,7 +105,6 @@ def _no_limits(model: pin.Model, joint: int) -> bool:
 
 
 def _limits(model: pin.Model, joint: int) -> tuple[float, float, float]:
-    """Lower and upper limit in rad or m, and effort in N·m or N."""
     kind = model.joints[joint]
     effort = float(model.upperEffortLimit[kind.idx_v]) or math.inf
     if kind.nq != 1 or _no_limits(model, joint):  # continuous: Pinocchio keeps cosine and sine
@@ -134,7 +133,6 @@ def _z_to(axis: Floats) -> Floats:
 
 
 def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
-    """Joints between two links, each revolute or prismatic."""
     start, joint = _link(model, base).parentJoint, _link(model, tip).parentJoint
     chain: list[int] = []
     while joint not in (start, 0):
@@ -166,7 +164,6 @@ def _link(model: pin.Model, name: str) -> pin.Frame:
 
 
 def _only_leaf(model: pin.Model, path: Path) -> str:
-    """Name of the only moving link that nothing is attached to."""
     parents = {frame.parentFrame for frame in model.frames}
     leaves = [
         str(frame.name)
