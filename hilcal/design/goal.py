@@ -27,13 +27,9 @@ from hilcal.types import Floats
 
 JOINTS = JointCompliance.name  # The effect that "joint" and "j3" are short for
 FORMS = (
-    '"joint std < 2 %"',
-    '"j3 std < 3 %"',
-    '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
-    '"joint_tilt_compliance std < 10 %"',
-    '"position std < 20 um"',
-    '"deflection std < 20 um"',
-)
+    '"joint std < 2 %"', '"j3 std < 3 %"', '"joint_compliance.j3 std < 1e-7 rad/(N·m)"',
+    '"joint_tilt_compliance std < 10 %"', '"position std < 20 um"', '"deflection std < 20 um"',
+)  # fmt: skip
 POSITIONS = ("position", "deflection")  # predicted where the robot will work
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "µrad": 1e-6, "μrad": 1e-6}
 _SHAPE = re.compile(

@@ -309,17 +309,11 @@ def problem(
     precision = np.ones(len(terms))
     precision[:count] = (scale[:count] / nominal.prior_std[nominal.live]) ** 2
     return DesignProblem(
-        nominal=nominal,
-        mode=mode,
-        candidates=of,
-        units=CandidateSet(rows, layout.cost),
-        what=layout.what,
-        terms=terms,
-        families=against.effects,
-        prior=measured + np.diag(precision),
-        measured=measured,
+        nominal=nominal, mode=mode, candidates=of, units=CandidateSet(rows, layout.cost),
+        what=layout.what, terms=terms, families=against.effects,
+        prior=measured + np.diag(precision), measured=measured,
         notes=(*nominal.notes, *against.notes, *layout.notes),
-    )
+    )  # fmt: skip
 
 
 def _terms(nominal: NominalModel, against: Potential) -> tuple[DesignTerm, ...]:

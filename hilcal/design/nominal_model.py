@@ -263,13 +263,9 @@ def nominal_states(q: Floats, wrench: Floats) -> States:
     time = rng.uniform(0.0, DURATION_S, len(q))
     approach = rng.choice([-1.0, 1.0], q.shape)
     return States(
-        q=q,
-        wrench=wrench,
-        time=time,
-        load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
-        joint_temperature=rng.uniform(*TEMPERATURES, q.shape),
-        approach=approach,
-    )
+        q=q, wrench=wrench, time=time, load_time=rng.uniform(*LOAD_TIMES_S, len(q)),
+        joint_temperature=rng.uniform(*TEMPERATURES, q.shape), approach=approach,
+    )  # fmt: skip
 
 
 def _registered(cell: Cell, config: CellConfig, place: Floats) -> tuple[Cell, Floats]:

@@ -116,17 +116,12 @@ class Confounding:
         """Return it for a plan's file."""
         left, rate = self.returned_m, self.drift_std
         return {
-            "deflections": self.deflections,
-            "correlation": round(self.correlation, 4),
-            "correlated_with": self.regressor,
-            "lag_mean_s": round(self.lag_mean_s, 1),
-            "lag_rms_s": round(self.lag_rms_s, 1),
-            "drift_m_per_h": 3600.0 * self.drift,
-            "error_m": self.error_m,
-            "bias_m": self.bias_m,
-            "error_with_returns_m": left,
+            "deflections": self.deflections, "correlation": round(self.correlation, 4),
+            "correlated_with": self.regressor, "lag_mean_s": round(self.lag_mean_s, 1),
+            "lag_rms_s": round(self.lag_rms_s, 1), "drift_m_per_h": 3600.0 * self.drift,
+            "error_m": self.error_m, "bias_m": self.bias_m, "error_with_returns_m": left,
             "drift_std_m_per_h": None if rate is None else 3600.0 * rate,
-        }
+        }  # fmt: skip
 
 
 def confounding(
@@ -166,16 +161,12 @@ def confounding(
     rms = float(np.sqrt(np.mean(lag**2))) if len(lag) else 0.0
     slope = _slope_std(plan, times, reading_std)
     return Confounding(
-        deflections=len(pairs),
-        correlation=float(rho[worst]) if len(rho) else 0.0,
+        deflections=len(pairs), correlation=float(rho[worst]) if len(rho) else 0.0,
         regressor=names[worst] if len(rho) else "",
-        lag_mean_s=float(lag.mean()) if len(lag) else 0.0,
-        lag_rms_s=rms,
-        drift=drift,
-        error_m=drift * rms,
-        bias_m=drift * float(lag.mean()) if len(lag) else 0.0,
+        lag_mean_s=float(lag.mean()) if len(lag) else 0.0, lag_rms_s=rms, drift=drift,
+        error_m=drift * rms, bias_m=drift * float(lag.mean()) if len(lag) else 0.0,
         drift_std=slope,
-    )
+    )  # fmt: skip
 
 
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:

@@ -158,18 +158,13 @@ class PlanSummary:
             }
         same = ("poses", "readings", "criterion", "efficiency", "position_std_m", "parameters")
         return {
-            **{key: known[key] for key in same},
-            "asked_poses": self.asked_poses,
-            "position": self.position,
-            "position_note": self.position_note,
+            **{key: known[key] for key in same}, "asked_poses": self.asked_poses,
+            "position": self.position, "position_note": self.position_note,
             "predicted_std": {p.name: p.std for p in self.parameters},
-            "readings_by_load": self.loads,
-            "criteria": known["criteria"],
-            "curve": known["curve"],
-            "detectable": known["detectable"],
-            "order": order,
+            "readings_by_load": self.loads, "criteria": known["criteria"],
+            "curve": known["curve"], "detectable": known["detectable"], "order": order,
             "remarks": list(self.remarks),
-        }
+        }  # fmt: skip
 
 
 def summarise(
@@ -186,24 +181,17 @@ def summarise(
     if compare or curve:
         say("comparing criteria and numbers of poses" if compare else "comparing numbers of poses")
     return PlanSummary(
-        poses=len({s.pose for s in plan.steps} - {REFERENCE}),
-        readings=len(plan.steps),
+        poses=len({s.pose for s in plan.steps} - {REFERENCE}), readings=len(plan.steps),
         loads={name: sum(s.load == name for s in plan.steps) for name in plan.loads},
-        duration=planned.ordered.duration,
-        criterion=planned.criterion,
-        efficiency=planned.design.efficiency,
-        parameters=_parameters(planned),
-        position_std_m=_finite(knows.position),
-        position=planned.work.what,
+        duration=planned.ordered.duration, criterion=planned.criterion,
+        efficiency=planned.design.efficiency, parameters=_parameters(planned),
+        position_std_m=_finite(knows.position), position=planned.work.what,
         criteria=tuple(_criteria(planned, config, rng)) if compare else (),
         curve=tuple(_curve(planned)) if curve else (),
-        detectable=tuple(detectable_effects(planned, config)),
-        longer=planned.ordered.longer,
-        confounding=planned.ordered.confounding,
-        shortest=planned.ordered.confounding_shortest,
-        remarks=remarks(planned),
-        asked_poses=planned.asked_poses,
-    )
+        detectable=tuple(detectable_effects(planned, config)), longer=planned.ordered.longer,
+        confounding=planned.ordered.confounding, shortest=planned.ordered.confounding_shortest,
+        remarks=remarks(planned), asked_poses=planned.asked_poses,
+    )  # fmt: skip
 
 
 def position_note(quantity: str) -> str:

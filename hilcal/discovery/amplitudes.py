@@ -397,16 +397,12 @@ def composed(terms: tuple[tuple[float, Amplitude], ...]) -> Composed:
     slots = [f.variable.slot for a in products for f in a.factors if f.variable.slot is not None]
     joints = {f.variable.joint for a in products for f in a.factors}
     return Composed(
-        "composed",
-        tuple(dict.fromkeys(n for a in products for n in a.names)),
+        "composed", tuple(dict.fromkeys(n for a in products for n in a.names)),
         _sum([(w, a.text()) for w, a in terms], "·"),
-        _sum([(w, a.latex()) for w, a in terms], r"\,"),
-        products[0].unit(),
-        _code(terms),
-        slot=slots[0] if slots else None,
-        joint=joints.pop() if len(joints) == 1 else -1,
+        _sum([(w, a.latex()) for w, a in terms], r"\,"), products[0].unit(), _code(terms),
+        slot=slots[0] if slots else None, joint=joints.pop() if len(joints) == 1 else -1,
         terms=terms,
-    )
+    )  # fmt: skip
 
 
 def _sum(terms: list[tuple[float, str]], times: str) -> str:

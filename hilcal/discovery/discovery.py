@@ -240,19 +240,12 @@ def _laws(
     )
     named = {kinds[k]: law.name for k, law in reversed([*zip(kept, laws, strict=True)])}
     return Discovery(
-        fit,
-        "law",
-        laws,
+        fit, "law", laws,
         float(np.clip(max(attainable, folds.share, laws[0].holdout_share), 0.0, 1.0)),
-        folds.share,
-        (),
-        found.candidates,
-        made[kept[0]][1],
-        made[kept[0]][3],
-        curves(made[kept[0]][1], laws[0].form),
-        refused=tuple(refused),
+        folds.share, (), found.candidates, made[kept[0]][1], made[kept[0]][3],
+        curves(made[kept[0]][1], laws[0].form), refused=tuple(refused),
         structures=tuple(replace(x, law=named.get(x.kind, "")) for x in likely),
-    )
+    )  # fmt: skip
 
 
 def _as_good(left: Floats, best: Floats) -> bool:
@@ -286,18 +279,10 @@ def _law(
         values = v.read(situation)
         ranges.append((symbol, float(values.min()), float(values.max()), v.unit))
     return Law(
-        name=name,
-        form=form,
-        parameters=coefficients,
-        p_value=p_value,
-        odds=s.total,
-        holdout_share=share,
-        left=after.variance_factor,
-        probability=0.0,
-        resembles=near[:3],
-        ranges=tuple(ranges),
-        again=found_again(problem.screen, folds, s.terms),
-    )
+        name=name, form=form, parameters=coefficients, p_value=p_value, odds=s.total,
+        holdout_share=share, left=after.variance_factor, probability=0.0, resembles=near[:3],
+        ranges=tuple(ranges), again=found_again(problem.screen, folds, s.terms),
+    )  # fmt: skip
 
 
 FOLDS = 5  # As in the regression of the residual; a choice

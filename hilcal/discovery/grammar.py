@@ -131,16 +131,10 @@ def _lasting(v: Variable, x: Floats) -> list[Factor]:
 
 
 _CURVED: dict[str, _Made] = {
-    "torque": _wrench,
-    "force": _wrench,
-    "load": _wrench,
-    "sensor": _read_by_sensor,
-    "gravity": _gravity,
-    "temperature": _temperature,
-    "time": _lasting,
-    "hanging": _lasting,
+    "torque": _wrench, "force": _wrench, "load": _wrench, "sensor": _read_by_sensor,
+    "gravity": _gravity, "temperature": _temperature, "time": _lasting, "hanging": _lasting,
     "place": _grown,
-}
+}  # fmt: skip
 
 
 def _round(x: float) -> float:

@@ -343,16 +343,12 @@ def source_of_form(
         needs = "".join(f'"{n}", ' for n in form.needs).rstrip()
         attributes.append(f"    needs = ({needs})\n")
     source = _HEAD.format(
-        name=name,
-        formula=form.text(),
-        file=_in_docstring(quoted(file)),
+        name=name, formula=form.text(), file=_in_docstring(quoted(file)),
         evidence="\n".join(map(_in_docstring, evidence.split("\n"))),
-        imports=", Response" if form.elastic else "",
-        class_name=class_name(name),
-        attributes="".join(attributes),
-        parameters="\n".join(_parameters(form, found)),
+        imports=", Response" if form.elastic else "", class_name=class_name(name),
+        attributes="".join(attributes), parameters="\n".join(_parameters(form, found)),
         columns="\n".join(_moving(form)),
-    )
+    )  # fmt: skip
     if form.elastic:
         source += _RESPONSE.format(body="\n".join(_responses(form)))
     if any(p.site.field == "sensor" for p in form.parts):

@@ -41,16 +41,11 @@ def example_cell(joints: int | None = None, *, slides: bool = False) -> Cell:
     arm = cell.arm
     rows = np.minimum(np.arange(arm.n if joints is None else joints), arm.n - 1)
     longer = replace(
-        arm,
-        links=arm.links[[*rows, arm.n]],
-        masses=arm.masses[rows],
-        coms=arm.coms[rows],
-        q_min=arm.q_min[rows],
-        q_max=arm.q_max[rows],
-        torque_max=arm.torque_max[rows],
+        arm, links=arm.links[[*rows, arm.n]], masses=arm.masses[rows], coms=arm.coms[rows],
+        q_min=arm.q_min[rows], q_max=arm.q_max[rows], torque_max=arm.torque_max[rows],
         prismatic=np.arange(len(rows)) == 0 if slides else None,
         joint_names=tuple(f"joint {k + 1}" for k in range(len(rows))),
-    )
+    )  # fmt: skip
     names = [ObserverName("station", "S1"), ObserverName("station", "S2")]
     names += [ObserverName("point", "P"), ObserverName("gauge", "G")]
     longer_cell = replace(cell, arm=longer, load_point=np.array([0.02, -0.01, 0.1]))
@@ -66,16 +61,12 @@ def example_states(cell: Cell, count: int = 30) -> States:
     time = np.cumsum(rng.uniform(20, 60, count))
     warm = 1.0 - np.exp(-time[:, None] / 600)
     states = States(
-        q=q,
-        wrench=wrench,
-        time=time,
-        load_time=rng.uniform(5, 300, count),
+        q=q, wrench=wrench, time=time, load_time=rng.uniform(5, 300, count),
         air_temperature=21.0 + rng.normal(size=count),
         joint_temperature=22.0 + rng.uniform(5, 15, n) * warm,
         approach=rng.choice([-1.0, 1.0], (count, n)),
-        q_actual=q + 1e-5 * rng.normal(size=q.shape),
-        observer=np.arange(count) % 4,
-    )
+        q_actual=q + 1e-5 * rng.normal(size=q.shape), observer=np.arange(count) % 4,
+    )  # fmt: skip
     for field in fields(states):
         if (given := getattr(states, field.name)) is not None:
             given.flags.writeable = False

@@ -44,13 +44,9 @@ class Prediction(Brief):
         """Return the prediction of the chosen states."""
         s = self.situation
         chosen = replace(
-            s,
-            states=s.states[rows],
-            angle=s.angle[rows],
-            chain=take(s.chain, rows, axis=1),
-            wrench=s.wrench[rows],
-            load=replace(s.load, wrench=s.load.wrench[rows]),
-        )
+            s, states=s.states[rows], angle=s.angle[rows], chain=take(s.chain, rows, axis=1),
+            wrench=s.wrench[rows], load=replace(s.load, wrench=s.load.wrench[rows]),
+        )  # fmt: skip
         return Prediction(chosen, take(self.deviation, rows), take(self.observation, rows))
 
     @staticmethod

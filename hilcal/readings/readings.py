@@ -137,17 +137,12 @@ class Readings(Tabular):
     def __getitem__(self, rows: Ints | Bools | slice) -> "Readings":
         """Return the chosen readings; names are kept."""
         return replace(
-            self,
-            states=self.states[rows],
-            pose=self.pose[rows],
-            load=self.load[rows],
-            cycle=self.cycle[rows],
-            value=self.value[rows],
-            covariance=self.covariance[rows],
+            self, states=self.states[rows], pose=self.pose[rows], load=self.load[rows],
+            cycle=self.cycle[rows], value=self.value[rows], covariance=self.covariance[rows],
             common=None if self.common is None else self.common[rows],
             stated=None if self.stated is None else self.stated[rows],
             along=None if self.along is None else self.along[rows],
-        )
+        )  # fmt: skip
 
     @staticmethod
     def joined(parts: Sequence["Readings"]) -> "Readings":

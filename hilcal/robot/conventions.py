@@ -93,14 +93,9 @@ def with_conventions(
         moved = sign * (by @ offset + rest - offset)
         mimic = np.where(arm.own[:, None], mimic, np.column_stack([turned, moved]))
     return replace(
-        arm,
-        links=links,
-        coms=coms,
-        coupling=_unless_one(follows),
-        drive=_unless_one(drives),
-        mimic=mimic,
-        sign=signs if np.any(signs < 0) else None,
-    )
+        arm, links=links, coms=coms, coupling=_unless_one(follows), drive=_unless_one(drives),
+        mimic=mimic, sign=signs if np.any(signs < 0) else None,
+    )  # fmt: skip
 
 
 def as_drawn(arm: Arm) -> Arm:

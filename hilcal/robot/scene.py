@@ -28,15 +28,10 @@ def pinocchio_model(arm: Arm) -> pin.Model:
     joint = 0
     for i in range(arm.n):
         joint = model.addJoint(
-            joint,
-            pin.JointModelPZ() if arm.slides[i] else pin.JointModelRZ(),
-            pin.SE3(arm.links[i]),
-            arm.joint_names[i],
-            arm.torque_max[i : i + 1],
-            np.array([np.inf]),
-            arm.q_min[i : i + 1],
-            arm.q_max[i : i + 1],
-        )
+            joint, pin.JointModelPZ() if arm.slides[i] else pin.JointModelRZ(),
+            pin.SE3(arm.links[i]), arm.joint_names[i], arm.torque_max[i : i + 1],
+            np.array([np.inf]), arm.q_min[i : i + 1], arm.q_max[i : i + 1],
+        )  # fmt: skip
         body = pin.Inertia(float(arm.masses[i]), arm.coms[i], np.zeros((3, 3)))
         model.appendBodyToJoint(joint, body, pin.SE3.Identity())
     model.addFrame(pin.Frame(FLANGE, joint, 0, pin.SE3(arm.links[arm.n]), pin.FrameType.OP_FRAME))

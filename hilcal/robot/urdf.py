@@ -76,17 +76,11 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     return Arm(
         name=path.stem,
         links=np.array([b @ m @ a for b, m, a in zip(before, placements, after, strict=True)]),
-        masses=masses,
-        coms=np.array(coms),
-        q_min=np.array(lower),
-        q_max=np.array(upper),
-        torque_max=np.array(effort),
-        payload=math.inf,
-        joint_names=names,
-        source=f"URDF {path.name}",
-        notes=_missing(model, masses, slides),
+        masses=masses, coms=np.array(coms), q_min=np.array(lower), q_max=np.array(upper),
+        torque_max=np.array(effort), payload=math.inf, joint_names=names,
+        source=f"URDF {path.name}", notes=_missing(model, masses, slides),
         prismatic=slides if slides.any() else None,
-    )
+    )  # fmt: skip
 
 
 def _missing(model: pin.Model, masses: Floats, slides: Bools) -> tuple[str, ...]:

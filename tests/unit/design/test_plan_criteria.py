@@ -42,17 +42,12 @@ def compound_variance() -> MeanVariance:
 
 
 CRITERIA: dict[str, Callable[[], Criterion]] = {
-    "D": D,
-    "A": lambda: MeanVariance(np.eye(P) / P, "A"),
+    "D": D, "A": lambda: MeanVariance(np.eye(P) / P, "A"),
     "A of some": lambda: MeanVariance(np.diag([1.0, 0.0, 1.0, 0.0, 0.0, 1.0]) / 3, "A"),
-    "I": lambda: MeanVariance(few_poses()),
-    "E": E,
-    "K": K,
-    "E of some": lambda: E(np.array([0, 2, 5])),
-    "separate": lambda: Separate(pairs()),
-    "compound variance": compound_variance,
-    "compound determinant": lambda: D(4),
-}
+    "I": lambda: MeanVariance(few_poses()), "E": E, "K": K,
+    "E of some": lambda: E(np.array([0, 2, 5])), "separate": lambda: Separate(pairs()),
+    "compound variance": compound_variance, "compound determinant": lambda: D(4),
+}  # fmt: skip
 seeds = st.integers(0, 10**6)
 every = pytest.mark.parametrize("name", CRITERIA)
 

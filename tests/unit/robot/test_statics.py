@@ -70,17 +70,11 @@ def test_torques_are_those_that_pinocchio_holds_against(name: str, gravity: str)
 def test_a_weight_on_a_lever_turns_it_down() -> None:
     # One joint about −y, a lever of 0.5 m along x with 3 kg at its end: it falls by +τ.
     arm = Arm(
-        name="lever",
-        links=np.array([displacement([0, 0, 0, np.pi / 2, 0, 0]), np.eye(4)]),
-        masses=np.array([3.0]),
-        coms=np.array([[0.5, 0.0, 0.0]]),
-        q_min=np.array([-np.pi]),
-        q_max=np.array([np.pi]),
-        torque_max=np.array([100.0]),
-        payload=1.0,
-        joint_names=("j1",),
+        name="lever", links=np.array([displacement([0, 0, 0, np.pi / 2, 0, 0]), np.eye(4)]),
+        masses=np.array([3.0]), coms=np.array([[0.5, 0.0, 0.0]]), q_min=np.array([-np.pi]),
+        q_max=np.array([np.pi]), torque_max=np.array([100.0]), payload=1.0, joint_names=("j1",),
         source="made up",
-    )
+    )  # fmt: skip
     load = Load(np.zeros((1, 6)), np.zeros(3), 0.0, np.zeros(3), np.array([0, 0, -10.0]))
     wrench = slot_wrenches(arm, evaluate(arm, np.zeros((1, 1))), load)
     np.testing.assert_allclose(wrench[0, 0], [0, -30, 0, 0, 0, -15], rtol=0, atol=1e-13)
