@@ -241,15 +241,10 @@ def _dual(z: Floats, move: Floats) -> Floats:
 
 
 def _search(
-    program: BarrierProgram,
-    surrogate: Callable[[Floats], Smooth | None],
-    here: Smooth,
-    at: tuple[Floats, Floats],
-    step: tuple[Floats, Floats],
-    length: float,
-    mu: float,
+    program: BarrierProgram, surrogate: Callable[[Floats], Smooth | None], here: Smooth,
+    at: tuple[Floats, Floats], step: tuple[Floats, Floats], length: float, mu: float,
     slope: float,
-) -> float:
+) -> float:  # fmt: skip
     """Return the length of a step of weights and information: halved until it helps; 0 if never."""
     capped = np.isfinite(program.most)
     (w, m), (move, moved) = at, step

@@ -69,12 +69,11 @@ def objective_of(
     """Return a design problem with a criterion by its name; "I" needs prediction poses."""
     name = canonical(name)
     names = tuple(t.name for t in problem.terms)
-    size = problem.model_size
     whole = Objective(D(), problem.units, problem.prior, names)
     if name == "D":
         return whole
     if name == "A":
-        return replace(whole, criterion=MeanVariance(_mean_of(size, len(names)), "A"))
+        return replace(whole, criterion=MeanVariance(problem.mean_variance, "A"))
     if name == "I":
         if work is None:
             raise InputError('criterion "I" needs prediction poses; see [planning] work_q_rad')
@@ -101,12 +100,9 @@ def unknown(problem: DesignProblem) -> Ints:
 
 
 def choose(
-    asked: Objective,
-    budget: float,
-    rng: np.random.Generator,
-    effort: int = EFFORT,
+    asked: Objective, budget: float, rng: np.random.Generator, effort: int = EFFORT,
     relaxed: ApproximateDesign | None = None,
-) -> Design:
+) -> Design:  # fmt: skip
     """Return the exact design; see `optimum.best`."""
     return best(
         asked.units, asked.criterion, budget, asked.prior, rng, names=asked.names, effort=effort,
@@ -214,10 +210,6 @@ def _value(
         return 0.0
 
 
-def _mean_of(size: int, every: int) -> Floats:
-    return np.diag(np.where(np.arange(every) < size, 1.0 / size, 0.0))
-
-
 def compound_objective(
     problem: DesignProblem,
     config: CellConfig,
@@ -233,7 +225,7 @@ def compound_objective(
         return asked
     if name == "D":
         return replace(asked, criterion=D(size))
-    c = _mean_of(size, len(problem.terms))
+    c = problem.mean_variance
     whole, own = MeanVariance(c, name), MeanVariance(c[:size, :size], name)
     poses = np.array([pose for pose, _ in problem.what])
     some = only(asked, np.isin(poses, rng.permutation(len(problem.candidates))[:SAMPLE]))

@@ -16,6 +16,7 @@ scale are those that a diagnosis scores the effect with; see `regression.evidenc
 """
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,7 +108,12 @@ def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedP
     not_separable = []
     for names in dict.fromkeys(of.names):
         pair = of.pairs[of.names.index(names)]
-        if power(pair, spread) < LEAST_POWER and _best_power(problem, of, pair) < LEAST_POWER:
+        best = power(pair, spread)
+        if best < LEAST_POWER:
+            with suppress(CannotAnswerError):
+                found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
+                best = power(pair, found.information)
+        if best < LEAST_POWER:
             not_separable.append(names)
     keep = [k for k, names in enumerate(of.names) if names not in not_separable]
     if not keep:
@@ -116,35 +122,24 @@ def _separable(problem: DesignProblem, of: DiscriminatedPairs) -> DiscriminatedP
     return DiscriminatedPairs(pairs, both, of.prior, tuple(not_separable))
 
 
+def _by_effect(pairs: Sequence[tuple[str, str]]) -> dict[str, str]:
+    return {e: " or ".join(f for x, f in pairs if x == e) for e, _ in pairs}
+
+
 def not_separable_message(pairs: Sequence[tuple[str, str]]) -> str:
     """Name the pairs that no measurement separates."""
-    named: dict[str, list[str]] = {}
-    for e, f in pairs:
-        if e not in named.get(f, ()):
-            named.setdefault(e, []).append(f)
-    each = [f"{e} from {' or '.join(fs)}" for e, fs in named.items()]
+    both = [pair for k, pair in enumerate(pairs) if pair[::-1] not in pairs[:k]]
+    each = [f"{e} from {fs}" for e, fs in _by_effect(both).items()]
     return f"no measurement in this cell separates {', nor '.join(each)}"
 
 
 def not_ruled_out(pairs: Sequence[tuple[str, str]]) -> str:
     """Say of pairs (effect that is there, rival) that no measurement rules out the rival."""
-    named: dict[str, list[str]] = {}
-    for e, f in pairs:
-        named.setdefault(e, []).append(f)
-    each = [f"{' or '.join(fs)} where {e} is there" for e, fs in named.items()]
+    each = [f"{fs} where {e} is there" for e, fs in _by_effect(pairs).items()]
     return (
         f"no measurement in this cell rules out {', nor '.join(each)}: {MANY} of the best readings "
         f"would do so with a chance of less than {100 * LEAST_POWER:.0f} %"
     )
-
-
-def _best_power(problem: DesignProblem, of: DiscriminatedPairs, pair: Pair) -> float:
-    """Power of the best plan of `MANY` readings for one pair."""
-    try:
-        found = relax(problem.units, Separate((pair,)), MANY, of.prior, tolerance=_LOOSE)
-    except CannotAnswerError:
-        return LEVEL
-    return power(pair, found.information)
 
 
 def power(pair: Pair, information: Floats) -> float:

@@ -266,6 +266,11 @@ class DesignProblem:
         return sum(not t.potential for t in self.terms)
 
     @property
+    def mean_variance(self) -> Floats:
+        """(P, P) C whose tr(C M⁻¹) is the mean variance of the model's parameters."""
+        return np.diag([(not t.potential) / self.model_size for t in self.terms])
+
+    @property
     def scale(self) -> Floats:
         """(P,) what one unit of each parameter is, SI."""
         return np.array([t.scale for t in self.terms])

@@ -142,13 +142,9 @@ def _pair_powers(
 
 
 def _from_reference(
-    cell: Cell,
-    config: CellConfig,
-    made: Planned,
-    reference: Floats,
-    rng: np.random.Generator,
+    cell: Cell, config: CellConfig, made: Planned, reference: Floats, rng: np.random.Generator,
     request: Request,
-) -> Planned:
+) -> Planned:  # fmt: skip
     """Return the plan in an order from another reference pose, without what that cannot reach."""
     space, of = Space(cell, config), made.problem
     counts = made.counts.astype(np.int64)

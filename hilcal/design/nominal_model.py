@@ -15,7 +15,7 @@ from hilcal.identification.carried import CarriedPrior, check_arm
 from hilcal.identification.coordinates import coordinates_of
 from hilcal.identification.drift import least
 from hilcal.identification.fit import Fit
-from hilcal.identification.priors import prior_of
+from hilcal.identification.priors import prior_of, scales_of
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverKind, ObserverName, States
 from hilcal.robot import se3
@@ -111,7 +111,8 @@ def nominal_model(
     parts = [(e.role == "baseline") * np.array([p.scale for p in e.parameters]) for e in effects]
     notes += random_columns(effects)
     theta = np.concatenate(parts)
-    prior_std = _prior_std(model)
+    prior_std, groups = prior_of(model)  # a shrunk family is ordinary
+    prior_std = np.where(groups >= 0, scales_of(model), prior_std)
     if prior is not None:
         s = prior.posterior.source
         called = f"{s.campaign}: " if s.campaign else ""
@@ -210,7 +211,7 @@ def checked(names: tuple[str, ...], key: str, catalogue: Catalogue) -> tuple[str
         try:
             catalogue[name]
         except InputError as error:
-            raise InputError(f"[planning] {key}: {error}") from None
+            raise InputError(f"{key}: {error}") from None
     return tuple(dict.fromkeys(names))
 
 
@@ -224,11 +225,7 @@ def check_effects(cell: Cell, config: CellConfig, catalogue: Catalogue) -> None:
         raise InputError(words if known else f"[planning] model: {words}") from None
     potential_names(config, model)
     for section in ("plausible", "ordinary"):
-        for name in getattr(config, section):
-            try:
-                catalogue[name]
-            except InputError as error:
-                raise InputError(f"[{section}]: {error}") from None
+        checked(tuple(getattr(config, section)), f"[{section}]", catalogue)
 
 
 def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
@@ -245,7 +242,7 @@ def potential_names(config: CellConfig, model: Model) -> tuple[str, ...]:
             if kind.applies(model.cell) and not kind.needs and kind.role != "observer"
         )
     else:
-        names = checked(asked, "against", model.catalogue)
+        names = checked(asked, "[planning] against", model.catalogue)
     return tuple(name for name in names if name not in model.names)
 
 
@@ -297,10 +294,3 @@ def _observed(cell: Cell, config: CellConfig, place: Floats) -> Cell:
             frame = se3.matrix(np.eye(3), -turn @ place)
         found.append(replace(o, frame=frame))
     return replace(seen, observers=tuple(found))
-
-
-def _prior_std(model: Model) -> Floats:
-    """(P,) what effects know of their parameters; a shrunk family is ordinary."""
-    prior, groups = prior_of(model)
-    scale = np.array([p.scale for e in model.effects for p in e.parameters])
-    return np.asarray(np.where(groups >= 0, scale, prior))

@@ -108,14 +108,9 @@ class _Search:
     """The pool of units in which a plan is sought: those of weight and of the best prices."""
 
     def __init__(
-        self,
-        units: CandidateSet,
-        criterion: Criterion,
-        budget: float,
-        prior: Floats,
-        relaxed: ApproximateDesign,
-        most: int | None,
-    ) -> None:
+        self, units: CandidateSet, criterion: Criterion, budget: float, prior: Floats,
+        relaxed: ApproximateDesign, most: int | None,
+    ) -> None:  # fmt: skip
         most_of_one = budget / float(units.cost.min())
         fits = 2 * _TABLE // (units.size * (units.size + 1))
         count = max(min(_POOL, fits), 3 * int(np.ceil(most_of_one)))
@@ -160,13 +155,13 @@ class _Search:
 
     def _information(self, counts: Ints) -> Floats:
         used = np.flatnonzero(counts)
-        return np.asarray(self.prior + self.pool.information(counts[used], used))
+        return np.asarray(self.prior + self.pool.information(counts[used].astype(float), used))
 
     def _prices(self, gradient: Floats) -> Floats:
         """Return (S,) tr(G A_kᵀA_k), in single precision."""
         turned = (self.root.T @ gradient @ self.root)[self.triangle]
         scale = float(np.abs(turned).max(initial=0.0)) or 1.0
-        return (self.table @ (turned / scale).astype(np.float32)).astype(float) * scale
+        return np.asarray((self.table @ (turned / scale).astype(np.float32)).astype(float) * scale)
 
     def refilled(
         self, counts: Ints, banned: int = -1, rng: np.random.Generator | None = None

@@ -266,7 +266,12 @@ def make(
     counts = np.zeros(len(usable), dtype=np.int64)
     counts[np.flatnonzero(usable)] = design.counts
     repeats = max(2, (visited - 1) // 10)
-    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=_reading_std(space, of))
+    some = of.candidates[slice(0, SAMPLE)].states()
+    covariance = reading_covariance(
+        of.nominal, config, of.nominal.model.predict(some, of.nominal.theta)
+    )
+    std = float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))
+    how = Ordering(unloaded=request.unloaded, repeats=repeats, reading_std=std)
     order = ordered(space, of, home, counts, rng, how)
     knows = predicted(of, counts.astype(float), work=work)
     return Planned(
@@ -276,13 +281,11 @@ def make(
 
 
 def _budget(request: Request, of: DesignProblem) -> float:
-    if request.readings is not None:
-        if request.readings < 1:
-            raise InputError(f"{request.readings} readings; valid: a whole number from 1")
-        return float(request.readings)
-    if request.poses < 1:
-        raise InputError(f"{request.poses} poses; valid: a whole number from 1")
-    return float(request.poses * len(of.candidates.loads))
+    whole = request.readings is None
+    count, what = (request.poses, "poses") if whole else (request.readings or 0, "readings")
+    if count < 1:
+        raise InputError(f"{count} {what}; valid: a whole number from 1")
+    return float(count * (len(of.candidates.loads) if whole else 1))
 
 
 def _reference(space: Space, drawn: DrawnPoses, rng: np.random.Generator) -> tuple[Floats, Ints]:
@@ -346,10 +349,3 @@ def ordered(
     return order_plan(
         space.cell, space.config, list(name.values()), q, home, chosen, space.passable, rng, how
     )
-
-
-def _reading_std(space: Space, of: DesignProblem) -> float:
-    model, theta = of.nominal.model, of.nominal.theta
-    some = of.candidates[slice(0, SAMPLE)].states()
-    covariance = reading_covariance(of.nominal, space.config, model.predict(some, theta))
-    return float(np.sqrt(np.mean(np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2))))

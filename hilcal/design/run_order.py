@@ -5,7 +5,7 @@ clear; the blocks follow each other in random order.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from itertools import pairwise, permutations
 from typing import Literal
 
@@ -55,12 +55,7 @@ class Duration:
 
     def about(self) -> dict[str, float]:
         """Return it for a plan's file, s."""
-        split = {
-            "total": self.total,
-            "motion": self.motion,
-            "readings": self.readings,
-            "load_changes": self.load_changes,
-        }
+        split = {"total": self.total, **asdict(self)}
         return {key: round(value, 1) for key, value in split.items()}
 
 
@@ -152,29 +147,27 @@ def confounding(
     lag = np.array([when[s] - (unloaded[s.pose, s.cycle] if pairs else 0.0) for s in rows])
     q = np.array([plan.joints(s.pose) for s in rows]).reshape(len(rows), plan.q.shape[1])
     wrench = np.array([wrenches[s.load] if s.load != UNLOADED else np.zeros(6) for s in rows])
-    names, columns = _regressors(q, wrench.reshape(-1, 6), product=bool(pairs))
-    if not pairs:
-        lag = lag - lag.mean() if len(lag) else lag
-        columns = columns - columns.mean(axis=0) if len(lag) else columns
-    rho = _cosines(lag, columns)
-    worst = int(np.argmax(rho)) if len(rho) else -1
-    rms = float(np.sqrt(np.mean(lag**2))) if len(lag) else 0.0
     slope = _slope_std(plan, times, reading_std)
+    names, columns = _regressors(q, wrench.reshape(-1, 6), product=bool(pairs))
+    if not rows or not names:
+        return Confounding(0, 0.0, "", 0.0, 0.0, drift, 0.0, 0.0, slope)
+    if not pairs:
+        lag, columns = lag - lag.mean(), columns - columns.mean(axis=0)
+    size = np.linalg.norm(lag) * np.linalg.norm(columns, axis=0)
+    tiny = 1e-12 * np.linalg.norm(lag) * np.sqrt(len(lag))
+    rho = np.abs(lag @ columns) / np.where(size > tiny, size, np.inf)
+    worst, mean, rms = int(np.argmax(rho)), float(lag.mean()), float(np.sqrt(np.mean(lag**2)))
     return Confounding(
-        deflections=len(pairs), correlation=float(rho[worst]) if len(rho) else 0.0,
-        regressor=names[worst] if len(rho) else "",
-        lag_mean_s=float(lag.mean()) if len(lag) else 0.0, lag_rms_s=rms, drift=drift,
-        error_m=drift * rms, bias_m=drift * float(lag.mean()) if len(lag) else 0.0,
-        drift_std=slope,
+        len(pairs), float(rho[worst]), names[worst], mean, rms, drift, drift * rms, drift * mean,
+        slope,
     )  # fmt: skip
 
 
 def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str], Floats]:
     """Names and (N, k) columns; cos and sin times the wrench where they are products."""
-    joints = range(q.shape[1])
-    turned = [(f"cos q{j + 1}", np.cos(q[:, j])) for j in joints]
-    turned += [(f"sin q{j + 1}", np.sin(q[:, j])) for j in joints]
-    live = [k for k in range(6) if np.any(wrench[:, k] != 0)] if len(wrench) else []
+    turns = (("cos", np.cos), ("sin", np.sin))
+    turned = [(f"{w} q{j + 1}", f(q[:, j])) for w, f in turns for j in range(q.shape[1])]
+    live = np.flatnonzero(np.any(wrench != 0, axis=0)).tolist()
     out = [(_WRENCH[k], wrench[:, k]) for k in live]
     if product:
         out += [(f"{_WRENCH[k]} {name}", wrench[:, k] * x) for k in live for name, x in turned]
@@ -183,22 +176,13 @@ def _regressors(q: Floats, wrench: Floats, *, product: bool) -> tuple[list[str],
     return [name for name, _ in out], np.array([x for _, x in out]).reshape(len(out), -1).T
 
 
-def _cosines(lag: Floats, columns: Floats) -> Floats:
-    size = np.linalg.norm(lag) * np.linalg.norm(columns, axis=0)
-    tiny = 1e-12 * np.linalg.norm(lag) * np.sqrt(max(len(lag), 1))
-    return np.asarray(np.abs(lag @ columns) / np.where(size > tiny, size, np.inf))
-
-
 def _slope_std(plan: Plan, times: Floats, reading_std: float) -> float | None:
     """Standard uncertainty of a drift's rate from the readings at the reference pose, m/s."""
-    moment = 0.0
-    for load in plan.loads:
-        here: Sequence[float] = [
-            float(t)
-            for s, t in zip(plan.steps, times, strict=True)
-            if s.pose == REFERENCE and s.load == load
-        ]
-        moment += float(np.sum((np.array(here) - np.mean(here)) ** 2)) if here else 0.0
+    here: dict[str, list[float]] = {}
+    for s, t in zip(plan.steps, times.tolist(), strict=True):
+        if s.pose == REFERENCE:
+            here.setdefault(s.load, []).append(t)
+    moment = sum(len(some) * float(np.var(some)) for some in here.values())
     return reading_std / float(np.sqrt(moment)) if moment > 0 else None
 
 
@@ -544,12 +528,9 @@ def ways(q: Floats, load: str, passable: Passable, pace: Pace, near: int = NEAR)
 
 
 def load_order(
-    before: LoadBlock,
-    loaded: Sequence[LoadBlock],
-    after: LoadBlock,
-    wrenches: Mapping[str, Floats],
-    at: Pace,
-) -> list[int]:
+    before: LoadBlock, loaded: Sequence[LoadBlock], after: LoadBlock,
+    wrenches: Mapping[str, Floats], at: Pace,
+) -> list[int]:  # fmt: skip
     """Return the order of the loads whose wrenches are least correlated with their lags.
 
     With the middle t_l of the time of each load, t0 the mean time of the unloaded readings and n_l

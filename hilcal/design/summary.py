@@ -12,7 +12,7 @@ from hilcal.config import CellConfig
 from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
 from hilcal.design.information import DesignProblem, reading_derivatives
 from hilcal.design.planner import Planned, Say
-from hilcal.design.predicted import PredictedUncertainty, predicted
+from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
 from hilcal.errors import CannotAnswerError
@@ -300,12 +300,18 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
     sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(left), 0.0))
     alone = np.sqrt(np.maximum(np.linalg.eigvalsh(known[np.ix_(free, free)]), 0.0))
     readings = float(counts @ of.units.cost)
+    baseline = _prefixes(of, "baseline")
+    shares = [
+        std / abs(value)
+        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
+        if name.startswith(baseline) and value
+    ]
     volume = float(np.exp(np.mean(np.log(np.maximum(sigma, 1e-300)))))
     return CriterionResult(
         criterion=name,
         position_std_m=_finite(knows.position),
         position_open_m=_finite(knows.position_open),
-        joint_share=_joint_share(knows, _prefixes(of, "baseline")),
+        joint_share=_finite(max(shares)) if shares else None,
         o1=volume / np.sqrt(readings),
         o2=float(alone[0] / alone[-1]),
         o3=float(sigma[0]),
@@ -315,15 +321,6 @@ def _result(planned: Planned, name: str, counts: Floats, efficiency: float) -> C
 
 def _prefixes(of: DesignProblem, *roles: Role) -> tuple[str, ...]:
     return tuple(f"{e.name}." for e in of.nominal.model.effects if e.role in roles)
-
-
-def _joint_share(knows: PredictedUncertainty, joints: tuple[str, ...]) -> float | None:
-    shares = [
-        std / abs(value)
-        for name, std, value in zip(knows.names, knows.std, knows.values, strict=True)
-        if name.startswith(joints) and value
-    ]
-    return _finite(max(shares)) if shares else None
 
 
 def _curve(planned: Planned) -> Iterator[CurvePoint]:

@@ -9,7 +9,7 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from hilcal.types import Floats, Ints
+from hilcal.types import Floats
 
 NEVER = 1e7  # Seconds of a way that does not exist: more than any campaign, so that sums stay exact
 _EXACT = 7  # stops up to which every order is tried
@@ -191,13 +191,8 @@ def loops(
                 best[j + 1], cut[j + 1] = best[i] + whole + reading_s, i
     if not np.isfinite(best[count]):
         return None
-    return _parts(order, cut)
-
-
-def _parts(order: Sequence[int], cut: Ints) -> list[list[int]]:
-    out, j = [], len(order)
-    while j > 0:
-        i = int(cut[j])
-        out.append(list(order[i:j]))
-        j = i
+    out, j = [], count
+    while j > 0:  # follow the cuts from the end
+        out.append(list(order[int(cut[j]) : j]))
+        j = int(cut[j])
     return out[::-1]

@@ -313,7 +313,11 @@ class Amplitude:
         """Return the same law of another joint's own quantities; None where it has none."""
         return self._with(
             lambda v: v.joint == old and v.kind != "sum",
-            lambda v, w: w.kind == v.kind and w.joint == new and _alike(w, v),
+            lambda v, w: (
+                w.kind == v.kind
+                and w.joint == new
+                and (w.slot is None or v.slot is None or w.slot[1] == v.slot[1])
+            ),
             known,
         )
 
@@ -341,10 +345,6 @@ class Amplitude:
                 return None
             out.append(replace(f, variable=found))
         return Amplitude(tuple(out))
-
-
-def _alike(a: Variable, b: Variable) -> bool:
-    return a.slot is None or b.slot is None or a.slot[1] == b.slot[1]
 
 
 def unit_of(powers: dict[str, float]) -> str:

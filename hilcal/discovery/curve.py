@@ -58,7 +58,11 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
     groups: dict[tuple[Site, str, frozenset[tuple[object, ...]]], list[LawPart]] = {}
     for p in sure:
         for f in p.amplitude.factors:
-            others = frozenset(_key(p, f.variable.symbol))
+            others = frozenset(
+                (x.variable.symbol, x.shape.name, x.numbers)
+                for x in p.amplitude.factors
+                if x.variable.symbol != f.variable.symbol
+            )
             groups.setdefault((p.site, f.variable.symbol, others), []).append(p)
     if not groups:
         return ()
@@ -69,14 +73,6 @@ def curves(after: Fit, form: Form, most: int = MOST_CURVES) -> tuple[Curve, ...]
         own = motion[:, :, sites.index(site)] / ORDINARY[site.unit]
         out.append(_curve(after, situation, own, parts, symbol, theta))
     return tuple(out)
-
-
-def _key(p: LawPart, symbol: str) -> list[tuple[object, ...]]:
-    return [
-        (f.variable.symbol, f.shape.name, f.numbers)
-        for f in p.amplitude.factors
-        if f.variable.symbol != symbol
-    ]
 
 
 def _curve(
@@ -92,9 +88,7 @@ def _curve(
     order = orders.pop() if len(orders) == 1 else 0.0
     name = symbol
     if order > HARMONICS:
-        period = 2 * np.pi / order
-        x = np.mod(x + period / 2, period) - period / 2
-        name = f"{symbol} within a period of 2π/{order:g}"
+        x, name = _folded(x, order), f"{symbol} within a period of 2π/{order:g}"
 
     def law(at: Floats) -> Floats:
         told = [theta[p.coefficient] * f.shape.value(at, f.numbers) for p, f in own]
@@ -109,20 +103,15 @@ def _curve(
     std = std[kept] / size[kept]
     ends = np.linspace(float(x.min()), float(x.max()), LINE)
     inner = "·".join(f.shape.text(f.variable.symbol, [f"{n:g}" for n in f.numbers]) for f in others)
-    unit = site.unit
+    of, unit = site.symbol, site.unit
     if others:
+        of = f"{of}/({inner})" if "·" in inner else f"{of}/{inner}"
         divided = type(first.amplitude)(tuple(others)).unit()
         unit = unit if divided == "1" else f"{unit}/({divided})"
     return Curve(
-        site.words, _over(site.symbol, inner), unit, name, v.unit,
+        site.words, of, unit, name, v.unit,
         x, y, std, binned(x, y, std), np.vstack([ends, law(ends)]),
     )  # fmt: skip
-
-
-def _over(symbol: str, inner: str) -> str:
-    if not inner:
-        return symbol
-    return f"{symbol}/({inner})" if "·" in inner else f"{symbol}/{inner}"
 
 
 def said_by_readings(after: Fit, motion: Floats) -> tuple[Floats, Floats]:

@@ -187,14 +187,9 @@ def _silent(fit: Fit, found: Screen, say: Callable[[str], None], searched: float
 
 
 def _laws(
-    fit: Fit,
-    problem: SearchProblem,
-    selections: list[Selection],
-    folds: FoldSearch,
-    known: KnownEffects,
-    say: Callable[[str], None],
-    name: str,
-) -> Discovery:
+    fit: Fit, problem: SearchProblem, selections: list[Selection], folds: FoldSearch,
+    known: KnownEffects, say: Callable[[str], None], name: str,
+) -> Discovery:  # fmt: skip
     found = problem.screen
     before = left_out_by_pose(fit)
     rank = fit.whitening.rank
@@ -231,7 +226,10 @@ def _laws(
         silent = _silent(fit, found, say, folds.share)
         return replace(silent, reason="no_law", refused=tuple(refused))
     best = min(range(len(made)), key=lambda k: float(made[k][2].sum()))
-    kept = [k for k in range(len(made)) if _as_good(made[k][2], made[best][2])]
+    # those that predict poses left out as well, to within one standard error
+    more = [m[2] - made[best][2] for m in made]
+    root = np.sqrt(max(len(more[0]) - 1, 1))
+    kept = [k for k, x in enumerate(more) if float(x.mean()) <= float(np.std(x)) / root]
     say("asking what is predictable at all")
     attainable = residual_regression(found.linear).share
     laws = tuple(
@@ -248,23 +246,11 @@ def _laws(
     )  # fmt: skip
 
 
-def _as_good(left: Floats, best: Floats) -> bool:
-    """Whether poses left out are predicted as well, to within one standard error."""
-    more = left - best
-    return bool(float(more.mean()) <= float(np.std(more)) / np.sqrt(max(len(more) - 1, 1)))
-
-
 def _law(
-    problem: SearchProblem,
-    s: Selection,
-    form: Form,
-    name: str,
-    coefficients: tuple[Coefficient, ...],
-    share: float,
-    after: Fit,
-    folds: FoldSearch,
+    problem: SearchProblem, s: Selection, form: Form, name: str,
+    coefficients: tuple[Coefficient, ...], share: float, after: Fit, folds: FoldSearch,
     known: KnownEffects,
-) -> Law:
+) -> Law:  # fmt: skip
     linear = problem.screen.linear
     x = np.hstack([problem.columns(t) for t in s.terms])
     score = score_family(linear.information(x), x.T @ linear.residual, linear.rss, linear.fit.dof)

@@ -24,15 +24,6 @@ HARMONICS = 4  # Multiples of an angle; as in the diagnosis
 FINEST = 512  # highest multiple of an angle, at most one per pose; a choice, as of encoders
 
 
-def fine_waves(v: Variable, finest: int) -> list[Factor]:
-    """Return waves of an angle beyond `HARMONICS`; as complex as a product, so in none."""
-    return [
-        Factor(v, f, (float(k),))
-        for k in range(HARMONICS + 1, finest + 1)
-        for f in (shapes.FINE_COS, shapes.FINE_SIN)
-    ]
-
-
 def functions(v: Variable, x: Floats, most: int) -> list[Factor]:
     """Return the functions of a quantity x (N,); those of complexity `most` are in no product."""
     linear = Factor(v, shapes.LINEAR)
@@ -94,21 +85,21 @@ def _wrench(v: Variable, x: Floats) -> list[Factor]:
 
 def _read_by_sensor(v: Variable, x: Floats) -> list[Factor]:
     """Curvature, and a sensor that is another one for pull and push."""
-    near = _round(0.01 * _middle(x))
     if not x.min() < 0 < x.max():
-        return [Factor(v, shapes.EVEN, (2.0, near))]
-    return [Factor(v, shapes.PLUS), *(Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0))]
+        return _even(v, x, 2.0)
+    return [Factor(v, shapes.PLUS), *_even(v, x, 1.0, 2.0)]
 
 
 def _gravity(v: Variable, x: Floats) -> list[Factor]:
-    near = _round(0.01 * _middle(x))
-    side = Factor(v, shapes.SATURATION, (_round(0.05 * _middle(x)),))
-    return [side, *(Factor(v, shapes.EVEN, (p, near)) for p in (1.0, 2.0))]
+    return [Factor(v, shapes.SATURATION, (_round(0.05 * _middle(x)),)), *_even(v, x, 1.0, 2.0)]
 
 
 def _temperature(v: Variable, x: Floats) -> list[Factor]:
-    near = _round(0.01 * _middle(x))
-    return [*(Factor(v, shapes.EVEN, (p, near)) for p in (2.0, 1.0)), Factor(v, shapes.PLUS)]
+    return [*_even(v, x, 2.0, 1.0), Factor(v, shapes.PLUS)]
+
+
+def _even(v: Variable, x: Floats, *powers: float) -> list[Factor]:
+    return [Factor(v, shapes.EVEN, (p, _round(0.01 * _middle(x)))) for p in powers]
 
 
 def _grown(v: Variable, x: Floats) -> list[Factor]:
@@ -228,8 +219,7 @@ class Grammar:
 
     @cached_property
     def _grid(self) -> frozenset[tuple[str, str, Numbers]]:
-        alone = (a for a in self.amplitudes if len(a.factors) == 1)
-        return frozenset(k for a in alone for k in _key(a))
+        return frozenset(k for a in self.amplitudes if len(a.factors) == 1 for k in _key(a))
 
     def inner(self, k: int) -> list[int]:
         """Return the amplitudes with one factor less."""
@@ -312,7 +302,13 @@ def _key(a: Amplitude) -> frozenset[tuple[str, str, Numbers]]:
 def grammar(known: list[Variable], s: Situation, poses: int = 0) -> Grammar:
     """Return all products of functions of the quantities; poses limit the multiples of an angle."""
     singles = [f for v in known for f in functions(v, v.read(s), MOST)]
-    singles += [f for v in known if v.kind == "angle" for f in fine_waves(v, min(poses, FINEST))]
+    singles += [  # fine waves, as complex as a product, so in none
+        Factor(v, f, (float(k),))
+        for v in known
+        if v.kind == "angle"
+        for k in range(HARMONICS + 1, min(poses, FINEST) + 1)
+        for f in (shapes.FINE_COS, shapes.FINE_SIN)
+    ]
     value = np.array([f.values(s) for f in singles]).reshape(len(singles), -1)
     cost = np.array([f.cost for f in singles])
     flat = np.std(value, axis=1) < FLAT * np.sqrt(np.mean(value**2, axis=1))

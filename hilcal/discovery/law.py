@@ -36,15 +36,12 @@ def expressions(law: "Law") -> dict[str, str]:
     for p in law.form.parts:
         value = law.parameters[p.coefficient].value
         terms.setdefault(p.site.symbol, []).append(f"{value!r}*({p.amplitude.code()})")
-    plain = {symbol: _plain(" + ".join(own)) for symbol, own in terms.items()}
+    plain = {}
+    for symbol, own in terms.items():
+        text = " + ".join(own).replace("np.ones(len(s.angle))", "1.0").replace("np.maximum", "max")
+        text = _FORCE.sub("force", _JOINT.sub(_joints, text))
+        plain[symbol] = _RECORDED.sub(lambda m: m[1] or "", text)
     return {symbol: text for symbol, text in plain.items() if not _OTHER.search(text)}
-
-
-def _plain(code: str) -> str:
-    """Return the code of an effect with its quantities by name; what has none stays."""
-    text = code.replace("np.ones(len(s.angle))", "1.0").replace("np.maximum", "max")
-    text = _JOINT.sub(_joints, text)
-    return _RECORDED.sub(lambda m: m[1] or "", _FORCE.sub("force", text))
 
 
 def _joints(m: re.Match[str]) -> str:
@@ -384,7 +381,8 @@ def effect_class(source: str, name: str) -> type[Effect]:
 
 
 def _parameters(form: Form, found: tuple[Coefficient, ...]) -> Iterator[str]:
-    scales = {c.name: _one_digit(abs(c.value)) for c in found}
+    size = {c.name: abs(c.value) for c in found}
+    scales = {k: float(f"{x:.0e}") for k, x in size.items() if x > 0 and np.isfinite(x)}
     for k, letter in enumerate(LETTERS[: form.count]):
         where = ", ".join(dict.fromkeys(p.site.words for p in form.parts if p.coefficient == k))
         scale = scales.get(letter, USUAL)
@@ -425,7 +423,3 @@ def _responses(form: Form) -> Iterator[str]:
                 to = f"twist[:, :, {p.site.element}, {p.site.axis}]"
             yield f"        slope = theta[{p.coefficient}] * {slope}"
             yield f"        {to} += slope[:, None] * change[:, :, {slot}, {component}]"
-
-
-def _one_digit(x: float) -> float:
-    return float(f"{x:.0e}") if x > 0 and np.isfinite(x) else USUAL

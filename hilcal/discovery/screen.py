@@ -198,13 +198,9 @@ def screen(linear: Linearisation) -> Screen:
 
 
 def screened(
-    linear: Linearisation,
-    words: Grammar,
-    places: tuple[Site, ...],
-    motion: Floats,
-    rows: Bools,
+    linear: Linearisation, words: Grammar, places: tuple[Site, ...], motion: Floats, rows: Bools,
     readings: Ints,
-) -> Screen:
+) -> Screen:  # fmt: skip
     """Return all candidates of some amplitudes and sites, as `Screen` has them."""
     w = linear.fit.whitening
     own = projection(linear.rows[rows], linear.projection.ridge)

@@ -109,19 +109,17 @@ def _simplicity(screen: Screen, t: LawTerm) -> tuple[float, ...]:
     sites = max(screen.sites[s].rank for s, _ in t.parts)
     functions = max(sum(f.shape.rank for f in a.factors) for a in amplitudes)
     far = [
-        [(_far(f.variable.joint, screen.sites[s].joint), f.variable.kind) for f in a.factors]
+        [
+            # of the site's own joint, of none, or of another one
+            (0 if f.variable.joint == screen.sites[s].joint else 1 + (f.variable.joint >= 0),
+             f.variable.kind)
+            for f in a.factors
+        ]
         for a, (s, _) in zip(amplitudes, t.parts, strict=True)
-    ]
+    ]  # fmt: skip
     apart = max(sum(distance for distance, _ in each) for each in far)
     cost += any((2, "temperature") in each for each in far)
     return t.count + cost, sites, apart, functions
-
-
-def _far(quantity: int, site: int) -> int:
-    """Whether a quantity is that of the site's own joint (0), of none (1), or of another (2)."""
-    if quantity == site:
-        return 0
-    return 1 if quantity < 0 else 2
 
 
 def _keep(problem: SearchProblem, best: dict[int, Selection], s: Selection) -> None:

@@ -99,14 +99,9 @@ def sites(n: int) -> tuple[Site, ...]:
 
 
 def _twists(
-    element: int,
-    group: str,
-    symbol: str,
-    latex: str,
-    axes: tuple[int, ...],
-    joint: int = -1,
+    element: int, group: str, symbol: str, latex: str, axes: tuple[int, ...], joint: int = -1,
     field: Field = "twist",
-) -> list[Site]:
+) -> list[Site]:  # fmt: skip
     out = []
     for c in axes:
         axis, way = _AXES[c % 3], "along" if c < 3 else "about"

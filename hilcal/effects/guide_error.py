@@ -9,7 +9,6 @@ from hilcal.cell import Cell
 from hilcal.effects.protocol import Columns, Effect, Parameter, Situation
 from hilcal.errors import InputError
 from hilcal.readings.readings import States
-from hilcal.types import Floats
 
 KINDS = ("x", "y", "z", "rx", "ry", "rz")
 USUAL_ORDERS, MOST_ORDERS = 4, 12
@@ -76,14 +75,11 @@ class GuideError(Effect):
         values = np.zeros((len(travel), len(element), 6))
         for n, j in enumerate(np.flatnonzero(arm.slides).tolist()):
             # The limits are those of the controller's value; a coupling leaves the base as it is.
-            waves = legvander(self._share(s.values[:, j], j), self.orders)
+            low, high = arm.q_min[j], arm.q_max[j]
+            waves = legvander((2 * s.values[:, j] - low - high) / (high - low), self.orders)
             for p, (kind, k) in enumerate(self._terms, start=n * count):
                 values[:, p, KINDS.index(kind)] = waves[:, k]
             mine = values[:, n * count : (n + 1) * count]
             mine[..., 0] -= mine[..., 4] * travel[:, None, j]
             mine[..., 1] += mine[..., 3] * travel[:, None, j]
         return (Columns("twist", np.arange(len(element)), element, values),)
-
-    def _share(self, q: Floats, j: int) -> Floats:
-        low, high = self.cell.arm.q_min[j], self.cell.arm.q_max[j]
-        return np.asarray((2 * q - low - high) / (high - low))

@@ -96,14 +96,9 @@ def _label(group: list[int]) -> str:
 
 
 def joint_change(
-    words: str,
-    cause: str,
-    *,
-    listed: bool = False,
-    by_frame: bool = False,
-    with_others: bool = False,
-    **options: object,
-) -> Changeable:
+    words: str, cause: str, *, listed: bool = False, by_frame: bool = False,
+    with_others: bool = False, **options: object,
+) -> Changeable:  # fmt: skip
     """Return how the parameters of a joint may change, each by itself; see `Changeable`."""
     return Changeable(
         "joint", words=words, cause=cause, listed=listed, by_frame=by_frame,

@@ -99,14 +99,13 @@ def _options(text: str, where: str) -> dict[str, object]:
             raise InputError(f"{where}: {part!r} is not an option with a value; {EXAMPLE}")
         if key in out:
             raise InputError(f"{where}: option {key} is there twice")
-        out[key] = _value(value, f"{where}: {key}")
+        here = f"{where}: {key}"
+        if value.startswith("[") and value.endswith("]"):
+            each = _split(value[1:-1], ",;", here, f"valid: {_VALUES}")
+            out[key] = [_single(v, here) for v in each]
+        else:
+            out[key] = _single(value, here)
     return out
-
-
-def _value(text: str, where: str) -> object:
-    if text.startswith("[") and text.endswith("]"):
-        return [_single(v, where) for v in _split(text[1:-1], ",;", where, f"valid: {_VALUES}")]
-    return _single(text, where)
 
 
 def _single(text: str, where: str) -> object:

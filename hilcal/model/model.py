@@ -207,14 +207,9 @@ class Model(Brief):
         return self.jacobian_of(self.effects, prediction, theta, m, live)
 
     def jacobian_of(
-        self,
-        effects: tuple[Effect, ...],
-        prediction: Prediction,
-        theta: Floats,
-        m: int,
-        live: Ints | None = None,
-        scale: Floats | None = None,
-    ) -> Floats:
+        self, effects: tuple[Effect, ...], prediction: Prediction, theta: Floats, m: int,
+        live: Ints | None = None, scale: Floats | None = None,
+    ) -> Floats:  # fmt: skip
         """Derivative (N, m, P) of the readings by the parameters of `effects`.
 
         `effects` may or may not be in the model; one that is not is taken at zero. Analytic:
@@ -238,14 +233,9 @@ class Model(Brief):
         return out
 
     def _fill(
-        self,
-        out: Floats,
-        effects: tuple[Effect, ...],
-        places: list[Ints],
-        prediction: Prediction,
-        theta: Floats,
-        scale: Floats | None,
-    ) -> None:
+        self, out: Floats, effects: tuple[Effect, ...], places: list[Ints],
+        prediction: Prediction, theta: Floats, scale: Floats | None,
+    ) -> None:  # fmt: skip
         """Write the derivative of a chunk of states; `places`: columns of `out`, −1 for none."""
         s = prediction.situation
         moves, blocks = self._motion(prediction, theta, out.shape[1])

@@ -77,14 +77,9 @@ def observe(
 
 
 def _observed(
-    cell: Cell,
-    deviation: Deviation,
-    observer: Ints,
-    sensor: Floats,
-    rotation: Floats,
-    base_position: Floats,
-    axes: Floats,
-) -> Observation:
+    cell: Cell, deviation: Deviation, observer: Ints, sensor: Floats, rotation: Floats,
+    base_position: Floats, axes: Floats,
+) -> Observation:  # fmt: skip
     """Read what is seen in sensor axes by the observers (N,)."""
     turn, own, offset = _in_own_axes(cell.observers, observer, sensor)
     if deviation.observer is not None:

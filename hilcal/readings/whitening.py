@@ -220,15 +220,12 @@ class Bucket:
         """(G·L, ...) loaded minus the mean of the unloaded of x (N, ...)."""
         loaded = x[self.loaded]
         if self.reference.shape[1]:
-            loaded -= self._reference_mean(x)
+            unloaded = x[self.reference]
+            if np.all(self.weights == self.weights[:1]):  # all from the same ones
+                loaded -= unloaded.mean(axis=1)[:, None]
+            else:
+                loaded -= np.einsum("lu,gu...->gl...", self.weights, unloaded)
         return loaded.reshape(self.loaded.size, *x.shape[1:])
-
-    def _reference_mean(self, x: Floats) -> Floats:
-        """(G, L or 1, ...) means of the unloaded of x (N, ...)."""
-        unloaded = x[self.reference]
-        if np.all(self.weights == self.weights[:1]):  # all from the same ones
-            return np.asarray(unloaded.mean(axis=1)[:, None])
-        return np.asarray(np.einsum("lu,gu...->gl...", self.weights, unloaded))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,7 +248,8 @@ class Whitening:
     def raw(self, x: Floats) -> Floats:
         """Measurements (D, m, ...) from values at the readings (N, m, ...)."""
         if self.mode == "absolute":
-            return x if _each_alone(self.buckets) else x[self.reading]
+            alone = len(self.buckets) == 1 and self.buckets[0].loaded.shape[1] == 1
+            return x if alone else x[self.reading]  # in their own order where none share an error
         return np.concatenate([b.difference(x) for b in self.buckets])
 
     def whiten(self, raw: Floats, overwrite: bool = False) -> Floats:
@@ -338,11 +336,6 @@ def relative_rotation(r: Floats, w: Whitening) -> Floats:
             turn[:, mine] = se3.rotation_vector(r[b.loaded[:, mine]] @ np.swapaxes(mean, -1, -2))
         out.append(turn.reshape(-1, 3))
     return np.concatenate(out)
-
-
-def _each_alone(buckets: tuple[Bucket, ...]) -> bool:
-    """Whether no absolute readings share an error, so that they are in their own order."""
-    return len(buckets) == 1 and buckets[0].loaded.shape[1] == 1
 
 
 def covariance_blocks(readings: Readings, w: Whitening) -> list[Floats]:

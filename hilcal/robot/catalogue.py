@@ -1,7 +1,7 @@
 """The arms that come with the program, and the way to load any other."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Literal
@@ -15,7 +15,6 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm, missing
 from hilcal.robot.conventions import as_counted
 from hilcal.toml import NonNegative, Number, Positive, Section, Vector3, load_section, suggest
-from hilcal.types import Floats
 
 _LENGTH = "a finite number in m"
 _ANGLE = "a finite number in degrees"
@@ -117,7 +116,9 @@ def arm_from_dh(path: Path) -> Arm:
         fixed, after = shifts, [*turns[1:], np.eye(4)]
     else:
         fixed, after = [a @ b for a, b in zip(shifts, turns, strict=True)], [np.eye(4)] * len(rows)
-    links = _links([a @ b for a, b in zip(fixed, after, strict=True)], offsets)
+    spins = [*(se3.screw(2, offset) for offset in offsets), np.eye(4)]
+    parts = zip(fixed, after, spins[1:], strict=True)
+    links = np.array([spins[0], *(a @ b @ spin for a, b, spin in parts)])
     if table.convention == "modified":
         links[0] = turns[0] @ links[0]
     if table.base_m_rad is not None:
@@ -151,12 +152,6 @@ def arm_from_dh(path: Path) -> Arm:
         return as_counted(arm, table)
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from None
-
-
-def _links(fixed: Sequence[Floats], offsets: Sequence[float]) -> Floats:
-    """(n + 1, 4, 4) transforms L_k from the fixed parts of the rows and the joint offsets."""
-    turns = [se3.screw(2, offset) for offset in offsets] + [np.eye(4)]
-    return np.array([turns[0], *(part @ turn for part, turn in zip(fixed, turns[1:], strict=True))])
 
 
 OTHER_ARMS = "the path of a .urdf file, or of a .toml file with DH rows"

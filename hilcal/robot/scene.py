@@ -77,7 +77,9 @@ class Scene:
         self._arm, self._model = arm, pinocchio_model(arm)
         self._data = self._model.createData()
         self._things = [(thing.name, *_obstacle(thing)) for thing in obstacles]
-        far = np.array([_farthest(arm, part) for part in self.parts])
+        joints = range(1, arm.n + 1)  # bounds on how far parts are from their axes
+        ends = [(part.body, np.array([part.start, part.end])) for part in self.parts]
+        far = np.array([[from_axis(arm, body, end, i) for i in joints] for body, end in ends])
         bodies = np.array([part.body for part in self.parts])
         self.rates = np.where(np.arange(1, arm.n + 1) <= bodies[:, None], far, 0.0)
         count = len(self.parts)
@@ -160,15 +162,9 @@ class Pairs:
     """Pairs of shapes that are checked together; `rates` (K, n): how fast they near, m/rad."""
 
     def __init__(
-        self,
-        arm: Arm,
-        model: Any,
-        data: Any,
-        geometry: Any,
-        names: tuple[str, ...],
-        pairs: tuple[tuple[int, int], ...],
-        rates: Floats,
-    ) -> None:
+        self, arm: Arm, model: Any, data: Any, geometry: Any, names: tuple[str, ...],
+        pairs: tuple[tuple[int, int], ...], rates: Floats,
+    ) -> None:  # fmt: skip
         """Take shapes and pairs from `Scene`, which makes these."""
         self.rates = rates
         self._arm, self._model, self._data, self._geometry = arm, model, data, geometry
@@ -278,12 +274,6 @@ def on_flange(arm: Arm, point: Floats) -> Floats:
     """Return (3,) a point in flange axes in the frame of the last body, m."""
     flange = arm.links[arm.n]
     return np.asarray(flange[:3, :3] @ point + flange[:3, 3])
-
-
-def _farthest(arm: Arm, part: Capsule) -> Floats:
-    """(n,) bound on how far a part's segment is from each axis, m."""
-    ends = np.array([part.start, part.end])
-    return np.array([from_axis(arm, part.body, ends, i) for i in range(1, arm.n + 1)])
 
 
 def _along(arm: Arm, body: int, points: Floats, last: int) -> float:

@@ -62,7 +62,10 @@ def _arm(model: pin.Model, base: pin.SE3, tip: pin.SE3, path: Path) -> Arm:
     joints = range(1, model.njoints)
     axes = _axes(model)
     slides = np.array([bool(np.any(axis[:3])) for axis in axes])
-    turns = [_z_to(axis[:3] if s else axis[3:]) for axis, s in zip(axes, slides, strict=True)]
+    turns = np.tile(np.eye(4), (len(axes), 1, 1))  # the smallest that take z to the axes
+    for turn, axis, s in zip(turns, axes, slides, strict=True):
+        to = axis[:3] if s else axis[3:]
+        turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), to).matrix()
     coms = [
         turn[:3, :3].T @ model.inertias[joint].lever
         for turn, joint in zip(turns, joints, strict=True)
@@ -117,13 +120,6 @@ def _axes(model: pin.Model) -> list[Floats]:
         pin.getJointJacobian(model, data, joint, frame).reshape(6, -1)[:, model.joints[joint].idx_v]
         for joint in range(1, model.njoints)
     ]
-
-
-def _z_to(axis: Floats) -> Floats:
-    """(4, 4) the smallest rotation that takes z to a unit axis."""
-    turn = np.eye(4)
-    turn[:3, :3] = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), axis).matrix()
-    return turn
 
 
 def _chain(model: pin.Model, base: str, tip: str, path: Path) -> list[int]:
