@@ -13,7 +13,7 @@ from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.residual_regression import residual_regression
 from hilcal.discovery.discovery import Discovery, discover
-from hilcal.discovery.write_effect import effect_class
+from hilcal.discovery.law import effect_class
 from hilcal.engine.engine import open_engine
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit

@@ -17,7 +17,7 @@ from plotly.subplots import make_subplots
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.effects.catalogue import installed
-from hilcal.effects.example import ROBOT, example_cell
+from hilcal.effects.check import ROBOT, example_cell
 from hilcal.effects.protocol import Effect, Parameter
 from hilcal.model.model import Model
 from hilcal.numbers import unit_for

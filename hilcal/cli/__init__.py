@@ -220,7 +220,7 @@ def _run(
             return failures.tell(error, words, _USAGE)
         if words := lacking(error):
             return failures.tell(error, words, _USAGE)
-        from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
+        from hilcal.effects.from_file import failure_of  # loads numpy, which takes a while
 
         if failed := failure_of(error):
             return failures.tell(error, str(failed), failed.exit_code)

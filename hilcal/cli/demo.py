@@ -36,9 +36,7 @@ from hilcal.diagnosis.doubt import in_doubt as left_open
 from hilcal.diagnosis.effect_ranking import candidates, rank_suspects
 from hilcal.diagnosis.evidence import Evidence
 from hilcal.diagnosis.verdict import diagnose, judge
-from hilcal.discovery.discovery import agreement
-from hilcal.discovery.document import laws_json
-from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.discovery import LawSearch, agreement, laws_json
 from hilcal.discovery.search import SAME
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE, RESEMBLING
 from hilcal.drivers.simulated.rehearsal import (

@@ -18,8 +18,7 @@ from hilcal.cli.options import (
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.discovery.discovery import discover as search
-from hilcal.discovery.discovery import rival_sources
-from hilcal.discovery.document import discovery_json
+from hilcal.discovery.discovery import discovery_json, rival_sources
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.check import NAME
 from hilcal.effects.protocol import FRAME_ROLES

@@ -29,8 +29,7 @@ from hilcal.drivers.netft import NetFtOptions as NetFtOptions
 from hilcal.drivers.ur_link.services import UrOptions
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
-from hilcal.effects.check import NAME
-from hilcal.effects.example import ROBOT, example_cell, example_states
+from hilcal.effects.check import NAME, ROBOT, example_cell, example_states
 from hilcal.effects.protocol import Effect
 from hilcal.effects.written import option_defaults, written
 from hilcal.errors import InputError

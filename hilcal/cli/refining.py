@@ -42,8 +42,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.document import suspect_json, to_json
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
-from hilcal.discovery.document import laws_json
-from hilcal.discovery.proposal import LawSearch
+from hilcal.discovery.discovery import LawSearch, laws_json
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect

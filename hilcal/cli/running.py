@@ -26,7 +26,7 @@ from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, handled, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
-from hilcal.design.goal_rule import GoalRule
+from hilcal.design.goal import GoalRule
 from hilcal.diagnosis.live_model import LiveModel
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import (

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from hilcal.diagnosis.change_candidates import Candidate
-from hilcal.effects.changed import Changeable
+from hilcal.effects.protocol import Changeable
 from hilcal.identification.earlier_fit import EarlierFit
 from hilcal.identification.later_readings import Remeasured
 

@@ -35,9 +35,8 @@ from hilcal.identification.priors import scales_of
 from hilcal.identification.reading_model import ReadingModel
 from hilcal.model.model import Model, Prediction
 from hilcal.model.observe import motion
-from hilcal.readings.reading_groups import deflection_groups
 from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode, inverse_root
+from hilcal.readings.whitening import Mode, deflection_groups, inverse_root
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats, Ints
 

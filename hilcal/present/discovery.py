@@ -7,9 +7,8 @@ import numpy as np
 from hilcal import numbers
 from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.discovery.curve import Curve
-from hilcal.discovery.discovery import Discovery
+from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
-from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.structures import Structure, pareto
 from hilcal.present.diagnosis import binned_table, curves
 from hilcal.present.document import Block, Words, heading, table

@@ -15,7 +15,7 @@ from hilcal.diagnosis.added_variable import added_variable
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.residual_regression import Dependence
-from hilcal.discovery.drawn_law import drawn_laws
+from hilcal.discovery.curve import drawn_laws
 from hilcal.discovery.law import Coefficient
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit, all_left_out, mahalanobis2

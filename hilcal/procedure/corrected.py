@@ -14,8 +14,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import REASONS, Space
-from hilcal.design.run_order import Chosen, Ordering, order_plan
-from hilcal.design.timing import pace
+from hilcal.design.run_order import Chosen, Ordering, order_plan, pace
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.measuring.route import approach_sides, duration, route

@@ -10,8 +10,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import Space, draw
-from hilcal.design.run_order import Chosen, Ordering, order_plan
-from hilcal.design.timing import pace, timeline
+from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.dry_run import dry_run
 from hilcal.present.progress import Say

@@ -10,7 +10,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.campaign.campaign import Campaign
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.effects.failure import failure_of
+from hilcal.effects.from_file import failure_of
 from hilcal.errors import HilcalError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit

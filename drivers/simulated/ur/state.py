@@ -13,7 +13,7 @@ import pinocchio as pin
 
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.robot.arm import Arm
-from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
+from hilcal.robot.scene import FLANGE, pinocchio_model
 from hilcal.types import Floats
 
 REGISTERS = 48

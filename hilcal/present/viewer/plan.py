@@ -13,8 +13,8 @@ from hilcal import numbers
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, Obstacle
 from hilcal.design.next import PairPower
+from hilcal.design.run_order import pace, timeline
 from hilcal.design.summary import PlanSummary
-from hilcal.design.timing import pace, timeline
 from hilcal.errors import InputError
 from hilcal.measuring.clearance import TRACKER_UNKNOWN as NO_TRACKER
 from hilcal.measuring.clearance import Clearance, LineOfSight, clearance_of, sight_of

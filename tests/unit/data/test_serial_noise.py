@@ -7,10 +7,9 @@ import pytest
 
 from hilcal.readings import whitening as scaling_module
 from hilcal.readings.covariance import symmetric_root
-from hilcal.readings.reading_groups import has_unloaded
 from hilcal.readings.readings import Readings
 from hilcal.readings.serial_noise import SerialNoise
-from hilcal.readings.whitening import MODES, Mode, whitening
+from hilcal.readings.whitening import MODES, Mode, has_unloaded, whitening
 from hilcal.types import Floats
 from tests.unit.data.test_whitening import make_readings, random_readings, spd
 

@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor
-from hilcal.discovery.drawn_law import drawn_laws
-from hilcal.discovery.law import Form, LawPart
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
+from hilcal.discovery.curve import drawn_laws
+from hilcal.discovery.law import Form, LawPart, source_of_form
 from hilcal.discovery.sites import sites
-from hilcal.discovery.variables import variables
-from hilcal.discovery.write_effect import source_of_form
 from hilcal.effects.catalogue import installed
-from hilcal.effects.example import example_cell, example_situation, example_states
+from hilcal.effects.check import example_cell, example_situation, example_states
 from hilcal.effects.from_file import effects_of
 from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from hilcal.design.run_order import Confounding, Duration
 from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
@@ -15,7 +16,6 @@ from hilcal.design.summary import (
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.design.timing import Confounding, Duration
 from hilcal.present.plan import certified, enough, order_remark, plan_report
 from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm

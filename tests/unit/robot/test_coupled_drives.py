@@ -17,8 +17,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.body import body_poses, capsules, is_known
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
-from hilcal.robot.pinocchio_model import pinocchio_model
-from hilcal.robot.scene import Scene
+from hilcal.robot.scene import Scene, pinocchio_model
 from tests.support.campaigns import true_parameters
 from tests.support.effect_cases import make, numeric_jacobian, some_states
 

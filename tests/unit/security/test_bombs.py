@@ -25,7 +25,7 @@ from hilcal.cli import main
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
 from hilcal.readings.covariance import INSTRUMENT
-from hilcal.readings.reading_groups import deflection_groups
+from hilcal.readings.whitening import deflection_groups
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.tables import parquet_stream

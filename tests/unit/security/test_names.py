@@ -47,7 +47,7 @@ from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
 from hilcal.config.template import cell_text
-from hilcal.discovery.write_effect import source_of_form
+from hilcal.discovery.law import source_of_form
 from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
 from hilcal.identification import posterior_document
