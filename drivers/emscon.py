@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
-from hilcal.drivers.network import network_failures, own_axes
+from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
@@ -92,11 +92,7 @@ class EmsconConnection:
         self._socket.close()
 
     def ask(self, command: int, parameters: bytes = b"", *, until: float) -> tuple[int, bytes]:
-        """Send a command; return its status and what it returns. Waits while the server is busy.
-
-        Raises:
-            DeviceError: no answer in time, or the connection failed; it is closed then.
-        """
+        """Send a command; return its status and what it returns. Waits while the server is busy."""
         while True:
             body = struct.pack("<I", command) + parameters
             self._send(es.HEADER.pack(es.HEADER.size + len(body), es.COMMAND) + body)
@@ -214,12 +210,7 @@ class EmsconTracker:
         options: EmsconOptions,
         clock: Clock,
     ) -> None:
-        """Connect and set units, axes and mode; nothing turns.
-
-        Raises:
-            DeviceError: nobody answers, or the tracker cannot be used.
-            InputError: the reflector is not in its list.
-        """
+        """Connect and set units, axes and mode; nothing turns."""
         self._connect, self._config, self._options, self._clock = connect, config, options, clock
         self._reflector: tuple[int, str] | None = None
         self._remarks: list[str] = []
@@ -493,12 +484,7 @@ def _positive(covariance: Floats) -> bool:
 
 
 def open_tracker(config: CellConfig) -> EmsconTracker:
-    """Connect to the tracker that [tracker] names; nothing turns.
-
-    Raises:
-        InputError: [tracker] lacks the host, has another frame, or an unknown option.
-        DeviceError: nobody answers there.
-    """
+    """Connect to the tracker that [tracker] names; nothing turns."""
     tracker = config.tracker
     host, port = own_axes(tracker, "emscon", es.PORT)
     options = check_section(tracker.options, EmsconOptions, "[tracker] options")

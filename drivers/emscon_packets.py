@@ -122,11 +122,7 @@ _PROBE = struct.Struct("<IiIiiiIii41d")
 
 
 def measurement(kind: int, body: bytes) -> Measurement:
-    """Return what a result of type `SINGLE`, `SINGLE2` or `PROBE` says, without its status.
-
-    Raises:
-        struct.error: another length than that of its type.
-    """
+    """Return what a result of type `SINGLE`, `SINGLE2` or `PROBE` says, without its status."""
     none = np.zeros((3, 3))
     if kind == PROBE:
         d = np.array(_PROBE.unpack(body)[9:])

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.config import CellConfig
 from hilcal.config.rig import Whole
 from hilcal.drivers import natnet_frames as nn
-from hilcal.drivers.network import network_failures, own_axes
+from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
 from hilcal.toml import Section, check_section
@@ -62,12 +62,7 @@ class NatNetTracker:
     """A rigid body as a `hilcal.measuring.devices.TrackerDevice`; m = 6, or 3."""
 
     def __init__(self, host: str, port: int, options: NatNetOptions) -> None:
-        """Connect, agree on a version, find the rigid body.
-
-        Raises:
-            DeviceError: nobody answers, or in no known version.
-            InputError: there is no such rigid body.
-        """
+        """Connect, agree on a version, find the rigid body."""
         self._options, self._to = options, (host, port)
         self.where = f"{host}:{port}"
         self._data: socket.socket | None = None
@@ -284,12 +279,7 @@ def _drain(line: socket.socket) -> None:
 
 
 def open_tracker(config: CellConfig) -> NatNetTracker:
-    """Connect to the server that [tracker] names.
-
-    Raises:
-        InputError: [tracker] lacks the host, has another frame, or an unknown option.
-        DeviceError: nobody answers there.
-    """
+    """Connect to the server that [tracker] names."""
     tracker = config.tracker
     host, port = own_axes(tracker, "natnet", nn.PORT)
     options = check_section(tracker.options, NatNetOptions, "[tracker] options")

@@ -129,11 +129,7 @@ _COUNT = struct.Struct("<I")
 
 
 def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
-    """Return a frame's number and its rigid bodies.
-
-    Raises:
-        struct.error: it is cut short, or of another version.
-    """
+    """Return a frame's number and its rigid bodies."""
     r = Reader(content, version)
     number = r.count()
     sets, end = r.listed()
@@ -154,11 +150,7 @@ def frame(content: bytes, version: Version) -> tuple[int, list[Body]]:
 
 
 def names(content: bytes, version: Version) -> dict[int, str]:
-    """Return the names of the rigid bodies by their streaming IDs, from the descriptions.
-
-    Raises:
-        struct.error: they are cut short, or of another version.
-    """
+    """Return the names of the rigid bodies by their streaming IDs, from the descriptions."""
     r = Reader(content, version)
     found: dict[int, str] = {}
     for _ in range(r.count()):

@@ -18,16 +18,19 @@ import numpy as np
 
 from hilcal.config import CellConfig
 from hilcal.drivers.ur_link import probe, states
-from hilcal.drivers.ur_link.brakes import (
+from hilcal.drivers.ur_link.control import (
     UNWATCHED,
     Brakes,
+    Control,
+    MotionInProgress,
     cause_of,
+    deceleration,
     not_commanded,
     program_ended,
+    stands,
+    take,
 )
-from hilcal.drivers.ur_link.control import Control, take
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.motion import MotionInProgress, deceleration, stands
 from hilcal.drivers.ur_link.reading import (
     OPTIONAL,
     OUTPUTS,
@@ -36,11 +39,16 @@ from hilcal.drivers.ur_link.reading import (
     N,
     Reading,
     Receiver,
+    survey,
 )
-from hilcal.drivers.ur_link.services import UrOptions
 from hilcal.drivers.ur_link.states import CHECK_LINK, CONTROL, HOLD_ON, failure
-from hilcal.drivers.ur_link.supervision import PRIMARY_PORT, Generation, generation, why_silent
-from hilcal.drivers.ur_link.survey import survey
+from hilcal.drivers.ur_link.supervision import (
+    PRIMARY_PORT,
+    Generation,
+    UrOptions,
+    generation,
+    why_silent,
+)
 from hilcal.drivers.ur_link.torque_reader import TORQUE, TorqueReader
 from hilcal.drivers.ur_link.worker import WorkerError
 from hilcal.errors import InputError
@@ -355,12 +363,7 @@ def _lacking(python: tuple[int, ...]) -> str:
 
 
 def open_arm(config: CellConfig) -> UrArm:
-    """Connect to the controller of [robot] host; moves nothing and uploads nothing.
-
-    Raises:
-        InputError: [robot] host is missing, [robot.options] is wrong, or ur-rtde not installed.
-        DeviceError: no controller answers there.
-    """
+    """Connect to the controller of [robot] host; moves nothing and uploads nothing."""
     host = config.robot.host
     if host is None:
         raise InputError(

@@ -20,11 +20,7 @@ Handler = Callable[[str, dict[str, Any]], Any]
 
 
 def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
-    """Send one request to the simulated device behind `path` and return its answer.
-
-    Raises:
-        DeviceError: nobody answers, or the device refuses the request.
-    """
+    """Send one request to the simulated device behind `path` and return its answer."""
     try:
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as line:
             line.settimeout(timeout)
@@ -93,11 +89,7 @@ class Operations:
             self.functions["state"] = state
 
     def __call__(self, op: str, arguments: dict[str, Any]) -> Any:
-        """Carry out an operation.
-
-        Raises:
-            ValueError: an unknown one; lists the valid ones.
-        """
+        """Carry out an operation."""
         if op not in self.functions:
             raise ValueError(f"unknown op {op!r}; valid: {', '.join(self.functions)}")
         result = self.functions[op](**arguments)

@@ -72,11 +72,7 @@ class DeviceProcess:
         return self._process is not None and not self.socket.exists()
 
     def check(self) -> None:
-        """Raise where it has ended.
-
-        Raises:
-            DeviceError: with the last line that it said.
-        """
+        """Raise where it has ended."""
         if self._process is None or not self.ended:
             return
         words = self.log.read_text(encoding="utf-8", errors="replace").split("\n")
@@ -180,10 +176,6 @@ class SimulatedCell:
             base_dir: directory that a robot's file path in `config` is relative to.
             begun: world time at the start, s: over 0 where the world was there before.
             home: (n,) where the arm stands at first; an arm of UR stands upright.
-
-        Raises:
-            InputError: a cell that cannot be simulated.
-            DeviceError: a device ended early or was not ready in time.
         """
         _check(world, config, directory)
         try:
@@ -217,12 +209,7 @@ class SimulatedCell:
         raise AssertionError("unreachable")
 
     def ask(self, device: str, op: str, **arguments: Any) -> Any:
-        """Send a request to a device's admin line: "world", "arm", "tracker" or "force".
-
-        Raises:
-            InputError: no such device.
-            DeviceError: it does not answer, or refuses.
-        """
+        """Send a request to a device's admin line: "world", "arm", "tracker" or "force"."""
         return admin.ask(self._device(device).socket, op, **arguments)
 
     def kill(self, device: str) -> None:
@@ -230,11 +217,7 @@ class SimulatedCell:
         self._device(device).kill()
 
     def restart(self, device: str) -> None:
-        """Start a device again, after ending it where it still runs; returns when it is ready.
-
-        Raises:
-            DeviceError: it ended early or was not ready in time.
-        """
+        """Start a device again, after ending it where it still runs; returns when it is ready."""
         process = self._device(device)
         process.kill()
         self._begin([process])
@@ -298,11 +281,7 @@ class SimulatedCell:
 
 
 def free_host() -> str:
-    """Return a loopback address whose ports of devices are free now.
-
-    Raises:
-        DeviceError: none was found.
-    """
+    """Return a loopback address whose ports of devices are free now."""
     for _ in range(50):
         host = f"127.{secrets.randbelow(254) + 1}.{secrets.randbelow(256)}"
         host = f"{host}.{secrets.randbelow(254) + 1}"
@@ -376,7 +355,7 @@ def _devices(
             words += [f"--{key.replace('_', '-')}", *told]
         return DeviceProcess(name, f"hilcal.drivers.simulated.{server}", directory, tuple(words))
 
-    of_arm: tuple[str, dict[str, object]] = "arm_server", {}
+    of_arm: tuple[str, dict[str, object]] = "arm", {}
     if is_ur(world.cell.arm):
         version = config.simulation.controller_version
         of_arm = "ur_server", {**at, "robot": arm.model, "version": version}

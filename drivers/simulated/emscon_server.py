@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard, settled_truth
-from hilcal.drivers.simulated.geocom_station import Beam, PolarPoint, Station
+from hilcal.drivers.simulated.geocom_server import Beam, PolarPoint, Station
 from hilcal.drivers.simulated.world import SimulatedNoise
 from hilcal.types import Floats
 

@@ -260,11 +260,6 @@ def hide(
         pose: (N,) index of the pose, for deflections; equal joints are one pose when None.
         cycle: (N,) index of the cycle, for deflections; one cycle when None.
         harmonics: number of harmonics of a hidden transmission error.
-
-    Raises:
-        InputError: an unknown effect or mode, an effect that deflections do not show, a
-            deflection without an unloaded reading, states that lack what the effect depends
-            on, or a strength that cannot be reached.
     """
     _check(effect, strength_sigma, readings_mode, m)
     if world is None:

@@ -205,11 +205,7 @@ class Elasticity:
     turns: Floats | None = None  # (v, v) T; None: 1
 
     def give(self, tau: Floats, states: Ints) -> tuple[Floats, Floats]:
-        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states.
-
-        Raises:
-            InputError: the gear would soften to nothing.
-        """
+        """Return delta (K, v) and its derivative by tau (K, v, v) in K of the states."""
         if self.turns is None:
             return self._give(tau, states)
         delta, slack = self._give(tau @ self.turns, states)
@@ -348,9 +344,6 @@ def equilibrium(
             flange can tilt; None: 1.
         sensor: how `wrench` was misread, where it is not zero; None: it is true.
         guide: (N, g, 5) errors of the guides, for a tree that has them; None: 0.
-
-    Raises:
-        InputError: when a state has no equilibrium, or the gear would soften to nothing.
     """
     arm = _Loaded(tree, law, load_point, sensor)
     parts = [slice(k, k + _AT_ONCE) for k in range(0, max(len(q), 1), _AT_ONCE)]
@@ -399,12 +392,7 @@ class _Loaded:
         self.links: list[tuple[int, pin.SE3]] = []
 
     def grow(self, factor: float) -> None:
-        """Make every constant translation of the links so many times as long.
-
-        Raises:
-            ValueError: the flange cannot tilt, so that the last link has no degree of freedom
-                behind it.
-        """
+        """Make every constant translation of the links so many times as long."""
         if not self.links:
             if factor == 1.0:
                 return

@@ -46,12 +46,7 @@ class SimulatedOperator:
         return Report("operator", name, facts, problems, fields)
 
     def hang(self, load: CellLoad | None, why: str) -> None:
-        """Hang a load in the simulated world, or take it off; a person is asked first.
-
-        Raises:
-            DeviceError: the simulated world is gone or does not have this load, or the person
-                gives up.
-        """
+        """Hang a load in the simulated world, or take it off; a person is asked first."""
         if self.person is not None:
             self.person.hang(load, why)
         else:
@@ -59,11 +54,7 @@ class SimulatedOperator:
         admin.ask(self.socket, "hang", name=None if load is None else load.name)
 
     def confirm(self, question: str) -> None:
-        """Say that the arm may go on; a person is asked.
-
-        Raises:
-            DeviceError: the person gives up.
-        """
+        """Say that the arm may go on; a person is asked."""
         if self.person is not None:
             self.person.confirm(question)
 
@@ -77,9 +68,6 @@ def open_operator(config: CellConfig) -> SimulatedOperator:
     Its [operator] options are `socket`, the admin socket of the simulated world, `hand_s`, how long
     a change of the load takes, s of cell time, and `person`: true where it is left to the person at
     the terminal, whose every answer is then true in the simulated world.
-
-    Raises:
-        InputError: a missing or bad option.
     """
     options = config.operator.options
     for key in options:

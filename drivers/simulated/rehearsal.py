@@ -69,22 +69,16 @@ def check_choice(choice: str, catalogue: Catalogue | None = None) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SimulationCase:
-    """A simulated cell with something hidden in it.
-
-    Attributes:
-        mode: the kind of readings that shows the hidden effect.
-        hidden: the name of the hidden effect, or "nothing".
-        strength_sigma: rms of what it does to the readings, in units of their noise.
-        home: (n,) where the arm stands at first; None where no plan says it.
-    """
+    """A simulated cell with something hidden in it."""
 
     config: CellConfig
     cell: Cell
-    mode: Mode
+    mode: Mode  # the kind of readings that shows the hidden effect
     world: World
-    hidden: str
-    strength_sigma: float
+    hidden: str  # the name of the hidden effect, or "nothing"
+    strength_sigma: float  # rms of what it does to the readings, in units of their noise
     home: Floats | None = field(default=None, kw_only=True)
+    """(n,) where the arm stands at first; None where no plan says it."""
 
     def measured(self, readings: Readings, config: CellConfig | None = None) -> "Rehearsal":
         """Return what was measured in it, with the configuration that it was measured with."""

@@ -171,10 +171,6 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
            + sum_k a_jk cos k q_j + b_jk sin k q_j
 
     Joints do not drift at the temperature `reference`, °C.
-
-    Raises:
-        InputError: hysteresis without approach sides, or drifting joints without their
-            temperatures.
     """
     error = np.broadcast_to(hidden.encoder_offset, states.q.shape).copy()
     if np.any(hidden.hysteresis):
@@ -212,11 +208,7 @@ def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
 
 
 def joint_temperature(states: States) -> Floats:
-    """Return the (N, n) temperatures of the joints, °C.
-
-    Raises:
-        InputError: the states do not carry them.
-    """
+    """Return the (N, n) temperatures of the joints, °C."""
     if states.joint_temperature is None:
         raise InputError(
             "joint_temperature: thermal_joint_drift is hidden but the states carry no "
@@ -229,9 +221,6 @@ def further_compliance(hidden: Truth, arm: Arm, states: States) -> Floats | None
     """Return the (N, n) compliances of the drives beyond c_j, rad/(N·m); None: none anywhere.
 
     a_j cos 2 q_j + b_j sin 2 q_j + k c_j log10(1 + t / 1 s), q the commanded angle
-
-    Raises:
-        InputError: creep without the time under load.
     """
     extra: Floats | None = None
     if np.any(hidden.periodic_joint_compliance):
@@ -262,9 +251,6 @@ def link_growth(hidden: Truth, states: States) -> Floats | None:
     """Return the (N,) factor on all lengths of the links, 1 + alpha (T - 20 °C); None: 1.
 
     T is that of the air, or the mean of the joints' where the states do not carry it.
-
-    Raises:
-        InputError: growing links without any temperature.
     """
     if not np.any(hidden.thermal_growth):
         return None
@@ -292,11 +278,7 @@ class Misreading:
 
     @classmethod
     def of(cls, truth: Truth) -> "Misreading | None":
-        """Return that of a truth, flange axes; None where the sensor is perfect.
-
-        Raises:
-            InputError: a gain of nothing or less.
-        """
+        """Return that of a truth, flange axes; None where the sensor is perfect."""
         parts = (truth.wrench_bias, truth.wrench_gain, truth.sensor_misalignment)
         if not any(np.any(part) for part in parts):
             return None

@@ -30,11 +30,15 @@ import numpy as np
 
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur.controller import Controller, DashboardServer
-from hilcal.drivers.simulated.ur.primary import NOT_INITIALISED, PrimaryPort
-from hilcal.drivers.simulated.ur.robot_api import RobotApiServer
-from hilcal.drivers.simulated.ur.rtde import Faults, RtdeLink, RtdeLinks, Sensors
-from hilcal.drivers.simulated.ur.state import ArmState, Kinematics, Trajectory, WorldClock
+from hilcal.drivers.simulated.ur_controller import (
+    NOT_INITIALISED,
+    Controller,
+    DashboardServer,
+    PrimaryPort,
+    RobotApiServer,
+)
+from hilcal.drivers.simulated.ur_rtde import Faults, RtdeLink, RtdeLinks, Sensors
+from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
@@ -102,11 +106,7 @@ class UrServer:
         self._others: list[asyncio.Server] = []
 
     async def open(self) -> None:
-        """Listen.
-
-        Raises:
-            DeviceError: an address is in use, or is none of this computer's.
-        """
+        """Listen."""
         supervised = self._api_port if self.is_x else DASHBOARD
         self._others = [
             await self._listen(self.primary.run, PRIMARY),
@@ -170,11 +170,7 @@ def _rows(arm: Arm) -> Floats:
 
 
 def read_version(text: str) -> Version:
-    """Return the four numbers of a PolyScope version such as 5.11.6.1010327.
-
-    Raises:
-        InputError: it is something else.
-    """
+    """Return the four numbers of a PolyScope version such as 5.11.6.1010327."""
     parts = text.split(".")
     if len(parts) == 4 and all(part.isascii() and part.isdigit() for part in parts):
         a, b, c, d = map(int, parts)
@@ -312,12 +308,7 @@ def _share(key: str, value: Any) -> float:
 
 
 async def serve(options: argparse.Namespace) -> None:
-    """Open everything, and run until the process ends.
-
-    Raises:
-        InputError: an arm that cannot be simulated.
-        DeviceError: no shared world, or an address that cannot be had.
-    """
+    """Open everything, and run until the process ends."""
     arm = load_arm(options.robot)
     if arm.n != len(HOME):
         raise InputError(f"--robot {options.robot}: {arm.n} joints; an arm of UR has {len(HOME)}")

@@ -187,10 +187,6 @@ class World:
 
         dq_j = o_j + h_j s_j + kappa_j (T_j - reference) + sum_i k_ji q_i
                + sum_k a_jk cos k q_j + b_jk sin k q_j
-
-        Raises:
-            InputError: hysteresis without approach sides, or drifting joints without their
-                temperatures.
         """
         arm, hidden = self.cell.arm, self.physics
         off = drive_errors(hidden, arm, states, self.joint_reference)
@@ -204,9 +200,6 @@ class World:
         """Return the static equilibrium of N states.
 
         `slip` (N, n) is how far each drive missed its command, rad (repeatability).
-
-        Raises:
-            InputError: the states lack what a hidden effect depends on, or find no equilibrium.
         """
         q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
         guided = guide_motion(self.physics, self.cell.arm, states)
@@ -250,10 +243,6 @@ class World:
         T_flange_target, the target shifted by its offset; the position then 1 + s times as long,
         about the origin of the sensor's axes. An effect of a user's own displaces the target before
         drift and scale. `slip` is as for `rest`, which is the equilibrium where that is known.
-
-        Raises:
-            InputError: the states lack what a hidden effect depends on, e.g. a drifting
-                tracker without time stamps.
         """
         hidden, rest = self.physics, rest or self.rest(states, slip)
         target = np.array(self.cell.target_of(states.target))

@@ -12,7 +12,7 @@ import time
 from typing import Any
 
 from hilcal.drivers.ur_link import relay
-from hilcal.drivers.ur_link.child import Line, answered, outliving, start, words
+from hilcal.drivers.ur_link.worker import Line, answered, outliving, start, words
 
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0

@@ -26,11 +26,7 @@ class Connection:
     """
 
     def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
-        """Connect to the service `what`; all of it has to be done within so many seconds.
-
-        Raises:
-            LinkError: nobody answers.
-        """
+        """Connect to the service `what`; all of it has to be done within so many seconds."""
         self._where = f"{what} (port {port})"
         self._seconds = seconds
         self._end = time.monotonic() + seconds

@@ -261,11 +261,7 @@ class ArrivalReader:
         clock: Clock,
         watcher: Watcher,
     ) -> None:
-        """Use open devices.
-
-        Raises:
-            InputError: several targets, and a tracker that cannot be told which.
-        """
+        """Use open devices."""
         self._cell, self._measurer, self._registration = cell, measurer, registration
         self._clock, self._watcher, self._said = clock, watcher, False
         self._tracker: PointingTracker | None = None
@@ -283,11 +279,7 @@ class ArrivalReader:
         self._radius = 0.5 * float(apart[apart > 0].min(initial=np.inf))
 
     def read(self, q: Floats, name: str) -> list[TargetReading]:
-        """Read at the present pose, called `name`; q (n,) are the commanded joint angles, rad.
-
-        Raises:
-            DeviceError: no target could be read, or a device failed.
-        """
+        """Read at the present pose, called `name`; q (n,) are the commanded joint angles, rad."""
         if self._tracker is None:
             return [TargetReading(None, self._measurer.measure(name), self._clock.now())]
         places = self._registration.expected(q)

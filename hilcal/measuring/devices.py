@@ -21,12 +21,9 @@ class Clock:
 
     Time-outs of communication are not: a wire is as fast in a simulated cell as in a real one,
     so those use `time.monotonic` directly.
-
-    Attributes:
-        scale: cell seconds per real second; 1 for a real cell.
     """
 
-    scale: float = 1.0
+    scale: float = 1.0  # cell seconds per real second; 1 for a real cell
 
     def now(self) -> float:
         """Return the cell time, s since an arbitrary start."""
@@ -61,67 +58,43 @@ class LoadChangedError(DeviceError):
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Identity, state and problems of a device, read without any motion.
+    """Identity, state and problems of a device, read without any motion."""
 
-    Attributes:
-        device: its part in the cell: "arm", "tracker", "force sensor", "operator".
-        name: the maker's name for it, with its serial number where known.
-        facts: (what, value) for people: versions, modes, rates, temperatures.
-        problems: what has to be put right before a run, one clear line each.
-        fields: (name, value) of the facts for scripts: numbers with their unit in the name.
-        kinematics: of an arm, by which its controller computes poses; None where it does not tell.
-    """
-
-    device: str
-    name: str
+    device: str  # its part in the cell: "arm", "tracker", "force sensor", "operator"
+    name: str  # the maker's name for it, with its serial number where known
     facts: tuple[tuple[str, str], ...] = ()
-    problems: tuple[str, ...] = ()
+    """(what, value) for people: versions, modes, rates, temperatures."""
+    problems: tuple[str, ...] = ()  # what has to be put right before a run, one clear line each
     fields: tuple[tuple[str, object], ...] = ()
+    """(name, value) of the facts for scripts: numbers with their unit in the name."""
     kinematics: FactoryKinematics | None = None
+    """of an arm, by which its controller computes poses; None where it does not tell."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmSample:
-    """One consistent sample of the arm's state, SI.
+    """One consistent sample of the arm's state, SI."""
 
-    Attributes:
-        host_ns: `time.monotonic_ns` right after the sample came.
-        timestamp: the controller's own clock, s.
-        q: (n,) actual joint angles, rad.
-        q_target: (n,) commanded joint angles, rad.
-        qd: (n,) actual joint speeds, rad/s.
-        target_moment: (n,) torques that the controller computes, N·m.
-        current: (n,) actual motor currents, A.
-        target_current: (n,) commanded motor currents, A.
-        joint_temperature: (n,) °C.
-        tcp_pose: (6,) position and rotation vector of the tool point, m and rad.
-        tcp_force: (6,) wrench as the controller estimates it, N and N·m.
-        ft_raw_wrench: (6,) raw wrench of a sensor built into the arm; None where unknown.
-        payload: payload that is set in the controller, kg.
-        payload_com: (3,) its centre of mass, flange axes, m; None where unknown.
-        speed_scaling: factor that the controller applies to the speed, 0 to 1.
-        safety: the safety state in the maker's words, "normal" where all is well.
-        torque: (n,) mean torques that the drives were measured to exert since the sample before,
-            N·m, positive in the direction in which the joint's value grows; None where unknown.
-    """
-
-    host_ns: int
-    timestamp: float
-    q: Floats
-    q_target: Floats
-    qd: Floats
-    target_moment: Floats
-    current: Floats
-    target_current: Floats
-    joint_temperature: Floats
-    tcp_pose: Floats
-    tcp_force: Floats
+    host_ns: int  # `time.monotonic_ns` right after the sample came
+    timestamp: float  # the controller's own clock, s
+    q: Floats  # (n,) actual joint angles, rad
+    q_target: Floats  # (n,) commanded joint angles, rad
+    qd: Floats  # (n,) actual joint speeds, rad/s
+    target_moment: Floats  # (n,) torques that the controller computes, N·m
+    current: Floats  # (n,) actual motor currents, A
+    target_current: Floats  # (n,) commanded motor currents, A
+    joint_temperature: Floats  # (n,) °C
+    tcp_pose: Floats  # (6,) position and rotation vector of the tool point, m and rad
+    tcp_force: Floats  # (6,) wrench as the controller estimates it, N and N·m
     ft_raw_wrench: Floats | None
-    payload: float
-    payload_com: Floats | None
-    speed_scaling: float
-    safety: str
+    """(6,) raw wrench of a sensor built into the arm; None where unknown."""
+    payload: float  # payload that is set in the controller, kg
+    payload_com: Floats | None  # (3,) its centre of mass, flange axes, m; None where unknown
+    speed_scaling: float  # factor that the controller applies to the speed, 0 to 1
+    safety: str  # the safety state in the maker's words, "normal" where all is well
     torque: Floats | None = None
+    """(n,) mean torques that the drives were measured to exert since the sample before, N·m,
+    positive in the direction in which the joint's value grows; None where unknown."""
 
 
 class ArmDevice(Protocol):
@@ -192,20 +165,14 @@ class ArmDevice(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrackerSample:
-    """One measurement of the target.
+    """One measurement of the target."""
 
-    Attributes:
-        host_ns: `time.monotonic_ns` right after it came.
-        value: (m,) position in m and, for m = 6, rotation vector in rad, sensor axes.
-        covariance: (m, m) of this one measurement, from the instrument's specification and
-            what it says of itself.
-        warning: what the instrument remarked, empty where nothing.
-    """
-
-    host_ns: int
-    value: Floats
+    host_ns: int  # `time.monotonic_ns` right after it came
+    value: Floats  # (m,) position in m and, for m = 6, rotation vector in rad, sensor axes
     covariance: Floats
-    warning: str = ""
+    """(m, m) of this one measurement, from the instrument's specification and what it says of
+    itself."""
+    warning: str = ""  # what the instrument remarked, empty where nothing
 
 
 class TrackerDevice(Protocol):
@@ -258,38 +225,23 @@ class PointingTracker(TrackerDevice, Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WrenchSample:
-    """The raw reading of a force sensor, averaged over a window.
+    """The raw reading of a force sensor, averaged over a window."""
 
-    Attributes:
-        host_ns: `time.monotonic_ns` right after the last frame came.
-        wrench: (6,) mean force and moment, sensor axes, N and N·m; the sensor's own zero.
-        covariance: (6, 6) of one frame in the window (not of the mean); zero for one frame.
-        frames: number of frames in the window.
-        temperature: of the sensor, °C; None where it does not tell.
-    """
-
-    host_ns: int
-    wrench: Floats
-    covariance: Floats
-    frames: int
-    temperature: float | None = None
+    host_ns: int  # `time.monotonic_ns` right after the last frame came
+    wrench: Floats  # (6,) mean force and moment, sensor axes, N and N·m; the sensor's own zero
+    covariance: Floats  # (6, 6) of one frame in the window (not of the mean); zero for one frame
+    frames: int  # number of frames in the window
+    temperature: float | None = None  # of the sensor, °C; None where it does not tell
 
 
 @dataclass(frozen=True, slots=True)
 class Losses:
-    """What went wrong on the line since it was opened.
+    """What went wrong on the line since it was opened."""
 
-    Attributes:
-        frames: good frames.
-        lost: frames that should have come and did not.
-        corrupt: frames whose checksum was wrong.
-        skipped: bytes that belonged to no frame.
-    """
-
-    frames: int
-    lost: int
-    corrupt: int
-    skipped: int
+    frames: int  # good frames
+    lost: int  # frames that should have come and did not
+    corrupt: int  # frames whose checksum was wrong
+    skipped: int  # bytes that belonged to no frame
 
 
 class ForceSensorDevice(Protocol):
@@ -366,10 +318,6 @@ class ConfirmingOperator(OperatorDevice, Protocol):
 
 @runtime_checkable
 class TerminalPerson(OperatorDevice, Protocol):
-    """An operator who is asked at the terminal on which the campaign is shown.
+    """An operator who is asked at the terminal on which the campaign is shown."""
 
-    Attributes:
-        at_terminal: whether that is so now; the live display gives way to the question then.
-    """
-
-    at_terminal: bool
+    at_terminal: bool  # whether that is so now; the live display gives way to the question then

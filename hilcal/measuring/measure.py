@@ -79,10 +79,6 @@ def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> 
     Args:
         samples: at least 2, of one target at rest.
         systematic_share: s, 0 to 1.
-
-    Raises:
-        DeviceError: more than one in five samples (and more than one) are gross outliers, or
-            fewer than 2 remain.
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
@@ -304,10 +300,6 @@ class Measurer:
 
         `find` finds a lost target again, the tracker's search where None; `force` is the wrench
         where it was averaged at this stop already.
-
-        Raises:
-            TargetLostError: the target was not found again.
-            DeviceError: nothing settled in time, the arm did not stand still, or a device failed.
         """
         remarks: list[str] = []
         searches = repeats = 0

@@ -10,9 +10,8 @@ from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import ArmDevice, Clock
-from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.measuring.progress import Phase, Remark, Watcher
-from hilcal.measuring.route import route
+from hilcal.measuring.route import DryRun, dry_run, route
 from hilcal.measuring.session import LiveModel, Session
 from hilcal.measuring.stopping_rule import StoppingRule
 from hilcal.store.plan import Plan

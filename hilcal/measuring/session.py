@@ -16,14 +16,20 @@ from hilcal.measuring.arrival import ArrivalReader, RoughRegistration, TargetRea
 from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import Clock, LoadChangedError, TargetLostError, WrenchSample
 from hilcal.measuring.force import ForceMeter, TaredWrench
-from hilcal.measuring.guard import Guard
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.motion import Mover
+from hilcal.measuring.motion import Guard, Mover
 from hilcal.measuring.progress import ArmAt, LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.reading_record import detail, reading_of, sample_json, stored_wrench
 from hilcal.measuring.route import Stop
-from hilcal.measuring.session_state import Eta, SessionState, Shift
+from hilcal.measuring.session_state import (
+    Eta,
+    SessionState,
+    Shift,
+    detail,
+    reading_of,
+    sample_json,
+    stored_wrench,
+)
 from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
@@ -118,11 +124,7 @@ class Session:
     # the way
 
     def walk(self, stops: tuple[Stop, ...]) -> None:
-        """Go through all stops, or home as soon as the goal is met.
-
-        Raises:
-            HilcalError: something failed; the arm has to be stopped.
-        """
+        """Go through all stops, or home as soon as the goal is met."""
         total = len(self._plan.steps)
         self._event("start", {"missing": sum(s.step is not None for s in stops)})
         self._begin(stops[:2])

@@ -1,18 +1,218 @@
-"""What is carried from reading to reading: registration, unloaded readings, drift, pace."""
+"""What is carried from reading to reading, and a reading as it is stored, with all behind it."""
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.measuring.arrival import RoughRegistration
-from hilcal.measuring.devices import Clock
+from hilcal.measuring.devices import ArmSample, Clock, Losses, TrackerSample, WrenchSample
 from hilcal.measuring.force import TaredWrench
-from hilcal.measuring.repeatability import RepeatabilityEstimate, UnloadedVisit, repeatability
+from hilcal.measuring.measure import MeasuredStop
+from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import REFERENCE, UNLOADED, Step
 from hilcal.types import Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UnloadedVisit:
+    """One unloaded reading."""
+
+    pose: str
+    position: Floats  # (3,) m, sensor axes
+    tracker: Floats  # (3, 3) covariance of the instrument alone, m²
+    gain: float  # tr(J Jᵀ) of the target's translation, m²/rad²
+
+
+@dataclass(frozen=True, slots=True)
+class RepeatabilityEstimate:
+    """The scatter from one arrival to the next."""
+
+    poses: int  # poses with several readings
+    dof: int  # readings less poses
+    scatter: float  # rms distance of a reading from its pose's mean, m, unbiased
+    instrument: float  # the same as the instrument alone would make it, m
+    joint_std: float  # the scatter of every joint that explains the rest, rad; 0 where none is left
+    iso_9283: float = float("nan")
+    """The worst pose's RP = mean distance + 3 standard deviations of it, m (ISO 9283, 7.2.2), the
+    instrument's noise included; NaN in campaigns of older versions."""
+
+    @property
+    def shown(self) -> bool:
+        """Whether the arm scatters beyond what the instrument does by chance, about 1 in 100."""
+        total, noise = self.scatter**2, self.instrument**2
+        return bool(total - noise > 3.0 * noise * np.sqrt(2.0 / (3.0 * max(self.dof, 1))))
+
+    def words(self, configured: Floats) -> str:
+        """Return it for people, beside the configured standard deviations (n,), rad."""
+        told = float(np.sqrt(np.mean(configured**2)))
+        joints = f"is about {self.joint_std:.1g}" if self.shown else "does not show beside it"
+        return (
+            f"{self.dof} returns to {self.poses} poses scatter by {1e6 * self.scatter:.0f} µm, "
+            f"the instrument alone by {1e6 * self.instrument:.0f} µm: joint_std_rad {joints}, "
+            f"configured {told:.1g}"
+        )
+
+
+def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | None:
+    """Estimate it from unloaded readings; None where no pose has two.
+
+    With S = Σ |x − x̄|² over the readings of a pose that was visited k times,
+
+        E S = (1 − 1/k) Σ (tr C + σ² tr(J Jᵀ))
+
+    which is solved for σ², one for all joints, over all poses together.
+    """
+    spread = instrument = gain = worst = 0.0
+    poses = dof = 0
+    for name in dict.fromkeys(v.pose for v in visits):
+        mine = [v for v in visits if v.pose == name]
+        k = len(mine)
+        if k < 2:
+            continue
+        at = np.array([v.position for v in mine])
+        away = np.linalg.norm(at - at.mean(axis=0), axis=1)
+        spread += float(np.sum(away**2))
+        instrument += (1 - 1 / k) * sum(float(np.trace(v.tracker)) for v in mine)
+        gain += (1 - 1 / k) * sum(v.gain for v in mine)
+        worst = max(worst, float(away.mean() + 3 * away.std(ddof=1)))
+        poses, dof = poses + 1, dof + k - 1
+    if not poses:
+        return None
+    left = max(spread - instrument, 0.0)
+    return RepeatabilityEstimate(
+        poses=poses,
+        dof=dof,
+        scatter=float(np.sqrt(spread / dof)),
+        instrument=float(np.sqrt(instrument / dof)),
+        joint_std=float(np.sqrt(left / gain)) if gain > 0 else 0.0,
+        iso_9283=worst,
+    )
+
+
+def reading_of(
+    step: Step,
+    q: Floats,
+    measured: MeasuredStop,
+    wrench: Floats,
+    time: float,
+    load_time: float,
+    side: Floats,
+    joint_temperature: Floats | None,
+    torque: Floats | None = None,
+    target: int | None = None,
+    target_names: tuple[str, ...] = (),
+) -> Readings:
+    """Return one reading; its covariance is the instrument's alone.
+
+    Args:
+        step: which one.
+        q: (n,) commanded joint angles, rad.
+        measured: what was measured.
+        wrench: (6,) of the load at the load point, base axes, N and N·m.
+        time: since the campaign's start, cell s.
+        load_time: since the load's last change, cell s.
+        side: (n,) from which each joint arrived, -1 or +1.
+        joint_temperature: (n,) °C; None in a campaign without.
+        torque: (n,) that the drives were measured to exert, N·m, NaN where this reading has none;
+            None in a campaign without.
+        target: number of the target that was read; None where there is one.
+        target_names: the cell's names of them.
+    """
+    states = States(
+        q=q[None].copy(),
+        wrench=wrench[None].copy(),
+        time=np.array([time]),
+        load_time=np.array([load_time]),
+        joint_temperature=None if joint_temperature is None else joint_temperature[None].copy(),
+        approach=side[None].copy(),
+        q_actual=measured.q[None].copy(),
+        torque=None if torque is None else torque[None].copy(),
+        target=None if target is None else np.array([target]),
+    )
+    return Readings(
+        states=states,
+        pose=np.zeros(1, dtype=np.int64),
+        load=np.zeros(1, dtype=np.int64),
+        cycle=np.array([step.cycle], dtype=np.int64),
+        value=measured.mean.value[None].copy(),
+        covariance=measured.mean.covariance[None].copy(),
+        load_names=(step.load,),
+        pose_names=(step.pose,),
+        target_names=() if target is None else target_names,
+    )
+
+
+def detail(
+    step: Step,
+    measured: MeasuredStop,
+    tared: TaredWrench | None,
+    zero: Floats | None,
+    session: dict[str, Any],
+) -> dict[str, Any]:
+    """Return everything raw behind a reading.
+
+    `tared` is the mean wrench against the session's zero (6,), None without a force sensor;
+    `session` has further keys: times, losses, sides.
+    """
+    out: dict[str, Any] = {
+        "pose": step.pose,
+        "load": step.load,
+        "cycle": step.cycle,
+        "value": measured.mean.value.tolist(),
+        "tracker_covariance": measured.mean.covariance.tolist(),
+        "scatter": measured.mean.scatter,
+        "left_out": list(measured.mean.left_out),
+        "q_actual": measured.q.tolist(),
+        "torque": None if measured.torque is None else measured.torque.tolist(),
+        "settling_s": measured.settling,
+        "remarks": list(measured.remarks),
+        "arm_before": sample_json(measured.before),
+        "arm_after": sample_json(measured.after),
+        "tracker": [sample_json(sample) for sample in measured.tracker],
+        "force": sample_json(measured.force),
+    }
+    if tared is not None and zero is not None:
+        out["felt"] = {
+            "wrench": tared.wrench.tolist(),
+            "covariance": tared.covariance.tolist(),
+            "zero": zero.tolist(),
+        }
+    return out | session
+
+
+def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
+    """Return the mean wrench in a stored detail; None without one."""
+    felt = stored.get("felt")
+    if felt is None:
+        return None
+    return TaredWrench(
+        np.array(felt["wrench"]), np.array(felt["covariance"]), np.array(stored["q_actual"])
+    )
+
+
+def sample_json(sample: ArmSample | TrackerSample | WrenchSample | Losses | None) -> Any:
+    """Return a sample as a JSON object with the names of its fields; arrays as lists."""
+    if sample is None:
+        return None
+    return {f.name: _value(getattr(sample, f.name)) for f in fields(sample)}
+
+
+def _value(value: Any) -> Any:
+    """Return a JSON value; what is not a finite number becomes null."""
+    if isinstance(value, np.ndarray):
+        return [_value(x) for x in value.tolist()]
+    if isinstance(value, list):
+        return [_value(x) for x in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    return value
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,9 +7,8 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, Watcher
-from hilcal.measuring.route import Stop, home
+from hilcal.measuring.route import Stop, home, route_problems
 from hilcal.readings.readings import Readings
 from hilcal.store.plan import UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog

@@ -17,7 +17,7 @@ from hilcal.design.feasible import REASONS, Space
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.measuring.route import approach_sides, duration, route
 from hilcal.present.calibration import refusals
 from hilcal.present.progress import Say

@@ -13,7 +13,7 @@ from hilcal.design.feasible import Space, draw
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace, timeline
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.present.progress import Say
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

@@ -306,8 +306,8 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
     "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
-    "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
-    "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "measuring/connect": {"check CELL.toml --save-calibration": KINEMATICS},
+    "measuring/route": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {
         "hilcal accept RUN N": f"{HERE}what_a_report_names",
         "None yet: hilcal identify": f"{HERE}without_a_revision",

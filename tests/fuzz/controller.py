@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.drivers.ur_link import dashboard, lines, primary, probe, reading
+from hilcal.drivers.ur_link import lines, probe, reading, supervision
 from hilcal.drivers.ur_link.lines import LinkError
 from tests.fuzz.damage import bytes_damaged
 from tests.fuzz.harness import Accepted, Parser
@@ -73,9 +73,9 @@ def dashboard_server() -> Parser:
     corpus = [b"".join(said), said[0] + b"Stopped\n", said[0] + b"true\n",
               said[0] + b"could not understand: 'is in remote control'\n"]  # fmt: skip
     asked: list[Callable[[], object]] = [
-        lambda: dashboard.Dashboard("fuzz").describe(1.0),
-        lambda: dashboard.Dashboard("fuzz").stop(1.0),
-        lambda: dashboard.Dashboard("fuzz").in_remote_control(1.0),
+        lambda: supervision.Dashboard("fuzz").describe(1.0),
+        lambda: supervision.Dashboard("fuzz").stop(1.0),
+        lambda: supervision.Dashboard("fuzz").in_remote_control(1.0),
     ]
 
     def make(by: Random) -> bytes:
@@ -105,7 +105,7 @@ def primary_port() -> Parser:
 
     def parse(data: bytes) -> bool:
         with instead(lines, _network(data)):
-            found = primary.kinematics("fuzz", 1.0)
+            found = reading.read_kinematics("fuzz", 1.0)
         if not np.isfinite(found.links).all():
             raise Accepted("primary: transforms that are no numbers")
         return True

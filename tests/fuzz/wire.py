@@ -18,10 +18,9 @@ from geocompy import geo
 from geocompy.geo import GeoCom
 
 from hilcal.config.cell import Tracker
-from hilcal.drivers import bota, ft300, geocom_line, onrobot_hex
+from hilcal.drivers import bota, ft300, geocom, onrobot_hex
 from hilcal.drivers.force_stream import RING, ForceStream, SensorFormat
-from hilcal.drivers.geocom import GeoComOptions, GeoComTracker
-from hilcal.drivers.geocom_line import Link
+from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link
 from hilcal.measuring.devices import Clock
 from tests.fuzz import controller, network
 from tests.fuzz.damage import NUMBERS, bytes_damaged
@@ -136,10 +135,10 @@ def _geocom() -> Parser:
     port = Port()
     link = Link.__new__(Link)
     link._path, link._baud, link._port = "fuzz", 115200, port  # type: ignore[assignment]
-    link._connection = geocom_line._Connection(port)  # type: ignore[arg-type]
+    link._connection = geocom._Connection(port)  # type: ignore[arg-type]
     link._instrument = GeoCom.__new__(GeoCom)
     port.held = b"".join(line(f"%R1P,0,{k}", body) for k, body in enumerate(("0", "0,15", "0")))
-    with instead(geocom_line, quiet), instead(geo, {"sleep": lambda _: None}):
+    with instead(geocom, quiet), instead(geo, {"sleep": lambda _: None}):
         GeoCom.__init__(link._instrument, link._connection, attempts=1, checksum=True)
     config = Tracker(driver="geocom", port="fuzz")
     tracker = GeoComTracker(link, config, GeoComOptions(), Clock(1.0))
@@ -188,7 +187,7 @@ def _geocom() -> Parser:
         port.held = data[1:]
         link._instrument.transaction_counter = 0
         tracker._full_known, tracker._last_ms = True, 0.0
-        with instead(geocom_line, quiet):
+        with instead(geocom, quiet):
             sample = tracker.measure()
         distance = float(np.linalg.norm(sample.value))
         if not np.all(np.isfinite(sample.covariance)) or not 0.1 < distance < 101.0:

@@ -16,7 +16,7 @@ from hilcal.config.template import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
 from hilcal.drivers.simulated.world import World
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan
 from tests.support.spread_plan import spread_plan

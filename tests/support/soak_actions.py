@@ -15,7 +15,7 @@ from random import Random
 
 import numpy as np
 
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
 from tests.support.calibrate_process import Calibration

@@ -12,10 +12,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import UrArm, open_arm
-from hilcal.drivers.ur_link import dashboard
-from hilcal.drivers.ur_link.dashboard import Dashboard
-from hilcal.drivers.ur_link.robot_api import RobotApi
-from hilcal.drivers.ur_link.supervision import Supervision
+from hilcal.drivers.ur_link.supervision import Dashboard, RobotApi, Supervision, ask
 from hilcal.errors import DeviceError
 from tests.support import sim_ur_cases
 
@@ -131,7 +128,7 @@ def put_right(sim: Sim) -> None:
             for action in ("POWER_ON", "BRAKE_RELEASE"):
                 api(sim).order("/robotstate/v1/state", action, 2.0)
         else:
-            dashboard.ask(sim.host, ("power on", "brake release"), 2.0)
+            ask(sim.host, ("power on", "brake release"), 2.0)
         sim.wait("robot_mode", 7)
     sim.wait("moving", False)
 

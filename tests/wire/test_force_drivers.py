@@ -15,7 +15,7 @@ import pytest
 from hilcal.config import CellConfig
 from hilcal.drivers import bota, ft300, onrobot_hex
 from hilcal.drivers.ft300 import write_register
-from hilcal.drivers.serial_line import close_port, open_port
+from hilcal.drivers.links import close_port, open_port
 from hilcal.errors import DeviceError, InputError
 from tests.support.force_cases import (
     ALL,

@@ -6,8 +6,7 @@ import time
 import numpy as np
 import pytest
 
-from hilcal.drivers.geocom import DEADLINE_S, open_tracker
-from hilcal.drivers.geocom_line import ANSWER_S
+from hilcal.drivers.geocom import ANSWER_S, DEADLINE_S, open_tracker
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import TargetLostError
 from tests.support import sim_serial_cases as simulated

@@ -5,8 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, open_tracker
-from hilcal.drivers.geocom_line import Link
+from hilcal.drivers.geocom import GeoComOptions, GeoComTracker, Link, open_tracker
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, TargetLostError
 from tests.support import sim_serial_cases as simulated

@@ -10,7 +10,7 @@ import pytest
 
 from hilcal.config.template import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
-from hilcal.drivers.simulated.ur.rtde import outputs_since
+from hilcal.drivers.simulated.ur_rtde import outputs_since
 from hilcal.drivers.ur import open_arm
 from hilcal.drivers.ur_link.probe import controller
 from hilcal.drivers.ur_link.torque_reader import TORQUE

@@ -12,9 +12,9 @@ import pytest
 
 from hilcal.drivers.simulated.ur_server import API
 from hilcal.drivers.ur import open_arm
-from hilcal.drivers.ur_link import primary
+from hilcal.drivers.ur_link import reading
 from hilcal.drivers.ur_link.lines import LinkError
-from hilcal.drivers.ur_link.robot_api import RobotApi
+from hilcal.drivers.ur_link.supervision import RobotApi
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import nominal_rows
 from tests.support import sim_ur_cases
@@ -122,8 +122,8 @@ def test_kinematics_are_found_among_other_packages() -> None:
     part = package(5, struct.pack(">6I24dI", *range(6), *rows, 2) + b"later fields")
     state = package(16, package(0, b"modes") + part + package(6, b"configuration"))
     said = package(20, b"a message") + package(16, package(0, b"modes")) + state
-    with server(primary.PORT, lambda asked: said) as (host, _):
-        found = primary.kinematics(host, 2.0)
+    with server(reading.PRIMARY_PORT, lambda asked: said) as (host, _):
+        found = reading.read_kinematics(host, 2.0)
     np.testing.assert_array_equal(found.rows.ravel(), rows)
     assert (found.status, found.checksum) == (2, (0, 1, 2, 3, 4, 5))
 
@@ -141,10 +141,10 @@ def test_kinematics_are_found_among_other_packages() -> None:
 )
 def test_something_else_on_the_primary_port_is_one_line(says: bytes) -> None:
     with (
-        server(primary.PORT, lambda asked: says) as (host, _),
+        server(reading.PRIMARY_PORT, lambda asked: says) as (host, _),
         pytest.raises(LinkError, match="primary port") as refused,
     ):
-        primary.kinematics(host, 1.0)
+        reading.read_kinematics(host, 1.0)
     assert "\n" not in str(refused.value)
 
 
@@ -168,7 +168,7 @@ def test_a_controller_tells_the_kinematics_of_its_factory(tmp_path, version: str
 def test_a_controller_without_a_calibration_tells_the_nominal_ones(tmp_path) -> None:
     running = cases.start(tmp_path)
     try:
-        found = primary.kinematics(running.host, 2.0)
+        found = reading.read_kinematics(running.host, 2.0)
     finally:
         running.close()
     np.testing.assert_allclose(found.rows, nominal_rows(load_arm("ur10e")), rtol=0, atol=1e-12)

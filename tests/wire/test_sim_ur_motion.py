@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as some
 
-from hilcal.drivers.simulated.ur.programs import ScriptStream
-from hilcal.drivers.simulated.ur.state import GRAVITY, Kinematics, Trajectory, line
+from hilcal.drivers.simulated.ur_programs import ScriptStream
+from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics, Trajectory, line
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 

@@ -7,12 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hilcal.drivers.simulated.ur.state import line
+from hilcal.drivers.simulated.ur_state import line
 from hilcal.drivers.ur_link import states
-from hilcal.drivers.ur_link.brakes import program_ended
-from hilcal.drivers.ur_link.motion import MARGIN_S, MotionInProgress, deceleration
-from hilcal.drivers.ur_link.reading import OUTPUTS, N, ReadingError, read
-from hilcal.drivers.ur_link.survey import settled_rate
+from hilcal.drivers.ur_link.control import MARGIN_S, MotionInProgress, deceleration, program_ended
+from hilcal.drivers.ur_link.reading import OUTPUTS, N, ReadingError, read, settled_rate
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.route import duration
 

@@ -11,7 +11,7 @@ from hilcal.cell import cell_from_config, tracker_place
 from hilcal.config import CellConfig
 from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.space_cases import (
     TABLE,

@@ -18,7 +18,7 @@ from hilcal.design.information import DesignProblem
 from hilcal.design.planner import Planned, Request, make
 from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names

@@ -12,10 +12,9 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.design.feasible import Space
 from hilcal.measuring.clearance import Clearance
-from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.feasibility import BETWEEN_M, STATE, Feasibility, Margins
-from hilcal.measuring.guard import SLACK, SLACK_M, Guard
-from hilcal.measuring.route import Stop
+from hilcal.measuring.motion import SLACK, SLACK_M, Guard
+from hilcal.measuring.route import Stop, route_problems
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import UNLOADED

@@ -12,7 +12,7 @@ from hilcal.design.predicted import predicted
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.measuring.clearance import LineOfSight, clearance_of
-from hilcal.measuring.dry_run import seconds_at_rest
+from hilcal.measuring.route import seconds_at_rest
 from hilcal.readings.whitening import MODES, Mode
 from tests.support.plan_cases import config_of, everything_once, poses_in
 from tests.support.reflector_cases import NAMES, OFFSETS, reflectors

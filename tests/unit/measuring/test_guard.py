@@ -8,7 +8,7 @@ import pytest
 from hilcal.config import CellLoad, ForceSensor, Limits
 from hilcal.measuring.clearance import clearance_of
 from hilcal.measuring.devices import ArmSample
-from hilcal.measuring.guard import SLACK_M, Guard
+from hilcal.measuring.motion import SLACK_M, Guard
 from tests.support.fake_bench import POSES, Bench
 from tests.support.space_cases import reached
 

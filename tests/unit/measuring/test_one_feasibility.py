@@ -11,8 +11,8 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.design.feasible import Space
-from hilcal.measuring.dry_run import dry_run
-from hilcal.measuring.guard import Guard
+from hilcal.measuring.motion import Guard
+from hilcal.measuring.route import dry_run
 from hilcal.store.plan import UNLOADED, Plan, Step
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.cli_cases import Capsys, refused, run

@@ -10,7 +10,7 @@ import pytest
 from hilcal.config import CellLoad, ForceSensor, Repeatability, Tool
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.progress import LiveResidual, ReadingStored, Remark
-from hilcal.measuring.repeatability import UnloadedVisit, repeatability
+from hilcal.measuring.session_state import UnloadedVisit, repeatability
 from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.store.plan import Step

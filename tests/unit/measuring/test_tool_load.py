@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2 as chi2_law
 
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.force import compare
-from hilcal.measuring.tool_load import identify_tool_load, tare
+from hilcal.measuring.force import compare, identify_tool_load, tare
 
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 BIAS = np.array([4.0, -2.5, 7.0, 0.3, -0.2, 0.1])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
-from hilcal.drivers.simulated.world_state import WorldState
+from hilcal.drivers.simulated.world_server import WorldState
 from hilcal.errors import InputError
 from tests.support.arm_cases import ODD, arm_of
 from tests.support.living_cell import (

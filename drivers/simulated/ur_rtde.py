@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur.state import (
+from hilcal.drivers.simulated.ur_state import (
     GRAVITY,
     REGISTERS,
     ArmState,
@@ -130,11 +130,7 @@ class Recipe:
         return self.layout.pack(self.number, *values)
 
     def unpack(self, payload: bytes) -> Iterator[tuple[str, float]]:
-        """Yield (name, first number) of each variable in the payload of a data frame.
-
-        Raises:
-            struct.error: the payload has another size.
-        """
+        """Yield (name, first number) of each variable in the payload of a data frame."""
         numbers = iter(self.layout.unpack(payload)[1:])
         for name, kind in zip(self.names, self.kinds, strict=True):
             count = 3 if "3D" in kind else 6 if kind.startswith("VECTOR6") else 1

@@ -26,7 +26,7 @@ from enum import IntEnum
 
 import numpy as np
 
-from hilcal.drivers.simulated.ur.state import ArmState, pose, transform
+from hilcal.drivers.simulated.ur_state import ArmState, pose, transform
 from hilcal.types import Floats
 
 PROGRAM_STOP = 4.0
@@ -77,11 +77,7 @@ class ControlScript:
     """The uploaded script, once it plays."""
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read what the client has put into the text.
-
-        Raises:
-            ValueError: it is not ur_rtde's control script.
-        """
+        """Read what the client has put into the text."""
         found = _OFFSET.search(text)
         if found is None:
             raise ValueError("not a control script")
@@ -107,12 +103,7 @@ class ControlScript:
         return max(0.0, silence - 1.0 / self.watchdog)
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on.
-
-        Raises:
-            ProtectiveStop: the program asks for one.
-            ValueError: a command that is not emulated: the program ends.
-        """
+        """Do what there is to do; return whether the program goes on."""
         if self._async and not self._arm.trajectory.moving:
             self._async = False
             self._progress(None)
@@ -295,11 +286,7 @@ class WaypointProgram:
     late = 0.0
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read the program.
-
-        Raises:
-            ValueError: it has statements that are not emulated, or no moves.
-        """
+        """Read the program."""
         self._arm = arm
         self._steps = list(_steps(text))
         if not any(isinstance(step, Move) for step in self._steps):
@@ -307,11 +294,7 @@ class WaypointProgram:
         self._work = self._run()
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on.
-
-        Raises:
-            ValueError: a motion that is refused: the program ends.
-        """
+        """Do what there is to do; return whether the program goes on."""
         return next(self._work, False)
 
     def _run(self) -> Iterator[bool]:

@@ -1,28 +1,41 @@
-"""The state machine of the controller, and the dashboard that asks it and gives it orders.
+"""The state machine of a controller, and what asks it and gives it orders, or is told its state.
 
 Of the dashboard one line asks, one line answers. Source: Universal Robots, article "Dashboard
 Server e-Series, port 29999"; the sentence of the local mode as reported in
 Universal_Robots_ROS_Driver issue 125.
+
+The Robot API of PolyScope X has the same over HTTP. Paths, bodies and the versions that have them:
+Universal Robots, "Robot API" (openapi.json of the controller), and `DashboardClientImplX` of the
+Universal Robots Client Library. Every order is refused by 403 in local mode.
+
+A package of the primary port is its size (i32), its type (u8) and a body; the body of a robot state
+is a row of parts, each with size (i32), type (u8) and body. All big-endian. Part 5, of the
+kinematics, comes with the first state after a client has connected. Source: Universal Robots,
+"Remote Control via TCP/IP", and the parsers of the Universal Robots Client Library.
 """
 
 import asyncio
 import contextlib
+import http.client
+import json
+import struct
 import time
 from collections.abc import Callable
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur.programs import (
+from hilcal.drivers.simulated.ur_programs import (
     PROGRAM_STOP,
     ControlScript,
     ProtectiveStop,
     ScriptStream,
     WaypointProgram,
 )
-from hilcal.drivers.simulated.ur.rtde import Faults
-from hilcal.drivers.simulated.ur.state import ArmState, RobotMode, Runtime, SafetyMode
+from hilcal.drivers.simulated.ur_rtde import Faults
+from hilcal.drivers.simulated.ur_state import ArmState, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
 
 SAFETY_STOP = 15.0
@@ -385,3 +398,181 @@ class DashboardServer(ClientServer):
 
 def _said(answer: OrderResult, done: str, command: str) -> str:
     return done if answer is OrderResult.DONE else f"Failed to execute: {command}"
+
+
+BASE = "/universal-robots/robot-api"
+_API_VERSIONS = (((10, 14), "5.0.107"), ((10, 12), "3.1.4"), ((10, 11), "2.0.0"))
+_BODY = 1 << 16  # bytes of the longest body that is read
+Answer = tuple[int, dict[str, Any]]
+
+
+class RobotApiServer(ClientServer):
+    """Answers the requests of every client."""
+
+    async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve a client until it goes, one request after the other."""
+        self._writers.add(writer)
+        try:
+            while line := (await reader.readline()).decode("latin-1").split():
+                head: dict[str, str] = {}
+                while name := (await reader.readline()).decode("latin-1").strip():
+                    key, _, value = name.partition(":")
+                    head[key.lower()] = value.strip()
+                body = await reader.readexactly(min(int(head.get("content-length", 0)), _BODY))
+                if self._faults.dashboard_mute:
+                    continue
+                status, told = self.answer(line[0], line[1], body)
+                text = json.dumps(told).encode()
+                words = f"HTTP/1.1 {status} {http.client.responses[status]}\r\n"
+                words += f"Content-Type: application/json\r\nContent-Length: {len(text)}\r\n\r\n"
+                writer.write(words.encode() + text)
+        except (OSError, ValueError, IndexError, asyncio.IncompleteReadError):
+            pass  # gone, or no HTTP
+        finally:
+            self._writers.discard(writer)
+            writer.close()
+
+    def answer(self, method: str, path: str, body: bytes) -> Answer:
+        """Return status and body of the answer to a request."""
+        paths = self._paths()
+        at = path.removeprefix(BASE).rstrip("/")
+        if not path.startswith(BASE) or at not in paths:
+            return 404, {"message": "Not Found"}
+        ask, order = paths[at]
+        if method == "GET" and ask is not None:
+            return 200, ask()
+        if method != "PUT" or order is None:
+            return 405, {"message": "Method Not Allowed"}
+        arm = self._controller.arm
+        try:
+            action = json.loads(body)["action"]
+        except (ValueError, KeyError, TypeError):
+            return 422, {"message": "no action"}
+        if not arm.remote:
+            arm.note(f"Robot API refused in local mode: {action}")
+            return 403, {"message": "The robot must be in remote mode"}
+        arm.note(f"Robot API: {action}")
+        return order(action)
+
+    def _paths(
+        self,
+    ) -> dict[str, tuple[Callable[[], dict[str, Any]] | None, Callable[[str], Answer] | None]]:
+        """Questions and orders by path, as the version has them."""
+        arm, version = self._controller.arm, self._controller.arm.version[:2]
+        api = next((api for since, api in _API_VERSIONS if version >= since), None)
+        if api is None:
+            return {}
+        mode, safety = arm.robot_mode.name, arm.safety_mode.name.replace("ROBOT_", "")
+        control = "REMOTE" if arm.remote else "LOCAL"
+        runs = arm.program_state
+        paths: dict[str, Any] = {
+            "/openapi.json": (lambda: {"info": {"title": "Robot API", "version": api}}, None),
+            "/robotstate/v1/state": (None, self._state),
+            "/program/v1/state": (lambda: {"state": runs}, self._program),
+        }
+        if version >= (10, 12):
+            paths["/robotstate/v1/robotmode"] = (lambda: {"mode": mode}, None)
+            paths["/robotstate/v1/safetymode"] = (lambda: {"mode": safety}, None)
+            paths["/system/v1/controlmode"] = (lambda: {"mode": control}, None)
+            paths["/system/v1/operationalmode"] = (lambda: {"mode": "AUTOMATIC"}, None)
+        if version >= (10, 14):
+            name = self._model.upper().replace("E", "e").replace("UR8LONG", "UR8L")
+            about = {"robotType": name, "serialNumber": SERIAL_NUMBER}
+            paths["/system/v1/information"] = (lambda: about, None)
+            whole = ".".join(map(str, arm.version[:3]))
+            paths["/versions/v1"] = (lambda: {"marketingVersion": whole}, None)
+        return paths
+
+    def _program(self, action: str) -> Answer:
+        match action:
+            case "stop":
+                self._controller.stop_program("Robot API")
+                return 200, {"state": "STOPPED", "message": "Program stopped"}
+            case "play" | "resume":
+                return _api_said(self._controller.play(), action)
+        return 422, {"message": f"no action {action}"}
+
+    def _state(self, action: str) -> Answer:
+        powers = {
+            "POWER_ON": RobotMode.IDLE,
+            "BRAKE_RELEASE": RobotMode.RUNNING,
+            "POWER_OFF": RobotMode.POWER_OFF,
+        }
+        if action in powers:
+            return _api_said(self._controller.power(powers[action]), action)
+        if action == "UNLOCK_PROTECTIVE_STOP":
+            return _api_said(self._controller.unlock(), action)
+        return 422, {"message": f"no action {action}"}
+
+
+def _api_said(result: OrderResult, action: str) -> Answer:
+    if result is OrderResult.DONE:
+        return 200, {"message": f"{action} done"}
+    return 409, {"message": f"{action} is not possible now: {result.value}"}
+
+
+STATE, MESSAGE = 16, 20
+MODE, KINEMATICS = 0, 5
+LINEARISED, NOT_INITIALISED = 2, 0
+_VERSION_MESSAGE = 3
+_PERIOD = 0.1  # s between states
+
+
+class PrimaryPort:
+    """Sends states to every client, and takes programs from them."""
+
+    def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
+        """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m.
+
+        `status` is that of its calibration, `LINEARISED` or `NOT_INITIALISED`.
+        """
+        self._controller, self._rows, self._status = controller, rows, status
+
+    async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Serve a client until it goes."""
+        telling = asyncio.create_task(self._tell(writer))
+        try:
+            await self._controller.take_programs(reader)
+        finally:
+            telling.cancel()
+            writer.close()
+
+    async def _tell(self, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError):
+            writer.write(self._version())
+            parts = self._kinematics()
+            while not writer.is_closing():
+                writer.write(_package(STATE, self._mode() + parts))
+                await writer.drain()
+                parts = b""
+                await asyncio.sleep(_PERIOD)
+
+    def _version(self) -> bytes:
+        major, minor, bugfix, build = self._controller.arm.version
+        name = b"URControl"
+        body = struct.pack(">QbBB", time.monotonic_ns() // 1000, -2, _VERSION_MESSAGE, len(name))
+        body += name + struct.pack(">BBii", major, minor, bugfix, build) + b"01-01-2025, 00:00:00"
+        return _package(MESSAGE, body)
+
+    def _mode(self) -> bytes:
+        arm = self._controller.arm
+        program = arm.runtime in (Runtime.PLAYING, Runtime.PAUSED, Runtime.PAUSING)
+        flags = (
+            *(True, True, arm.robot_mode.value >= 4, arm.safety_bits & 0b11000000 > 0),
+            *(arm.safety_bits & 4 > 0, program, arm.runtime is Runtime.PAUSED),
+        )
+        body = struct.pack(
+            ">Q7?BBdddB", time.monotonic_ns() // 1000, *flags, arm.robot_mode.value, 0,
+            arm.slider, arm.scaling, 1.0, 0,
+        )  # fmt: skip
+        return _package(MODE, body)
+
+    def _kinematics(self) -> bytes:
+        valid = 0 if self._status == LINEARISED else 0xFFFFFFFF
+        body = struct.pack(">6I", *([valid] * 6))
+        body += struct.pack(">24d", *self._rows.ravel()) + struct.pack(">I", self._status)
+        return _package(KINEMATICS, body)
+
+
+def _package(kind: int, body: bytes) -> bytes:
+    return struct.pack(">iB", 5 + len(body), kind) + body
