@@ -71,11 +71,7 @@ class EmsconOptions(Section):
 
 
 class EmsconConnection:
-    """One connection to an emScon server: commands, results, and what it sends by itself.
-
-    Attributes:
-        changes: changes of its state that nobody has looked at yet.
-    """
+    """One connection to an emScon server; `changes` of its state wait to be looked at."""
 
     def __init__(self, host: str, port: int) -> None:
         """Connect; raises DeviceError where nobody answers within `CONNECT_S`."""
@@ -152,7 +148,7 @@ class EmsconConnection:
             raise
 
     def _packet(self, until: float) -> tuple[int, bytes]:
-        """Return type and content of the next packet; changes of state are kept aside.
+        """Type and content of the next packet; changes of state are kept aside.
 
         With `until` 0, BlockingIOError tells that none waits.
         """
@@ -223,10 +219,7 @@ class EmsconTracker:
             raise
 
     def measure(self) -> TrackerSample:
-        """Measure once, see `hilcal.measuring.devices.TrackerDevice.measure`.
-
-        Also refused is a reading of another reflector than the one that was set.
-        """
+        """Measure once; a reading of another reflector than the one that was set is refused."""
         found = self._measure()
         self._distance = float(np.linalg.norm(found.position))
         stated = found.covariance
@@ -358,11 +351,7 @@ class EmsconTracker:
         return time.monotonic() + DEADLINE_S + seconds
 
     def _ready(self, seconds: float = 0.0) -> float:
-        """See that the tracker is there and set as at first; return a deadline so much later.
-
-        A connection that failed is made anew; where the server says that something was changed,
-        settings are looked at again.
-        """
+        """See that the tracker is connected and set as at first; a deadline so much later."""
         until = self._soon(seconds)
         again = not self._line.open
         if again:

@@ -24,10 +24,7 @@ from hilcal.types import Floats, Ints
 
 
 def crc_table(polynomial: int) -> tuple[int, ...]:
-    """Return the 256 remainders of a reflected 16-bit polynomial, for one byte at a time.
-
-    D. V. Sarwate, Computation of cyclic redundancy checks via table look-up, CACM 31 (1988).
-    """
+    """Return the 256 remainders of a reflected 16-bit polynomial, for one byte at a time."""
     table = []
     for value in range(256):
         for _ in range(8):
@@ -74,12 +71,8 @@ class Deframer:
 
     A 16-bit checksum passes 1 of 65536 wrong candidates, and while looking for the next header
     every byte is a candidate. So a frame that does not follow a good one directly counts only
-    once a second good frame follows it directly.
-
-    Attributes:
-        corrupt: frames with a wrong checksum; several candidates inside one length count once.
-        skipped: bytes that belonged to no good frame; both from the first good frame on, for
-            who begins to listen comes into the middle of one.
+    once a second good frame follows it directly. `corrupt` frames (several candidates inside one
+    length are one) and `skipped` bytes count from the first good frame on.
     """
 
     def __init__(self, frame: FrameFormat) -> None:
@@ -148,9 +141,6 @@ class ByDeviceClock:
 
     A frame whose time is not shortly after its predecessor's is out of place, unless its
     successor follows on it (then the device has begun to count anew).
-
-    Attributes:
-        lost: frames so far.
     """
 
     LEARN = 20
@@ -171,11 +161,7 @@ class ByDeviceClock:
         return 1.0 / (self._period * self._tick) if self._period else 0.0
 
     def follow(self, count: int, ticks: Sequence[int], now: float) -> list[bool]:
-        """Take frames that came together; return which of them are in their place.
-
-        `ticks` is the device's clock at each, empty where it has none; `now` is when they were
-        read, s, and nothing was left to read.
-        """
+        """Return which of the frames that came together, read at `now`, s, are in their place."""
         return [self._in_place(tick) for tick in ticks]
 
     def _in_place(self, tick: int) -> bool:
@@ -328,14 +314,8 @@ class ForceStream:
     ) -> None:
         """Start to read an open port, which `close` closes.
 
-        Args:
-            port: open.
-            sensor: what it sends.
-            name: the maker's, with the serial number where known.
-            facts: for the report, besides those of the stream.
-            deframer: takes the frames out of the bytes where `sensor.frame` does not tell how.
-            failures: turns what the port raises into DeviceError, from the device and its place.
-            before_close: sends the last command to the sensor; must not raise.
+        `deframer` takes the frames out of the bytes where `sensor.frame` does not tell how;
+        `failures` turns what the port raises into DeviceError; `before_close` must not raise.
         """
         self._name, self._facts, self._before_close = name or sensor.name, facts, before_close
         self._port, self._sensor, self._failures = port, sensor, failures
@@ -552,10 +532,7 @@ def streaming(stream: ForceStream, seconds: float = FIRST_FRAME_S) -> ForceStrea
 
 
 def open_streaming(section: Section, baud: int, sensor: SensorFormat) -> ForceStream:
-    """Open the port of a sensor that streams from power-on, and wait for the first frame.
-
-    The rate of the configuration comes before `baud`, the one of the sensor as delivered, Bd.
-    """
+    """Open the port of a sensor that streams from power-on, and wait for the first frame."""
     path = serial_port(section)
     port = open_port(DEVICE, path, section.baud or baud)
     try:

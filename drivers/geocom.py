@@ -207,11 +207,9 @@ class Link:
         until: float,
         seconds: float = ANSWER_S,
     ) -> Reply:
-        """Send a request until it is answered without damage.
+        """Send a request until it is answered without damage, by `until`, `time.monotonic` s.
 
-        `values` are its arguments, of which floats stay floats on the line; `parsers` one per value
-        of the reply; `until` the deadline of all tries together, `time.monotonic` s; `seconds` how
-        long one answer may take.
+        `parsers` are one per value of the reply; one answer may take `seconds`.
         """
         complaint, silent, damaged = "", 0, 0
         while damaged < _TRIES and time.monotonic() < until:

@@ -25,11 +25,7 @@ BY_ID = Path("/dev/serial/by-id")
 
 
 def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial.Serial:
-    """Open a serial port, 8N1, raw, locked against every other program that asks.
-
-    `device` is its part in the cell, for messages; `baud` the rate, Bd; `timeout` of reads and
-    writes, s.
-    """
+    """Open a serial port, 8N1, raw, locked against every other program that asks."""
     try:
         return serial.Serial(
             path, baud, timeout=timeout, write_timeout=max(timeout, 0.5), exclusive=True

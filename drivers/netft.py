@@ -72,15 +72,7 @@ class NetFtOptions(Section):
 
 
 class Datagrams:
-    """Records as they come, behind the names of a port and of a deframer (`force_stream`).
-
-    Attributes:
-        port: where the sensor is.
-        baudrate: 0, there is none.
-        frames: good records.
-        corrupt: datagrams of a wrong length.
-        skipped: 0.
-    """
+    """Records as they come, behind the names of a port and of a deframer (`force_stream`)."""
 
     baudrate = 0
     skipped = 0

@@ -22,11 +22,7 @@ ANSWERS = "Enter = done, q = give up: "
 
 
 class TerminalOperator:
-    """Asks on standard error and listens to standard input.
-
-    Attributes:
-        at_terminal: true, see `hilcal.measuring.devices.TerminalPerson`.
-    """
+    """Asks on standard error and listens to standard input."""
 
     def __init__(self, config: CellConfig) -> None:
         """Remember where loads act and which way weights pull."""

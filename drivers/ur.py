@@ -293,10 +293,7 @@ class UrArm:
             control.give_back()
 
     def _end_program(self) -> None:
-        """End a program of ours that has outlived its process.
-
-        After a lost link ur_rtde may have uploaded it again, with no watchdog.
-        """
+        """End a program of ours that ur_rtde may have uploaded again after a lost link."""
         if self._was_ours and not self._silent:
             with contextlib.suppress(LinkError):
                 self._generation.supervision.stop(_ASK_S)

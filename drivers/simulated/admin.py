@@ -38,8 +38,7 @@ def ask(path: Path, op: str, timeout: float = 5.0, **arguments: Any) -> Any:
 def serve(path: Path, handler: Handler) -> None:
     """Answer requests in a daemon thread; `handler(op, arguments)` returns what JSON can hold.
 
-    An exception of the handler is returned to the client. The socket appears only when it
-    answers, so its existence shows that the device is ready.
+    An exception is returned to the client. The socket appears only when it answers.
     """
     new = path.with_name(path.name + ".new")
     new.unlink(missing_ok=True)
@@ -73,10 +72,9 @@ def serve(path: Path, handler: Handler) -> None:
 
 
 class Operations:
-    """What can be asked of a device by name: its faults and its state, a function each.
+    """What can be asked of a device by name, a function each; None is answered with the state.
 
-    Arguments are given by name. What returns nothing is answered with the state. `die` ends the
-    process at once, as a crash does.
+    Arguments are given by name. `die` ends the process at once, as a crash does.
     """
 
     def __init__(
@@ -117,10 +115,7 @@ def device_parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 def end_with_parent() -> None:
-    """Exit at once when standard input closes (the parent holds its other end).
-
-    A pipe ends with any death, also of kill -9; asynchronous and on every platform.
-    """
+    """Exit at once when standard input closes: the parent holds its other end."""
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 4096):

@@ -39,10 +39,7 @@ ROOM = 22.0
 
 @dataclass(slots=True, eq=False)
 class StrainGauge:
-    """The sensor's measuring bridge: what strain gauges make of the true wrench.
-
-    wrench = true + bias + drift (T - T_start) + overload + noise
-    """
+    """The measuring bridge: wrench = true + bias + drift (T - T_start) + overload + noise."""
 
     board: Blackboard
     rng: np.random.Generator
@@ -92,12 +89,7 @@ class StrainGauge:
 
 
 class SensorProtocol:
-    """A sensor's wire protocol; this one streams from power-on and takes no commands.
-
-    Attributes:
-        baud: the line's rate, Bd.
-        noise: of one frame, force in N and moment in N·m.
-    """
+    """A sensor's wire protocol; this one streams from power-on and takes no commands."""
 
     baud = 0
     noise = (0.0, 0.0)
@@ -109,10 +101,7 @@ class SensorProtocol:
         self.streaming = True
 
     def frame(self, number: int, wrench: Floats, temperature: float) -> bytes:
-        """Return one frame of a wrench (6,), N and N·m, and a temperature, °C.
-
-        `number` counts frames since power-on, lost ones, too.
-        """
+        """Return frame `number` since power-on of a wrench (6,) and a temperature, °C."""
         raise NotImplementedError
 
     def receive(self, data: bytes, wrench: Floats) -> bytes:
@@ -134,12 +123,7 @@ def crc16_x25(data: bytes) -> int:
 
 
 class Bota(SensorProtocol):
-    """Bota Systems Rokubi and SensONE.
-
-    Frame (Bota Systems' public Arduino and ROS drivers): `AA`, `<H6fIf` of status, wrench, device
-    time in µs and °C, then CRC-16/X25 over those 34 bytes, little-endian: 37 bytes at 460800 Bd.
-    Status bits: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values.
-    """
+    """Bota Systems Rokubi and SensONE; the frame is described in `hilcal.drivers.bota`."""
 
     baud = 460800
     noise = (0.05, 0.002)
@@ -171,12 +155,7 @@ class Bota(SensorProtocol):
 
 
 class Hex(SensorProtocol):
-    """OptoForce (OnRobot) HEX, 10 to 1000 Hz.
-
-    Frame (OptoForce, "OptoForce General DAQ", 6-axis): `AA 07 08 10`, `>HH6h` of counter, status,
-    wrench in counts, then the sum of all bytes before it as a big-endian u16: 22 bytes at 1 MBd.
-    The counts per newton are each sensor's own; here 50 per N and 2000 per N·m.
-    """
+    """OptoForce (OnRobot) HEX, 10 to 1000 Hz, described in `hilcal.drivers.onrobot_hex`."""
 
     baud = 1_000_000
     noise = (0.05, 0.001)
@@ -201,12 +180,7 @@ _STOP_BYTES = 50
 
 
 class Ft300(SensorProtocol):
-    """Robotiq FT 300: Modbus RTU slave 9, and a stream of its own; it tells no time.
-
-    Robotiq, "FT 300 Instruction Manual", chapters "Modbus RTU" and "Data stream": 19200 Bd 8N1,
-    100 Hz, frame `20 4E`, six int16 (N·100, N·m·1000), CRC-16/MODBUS over all before it, everything
-    little-endian. Writing 0200 to register 410 starts the stream, fifty bytes FF stop it.
-    """
+    """Robotiq FT 300, described in `hilcal.drivers.ft300`; it tells no time."""
 
     baud = 19200
     noise = (0.1, 0.005)

@@ -14,10 +14,7 @@ JOINT, BY = 2, 4
 
 
 class Invented(Effect):
-    """dq_3 = a cos(q_5) τ_3: joint 3 gives way to its torque τ_3 by the angle q_5 of the wrist.
-
-    As where a bundle of hoses along the forearm stiffens it, or not, with the turn of the wrist.
-    """
+    """dq_3 = a cos(q_5) τ_3: joint 3 gives way by the angle of the wrist, as with hoses."""
 
     name = "invented"
     summary = "dq_3 = a·cos(q_5)·τ_3"

@@ -65,9 +65,8 @@ class SimulatedOperator:
 def open_operator(config: CellConfig) -> SimulatedOperator:
     """Return the simulated operator of a configuration.
 
-    Its [operator] options are `socket`, the admin socket of the simulated world, `hand_s`, how long
-    a change of the load takes, s of cell time, and `person`: true where it is left to the person at
-    the terminal, whose every answer is then true in the simulated world.
+    Its [operator] options are `socket`, the world's admin socket, `hand_s`, how long a change of a
+    load takes, s of cell time, and `person`: true where it is left to the person at the terminal.
     """
     options = config.operator.options
     for key in options:

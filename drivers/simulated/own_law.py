@@ -51,11 +51,7 @@ class OwnLaw:
     ) -> tuple[Floats, Floats]:
         """Return by how much N readings are displaced (N, 3) and turned (N, 3, 3), sensor axes.
 
-        Args:
-            cell: the cell as configured.
-            frame: (4, 4) the true T_sensor_base.
-            compliance: (n,) of the drives, rad/(N·m), which the law may build on.
-            states: N states.
+        `frame` is the true T_sensor_base, `compliance` (n,) that of the drives, rad/(N·m).
         """
         if not self.effect.computable(states):
             needs = ", ".join(self.effect.needs)

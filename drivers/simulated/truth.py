@@ -38,10 +38,7 @@ _GUIDE = {"x": (2, 3, 4), "y": (2, 3, 4), "z": (1,)} | dict.fromkeys(_TURNS, (1,
 
 
 def long_links(arm: Arm) -> Ints:
-    """Return the numbers k of the (at most two) links that are longer than a third of the longest.
-
-    Only links between two joints count: upper arm and forearm of a usual arm.
-    """
+    """Return the numbers k of the two links between joints that are over a third of the longest."""
     lengths = np.linalg.norm(arm.links[1:-1, :3, 3], axis=1)
     longest = np.argsort(-lengths, kind="stable")[:2]
     return np.sort(longest[lengths[longest] > lengths.max() / 3.0]) + 1
@@ -190,10 +187,7 @@ def drive_errors(hidden: Truth, arm: Arm, states: States, reference: float) -> F
 
 
 def guide_motion(hidden: Truth, arm: Arm, states: States) -> Floats | None:
-    """Return the (N, g, 6) motions of the carriages of slides by errors of their guides; or None.
-
-    About the carriage, axes with z along the travel, m and rad; P_1 to P_4 are written out.
-    """
+    """Return the (N, g, 6) motions of carriages by errors of their guides, z along; or None."""
     if not np.any(hidden.guide_error):
         return None
     slides = arm.slides
@@ -248,10 +242,7 @@ def crossing_torque(arm: Arm) -> Floats:
 
 
 def link_growth(hidden: Truth, states: States) -> Floats | None:
-    """Return the (N,) factor on all lengths of the links, 1 + alpha (T - 20 °C); None: 1.
-
-    T is that of the air, or the mean of the joints' where the states do not carry it.
-    """
+    """Return the (N,) factor on lengths, 1 + alpha (T - 20 °C), T of air or joints; None: 1."""
     if not np.any(hidden.thermal_growth):
         return None
     temperature = states.air_temperature

@@ -64,12 +64,7 @@ class OrderResult(Enum):
 
 
 class Controller:
-    """Runs one program at a time, and stops it for every reason there is.
-
-    Attributes:
-        unlock_after: real time before a protective stop can be unlocked, s.
-        hears: whether the client that writes an integer register has an open link.
-    """
+    """Runs one program at a time, and stops it for every reason there is."""
 
     def __init__(self, arm: ArmState, board: Blackboard) -> None:
         """Take over the state; publishes it."""
@@ -176,7 +171,7 @@ class Controller:
         arm.safety_mode = SafetyMode.PROTECTIVE_STOP
         self._compiling = None
         arm.runtime = Runtime.STOPPED if self._program is None else Runtime.PAUSING
-        self._interrupted = arm.trajectory.told or self._interrupted
+        self._interrupted = arm.trajectory.goal or self._interrupted
         arm.trajectory.stop(SAFETY_STOP, arm.clock.now)
         self.step()
 
@@ -332,10 +327,7 @@ class DashboardServer(ClientServer):
             writer.close()
 
     def answer(self, words: str, local: bool) -> str:
-        """Return the answer to a line.
-
-        A connection that was made in `local` mode never gets more rights.
-        """
+        """Return the answer to a line; a connection made in `local` mode never gets more rights."""
         command = words.lower()
         asked = self._questions().get(command)
         if asked is not None:
@@ -522,10 +514,7 @@ class PrimaryPort:
     """Sends states to every client, and takes programs from them."""
 
     def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
-        """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m.
-
-        `status` is that of its calibration, `LINEARISED` or `NOT_INITIALISED`.
-        """
+        """Serve a controller of the kinematics `rows` (4, 6), theta, a, d, alpha, with a `status`."""
         self._controller, self._rows, self._status = controller, rows, status
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:

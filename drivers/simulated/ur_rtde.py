@@ -161,7 +161,6 @@ class Sensors:
     """Values of one instant; `refresh` begins the next.
 
     Where nobody has written the truth, the arm is rigid and carries what it has been told.
-    The sensor in the flange is taken as aligned with the cell's force sensor.
     """
 
     def __init__(self, arm: ArmState, board: Blackboard, rng: np.random.Generator) -> None:
@@ -290,10 +289,7 @@ class Sensors:
         return np.asarray(np.array(self.value("target_moment")) / _TORQUE_PER_AMPERE)
 
     def _measured_torque(self) -> Floats:
-        """What the drives exert: against load and weight, and against the friction of the arrival.
-
-        A gear that has stopped on its way in direction s keeps on being pushed in it.
-        """
+        """What the drives exert against load, weight, and the friction of the arrival."""
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 

@@ -197,10 +197,7 @@ class World:
         return error
 
     def rest(self, states: States, slip: Floats | None = None) -> Equilibrium:
-        """Return the static equilibrium of N states.
-
-        `slip` (N, n) is how far each drive missed its command, rad (repeatability).
-        """
+        """Return the equilibrium of N states; drives missed their command by `slip` (N, n), rad."""
         q = self.cell.arm.chain_angles(states.q) + self.joint_errors(states)
         guided = guide_motion(self.physics, self.cell.arm, states)
         return equilibrium(
@@ -311,12 +308,10 @@ class World:
 def stand(cell: Cell, rng: np.random.Generator, distance: float = 3.0) -> tuple[Floats, Floats]:
     """Place the tracker: return the true T_sensor_base and T_station_sensor, (4, 4) each.
 
-    An unknown registration is drawn: the station `distance` away from the base at a height
+    An unknown registration is drawn: the station `distance`, m, away from the base at a height
     near the arm's, turned about the vertical at random. A known one is the truth; where its
     origin lies within the arm's reach (readings in base axes) the instrument itself stands
     `distance` away from it.
-
-    `distance` is from the base to the station, m.
     """
     if cell.arm.slides.any():  # beside the rail, wherever on it the arm stands
         distance = max(distance, cell.arm.reach + 1.0)

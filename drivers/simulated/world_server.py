@@ -61,9 +61,6 @@ class SimulatedMount:
         """Return the (6,) wrench of tool and load on the sensor, its axes, N and N·m.
 
         f = Rᵀ (m g + f_load),  tau = Rᵀ ((c - o) × m g + (p - o) × f_load + tau_load)
-
-        Orientation `turn` (3, 3) of the flange and wrench (6,) of the load at its point are in
-        base axes.
         """
         cell = world.cell
         weight = cell.tool_mass * cell.gravity
@@ -104,13 +101,10 @@ class Swing:
 
 
 class WorldState:
-    """Looks at the arm, computes where it rests, and publishes what is true.
+    """Looks at the arm, computes where it rests, and publishes what is true; from any thread.
 
     The arm's repeatability: with every arrival the joints miss their command anew by
-    `joint_std`; the miss stays until the next arrival. Encoders sit at the motors, so they
-    see neither it nor the elastic deflection.
-
-    Every public method may be called from any thread.
+    `joint_std`. Encoders sit at the motors: they see neither that nor the elastic deflection.
     """
 
     def __init__(self, world: World, config: CellConfig, board: Blackboard, seed: int) -> None:
@@ -202,10 +196,7 @@ class WorldState:
     def swing(self, wrench: Sequence[float], period: float, decay: float) -> None:
         """Let every load that is hung from now on swing for a while; zeros: hang still.
 
-        w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change.
-
-        `wrench` (6,) is that at the start, base axes, N and N·m; period and decay are over 0, s of
-        world time.
+        w(t) = w exp(-t / decay) cos(2 pi t / period) adds to the load, t after its change, s.
         """
         start = _six("swing", wrench)
         if not (period > 0.0 and decay > 0.0):
@@ -339,11 +330,7 @@ _LATER = ("joint_coupling", "guide_error")
 
 
 def write_world(path: Path, world: World, config: CellConfig, base_dir: Path | None = None) -> None:
-    """Write the world and the configuration of its cell; floats keep every bit.
-
-    The file appears whole or not at all; `base_dir` is what a robot's path in `config` is relative
-    to.
-    """
+    """Write the world and the configuration of its cell, whole or not at all, with every bit."""
     other = _differences(world.cell, cell_from_config(config, base_dir))
     if other:
         raise InputError(

@@ -45,11 +45,7 @@ def stands(reading: Reading) -> bool:
 
 
 class MotionInProgress:
-    """A commanded motion, and how much of its time it has used.
-
-    Attributes:
-        brake: deceleration for stopping it, rad/s².
-    """
+    """A commanded motion, how much of its time it has used, and how it `brake`s, rad/s²."""
 
     def __init__(
         self,
@@ -60,11 +56,7 @@ class MotionInProgress:
         arrival: float,
         clock: float,
     ) -> None:
-        """Begin, from `start` to `goal` (6,), rad.
-
-        Speed and acceleration are of the leading joint, rad/s and rad/s²; `arrival` is the largest
-        joint error at its end, rad; `clock` cell seconds per real second.
-        """
+        """Begin, from `start` to `goal` (6,), rad; `clock` is cell seconds per real second."""
         self.brake = deceleration(speed)
         self._goal, self._arrival = goal, arrival
         self._usual = duration(start, goal, speed, acceleration) / clock
@@ -302,8 +294,7 @@ class Brakes:
     def halt(self, control: Control | None, brake: float, lost: str = "") -> Halt:
         """Stop in every way, which ends control; never raises.
 
-        `brake` is the deceleration of the leading joint, rad/s²; `lost` why the link is lost, if it
-        is known to be.
+        `brake` is the deceleration of the leading joint, rad/s²; `lost` why the link is lost.
         """
         if control is not None:
             try:
@@ -351,10 +342,7 @@ class Brakes:
             time.sleep(_TAKEN_S)
 
     def _until_still(self, seconds: float, *, program: bool) -> Reading | None:
-        """Return the second of two readings at rest in a row; None if there is none in time.
-
-        With `program`, nothing may be running either that could move the arm again.
-        """
+        """The second of two readings at rest in a row; with `program` none may run that could go on."""
         end, still = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             reading = self.receiver.read(STALE_S)
@@ -387,10 +375,7 @@ def cause_of(supervision: Supervision, halt: Halt, noticed: str) -> tuple[str, s
 
 
 def program_ended(reading: Reading, late: float) -> str:
-    """Return why the robot's program does not play any more, as far as it is known.
-
-    `late` is the longest pause in the signs of life to the robot's watchdog, s; 0 for none.
-    """
+    """Return why the robot's program ended; `late` is the longest pause in the signs of life, s."""
     busy = f"this computer was too busy for {late:.2f} s to show that it lives"
     if late > 1.0 / WATCHDOG_HZ:
         return f"its watchdog stopped it: {busy}"

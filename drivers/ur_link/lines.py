@@ -7,11 +7,7 @@ from typing import Self
 
 
 class LinkError(Exception):
-    """A connection failed; the text names it and the reason.
-
-    Attributes:
-        refused: nobody listens on the port.
-    """
+    """A connection failed; the text names it and the reason; `refused`: nobody listens there."""
 
     def __init__(self, text: str, *, refused: bool = False) -> None:
         """Keep the cause."""
@@ -20,10 +16,7 @@ class LinkError(Exception):
 
 
 class Connection:
-    """An open connection; every call ends before the deadline, given at the opening at first.
-
-    Where the connection broke or the deadline passed a call raises LinkError.
-    """
+    """An open connection; every call ends before the deadline, or raises LinkError."""
 
     def __init__(self, host: str, port: int, what: str, seconds: float) -> None:
         """Connect to the service `what`; all of it has to be done within so many seconds."""

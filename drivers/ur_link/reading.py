@@ -237,11 +237,7 @@ def survey(
     silent: str,
     needs_primary: bool,
 ) -> Report:
-    """Ask everything that can be asked without moving.
-
-    `silent` is why the supervision does not answer, empty where it does; `needs_primary` tells
-    whether programs go by the primary port.
-    """
+    """Ask everything that can be asked without moving; `silent` is why nobody supervises."""
     version = states.version_word(controller.version)
     facts = [("address", host), ("controller version", version)]
     fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
@@ -294,10 +290,7 @@ def survey(
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:
-    """Packets per second of the `hz` that were asked for; counted again for longer where few.
-
-    A computer that was busy for some tenths of a second is no broken network.
-    """
+    """Packets per second of the `hz` that were asked for; counted again for longer where few."""
     rate = count(_RATE_S[0])
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])
 

@@ -32,11 +32,7 @@ def environment() -> dict[str, str]:
 
 
 class WorkerError(Exception):
-    """A worker did not carry out a request; the text gives the reason.
-
-    Attributes:
-        lost: the process is gone (it crashed, or was ended because it did not answer).
-    """
+    """A worker did not carry out a request, and why; `lost`: the process is gone."""
 
     def __init__(self, text: str, *, lost: bool) -> None:
         """Keep the cause."""
@@ -45,10 +41,9 @@ class WorkerError(Exception):
 
 
 class Worker:
-    """A child process `python -m MODULE` that answers requests in JSON lines.
+    """A child process `python -m MODULE` that answers requests in JSON lines, one after the other.
 
-    It ends when this process ends, however that happens (see `child`). What the client library
-    prints is dropped. Calls of several threads are taken one after the other.
+    It ends when this process ends. What the client library prints is dropped.
     """
 
     def __init__(self, module: str, arguments: tuple[str, ...], seconds: float) -> None:
@@ -156,10 +151,7 @@ _NICE = -10
 
 
 def end_with_parent(life: int, parent: int) -> None:
-    """End this process when the parent ends; Ctrl-C is for the parent alone.
-
-    `life` is the file descriptor of the reading end of the parent's pipe, `parent` its number.
-    """
+    """End this process when the parent ends, which closes the pipe `life`; never by Ctrl-C."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGIO, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGIO})
@@ -241,11 +233,7 @@ def words(error: BaseException) -> str:
 
 
 def start() -> tuple[Line, list[str]]:
-    """Begin a worker process; returns the line to the parent and the other arguments.
-
-    Where it is allowed, the process and its later threads go before others: it needs little
-    time, but in time.
-    """
+    """Begin a worker process; the line to the parent, and the other arguments."""
     life, parent = int(sys.argv[1]), int(sys.argv[2])
     end_with_parent(life, parent)
     with contextlib.suppress(OSError):

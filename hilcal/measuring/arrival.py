@@ -61,10 +61,9 @@ class RoughRegistration:
         self._repeated: list[tuple[Step, str]] = []
 
     def add(self, q: Floats, position: Floats, target: int = 0, step: Step | None = None) -> None:
-        """Take note of a reading: joint angles (n,) and position (3,), sensor axes, m.
+        """Take note of a reading for a step: joint angles (n,) and position (3,), sensor axes, m.
 
-        One that repeats an earlier one is left out; older versions stored such. `step` is the one
-        that it was stored for, None at the positions of the start.
+        One that repeats an earlier one is left out; older versions stored such.
         """
         held = self._positions(q)[target]
         if self._stuck(held, position, target) is not None:
@@ -78,8 +77,7 @@ class RoughRegistration:
         """Return the stored readings that may not be of their target, each once, and why.
 
         They were stored while nothing told where the tracker stands: those that do not fit as soon
-        as that is known, and until then the one that the next reading repeated, which may be of
-        something at rest itself.
+        as that is known, and until then the one that the next reading repeated.
         """
         pose = self.pose()
         if pose is None:
@@ -98,10 +96,7 @@ class RoughRegistration:
         return out
 
     def doubt_repeated(self, q: Floats, position: Floats, target: int = 0) -> None:
-        """Doubt the reading that a refused one repeats, unless the tracker's place vouches for it.
-
-        The arguments are those of `add`.
-        """
+        """Doubt the reading that a refused one repeats, unless the tracker's place is known."""
         if self._stuck(self._positions(q)[target], position, target) is None or self.pose():
             return
         last = max(k for k, t in enumerate(self._target) if t == target)
@@ -166,10 +161,7 @@ class RoughRegistration:
         )
 
     def _stuck(self, held: Floats, position: Floats, target: int) -> str | None:
-        """Why a reading is the one before it or of something at rest, or None.
-
-        Distances between positions do not depend on where the tracker stands.
-        """
+        """Why a reading is the one before it, or of something at rest; or None."""
         same = np.flatnonzero(np.array(self._target) == target)
         if not len(same):
             return None
@@ -187,9 +179,9 @@ class RoughRegistration:
         )
 
     def _apart(self, held: Floats, position: Floats) -> float:
-        """By how much most distances from the other readings are not those of the arm, m.
+        """Median of how much distances from the other readings are not those of the arm, m.
 
-        The median; zero with fewer than two, of which one may be wrong itself.
+        Zero with fewer than two, of which one may be wrong itself.
         """
         if len(self._held) - len(self._doubted) < WITNESSES:
             return 0.0
@@ -203,8 +195,7 @@ class RoughRegistration:
     def repeatability(self, q: Floats, joint_std: Floats) -> Floats:
         """Return the (3, 3) covariance that the joints' scatter adds to a position, sensor axes.
 
-        J Σ_q Jᵀ at the target; while the tracker's axes are unknown its mean over all
-        directions, tr(J Σ_q Jᵀ)/3.
+        J Σ_q Jᵀ at the target; while the tracker's axes are unknown tr(J Σ_q Jᵀ)/3.
         """
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         point = chain.point(self._cell.target[:3, 3])

@@ -80,16 +80,7 @@ class _Wanted:
 
 
 def driver(group: str, name: str, key: str) -> Factory:
-    """Return the factory of a driver by name.
-
-    Args:
-        group: the group of entry points, see `devices`.
-        name: the driver's name, or its place as "module:function".
-        key: where the configuration gives it, for messages.
-
-    Raises:
-        InputError: unknown name (lists the valid ones), or the driver cannot be loaded.
-    """
+    """Return the factory of a driver by its name, or its place "module:function"."""
     found = {point.name: point for point in entry_points(group=group)}
     if ":" in name:
         found[name] = EntryPoint(name, name, group)
@@ -111,12 +102,8 @@ def driver(group: str, name: str, key: str) -> Factory:
 def connect(config: CellConfig) -> tuple[Rig | None, tuple[ConnectionResult, ...]]:
     """Open every device at once; nothing moves.
 
-    Returns:
-        The rig, None where a device did not open (the others are closed again), and what
-        became of each device.
-
-    Raises:
-        InputError: the configuration names no driver for a part, or an unknown one.
+    Returns the rig, None where a device did not open (the others are closed again), and what
+    became of each. InputError: the configuration names no driver for a part, or an unknown one.
     """
     wanted = _wanted(config)
     factories = [_factory(one) for one in wanted]
@@ -201,11 +188,7 @@ def told_by(answers: tuple[ConnectionResult, ...]) -> FactoryKinematics | None:
 def with_kinematics(
     answers: tuple[ConnectionResult, ...], cell: Cell
 ) -> tuple[ConnectionResult, ...]:
-    """Return what the devices said, with how the arm's kinematics differ from the cell's.
-
-    It is a problem where they are not those of [robot] calibration, and where they are of another
-    arm of the catalogue than [robot] model.
-    """
+    """Return what the devices said, with how the arm's kinematics differ from the cell's."""
     return tuple(_compared(a, cell) if told_by((a,)) is not None else a for a in answers)
 
 

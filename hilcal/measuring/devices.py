@@ -109,20 +109,11 @@ class ArmDevice(Protocol):
         ...
 
     def sample(self) -> ArmSample:
-        """Return a sample younger than 0.2 s (real time).
-
-        Raises:
-            DeviceError: the link is dead or stale.
-        """
+        """Return a sample younger than 0.2 s (real time), or raise DeviceError."""
         ...
 
     def take_control(self, mass: float, com: Floats) -> None:
-        """Take control of the arm, and set its payload.
-
-        Args:
-            mass: payload at the flange, kg.
-            com: (3,) its centre of mass, flange axes, m.
-        """
+        """Take control of the arm; set its payload, kg and m (flange axes)."""
         ...
 
     def set_payload(self, mass: float, com: Floats) -> None:
@@ -130,32 +121,23 @@ class ArmDevice(Protocol):
         ...
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
-        """Start a motion along a straight line in joint space and return at once.
+        """Start a straight line in joint space to q (n,) and return at once.
 
-        Args:
-            q: (n,) goal, rad.
-            speed: of the leading joint, rad/s.
-            acceleration: of the leading joint, rad/s².
+        Speed and acceleration are those of the leading joint, rad/s and rad/s².
         """
         ...
 
     def moving(self) -> bool:
         """Whether the motion is still going on; call at least every 0.1 s (real time).
 
-        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself.
-
-        Raises:
-            DeviceError: the motion failed or the robot is not in a state to move: protective
-                stop, emergency stop, program stopped, link lost; the arm has been stopped.
+        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself. It raises
+        DeviceError, the arm stopped, where the motion failed or the robot is not in a state to move:
+        protective stop, emergency stop, program stopped, link lost.
         """
         ...
 
     def stop(self) -> None:
-        """Stop the arm by every way there is; returns when it stands.
-
-        Raises:
-            DeviceError: it could not be made sure that it stands.
-        """
+        """Stop the arm by every way there is; DeviceError: not sure that it stands."""
         ...
 
     def close(self) -> None:
@@ -183,21 +165,11 @@ class TrackerDevice(Protocol):
         ...
 
     def measure(self) -> TrackerSample:
-        """Measure once.
-
-        Raises:
-            TargetLostError: no target, beam broken, lock lost, no distance.
-            DeviceError: the instrument or its line failed.
-        """
+        """Measure once; TargetLostError: no target, beam broken, lock lost, no distance."""
         ...
 
     def find_target(self) -> None:
-        """Search and lock the target again.
-
-        Raises:
-            TargetLostError: not found.
-            DeviceError: the instrument or its line failed.
-        """
+        """Search and lock the target again; TargetLostError: not found."""
         ...
 
     def close(self) -> None:
@@ -210,15 +182,9 @@ class PointingTracker(TrackerDevice, Protocol):
     """A tracker that can be told which of several targets to measure."""
 
     def aim(self, position: Floats, radius: float) -> None:
-        """Turn to where a target is expected, find the one that is there, and lock on it.
+        """Turn to where a target is expected (3,), sensor axes, m; find and lock it.
 
-        Args:
-            position: (3,) sensor axes, m.
-            radius: a target farther from there is another one, m.
-
-        Raises:
-            TargetLostError: there is none.
-            DeviceError: the instrument or its line failed.
+        One farther than `radius` from there is another one; TargetLostError: there is none.
         """
         ...
 
@@ -252,19 +218,11 @@ class ForceSensorDevice(Protocol):
         ...
 
     def latest(self) -> WrenchSample:
-        """Return the newest frame, younger than 0.2 s.
-
-        Raises:
-            DeviceError: the stream is dead or stale.
-        """
+        """Return the newest frame, younger than 0.2 s; DeviceError: the stream is dead or stale."""
         ...
 
     def average(self, seconds: float) -> WrenchSample:
-        """Return the mean of the frames that come in the next so many real seconds.
-
-        Raises:
-            DeviceError: the stream is dead, or gave too few frames.
-        """
+        """Return the mean of the frames of the next so many real seconds; DeviceError: too few."""
         ...
 
     def losses(self) -> Losses:
@@ -286,12 +244,7 @@ class OperatorDevice(Protocol):
     def hang(self, load: CellLoad | None, why: str) -> None:
         """Ask for a load (None: take everything off) and wait until it is said to be done.
 
-        Args:
-            load: what to hang.
-            why: why it is asked for (again), one line; empty at the first time.
-
-        Raises:
-            DeviceError: the person gives up.
+        `why` tells why it is asked for again; DeviceError: the person gives up.
         """
         ...
 
@@ -305,14 +258,7 @@ class ConfirmingOperator(OperatorDevice, Protocol):
     """An operator who can be asked whether the arm may go on."""
 
     def confirm(self, question: str) -> None:
-        """Ask and wait for the answer.
-
-        Args:
-            question: what the arm does next, one or more sentences.
-
-        Raises:
-            DeviceError: the person gives up.
-        """
+        """Ask about what the arm does next, and wait; DeviceError: the person gives up."""
         ...
 
 

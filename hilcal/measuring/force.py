@@ -67,10 +67,7 @@ class ToolLoad:
         return np.asarray(design(np.asarray(rotation), self.gravity) @ x)
 
     def load_wrench(self, wrench: Floats, rotation: Floats) -> Floats:
-        """Return the load's wrench (..., 6) at the sensor's origin, base axes, N and N·m.
-
-        Readings (..., 6) are in sensor axes; `rotation` (..., 3, 3) is R_base_sensor.
-        """
+        """Return the load's wrench (..., 6) at the sensor, base axes, of a reading."""
         own = np.asarray(wrench) - self.tool_wrench(rotation)
         parts = own.reshape(*own.shape[:-1], 2, 3)
         return np.asarray((parts @ np.swapaxes(rotation, -1, -2)).reshape(own.shape))
@@ -78,8 +75,7 @@ class ToolLoad:
     def load_covariance(self, covariance: Floats, rotation: Floats) -> Floats:
         """Return the covariance (6, 6) of `load_wrench`, from reading and parameters.
 
-        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R), R = R_base_sensor, and D the
-        design matrix; that of the reading (a mean's, if a mean) is in sensor axes.
+        Cov = B (Cov_reading + D Cov_x Dᵀ) Bᵀ with B = diag(R, R), D the design matrix.
         """
         D = design(np.asarray(rotation), self.gravity)
         B = np.kron(np.eye(2), rotation)
@@ -87,10 +83,7 @@ class ToolLoad:
 
 
 def design(rotation: Floats, gravity: Floats) -> Floats:
-    """Return D (..., 6, 10) with reading = D x for x = (b_f, b_M, m, m c) and no load.
-
-    `rotation` (..., 3, 3) is R_base_sensor, gravity (3,) in base axes, m/s².
-    """
+    """Return D (..., 6, 10): reading = D x, x = (b_f, b_M, m, m c), no load, in R_base_sensor."""
     u = np.swapaxes(rotation, -1, -2) @ np.asarray(gravity, dtype=np.float64)
     out = np.zeros((*u.shape[:-1], 6, PARAMETERS))
     out[..., :6] = np.eye(6)
@@ -102,15 +95,9 @@ def design(rotation: Floats, gravity: Floats) -> Floats:
 def identify_tool_load(
     wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats
 ) -> ToolLoad:
-    """Estimate zero, mass and centre of mass from readings without a load.
+    """Estimate zero, mass and centre of mass from K mean readings without a load, sensor axes.
 
     Whitened least squares: x = argmin sum_k |S_k⁻¹ (w_k - D_k x)|² with S_k S_kᵀ = Cov_k.
-
-    Args:
-        wrench: (K, 6) mean readings, sensor axes, N and N·m.
-        covariance: (K, 6, 6) of these means.
-        rotation: (K, 3, 3) R_base_sensor.
-        gravity: (3,) base axes, m/s².
     """
     wrench, rotation, gravity = (np.asarray(a, np.float64) for a in (wrench, rotation, gravity))
     _check(wrench, np.asarray(covariance), rotation, gravity)
@@ -145,15 +132,9 @@ def identify_tool_load(
 def tare(
     wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats, mass: float, com: Floats
 ) -> ToolLoad:
-    """Return the sensor's zero from one reading without a load; the tool is known.
+    """Return the sensor's zero from one mean reading (6,) without a load; the tool is known.
 
-    Args:
-        wrench: (6,) mean reading, sensor axes, N and N·m.
-        covariance: (6, 6) of this mean.
-        rotation: (3, 3) R_base_sensor.
-        gravity: (3,) base axes, m/s².
-        mass: of the tool beyond the sensor, kg.
-        com: (3,) its centre of mass, sensor axes from its origin, m.
+    Its centre of mass (3,) is in sensor axes from the sensor's origin, m.
     """
     wrench, rotation, gravity = (np.asarray(a, np.float64) for a in (wrench, rotation, gravity))
     _check(wrench[None], np.asarray(covariance)[None], rotation[None], gravity)
@@ -167,10 +148,7 @@ def tare(
 
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
-    """Return a wrench (..., 6) taken at a point that lies `arm` (..., 3) further, same axes, SI.
-
-    f' = f,  M' = M - arm × f
-    """
+    """Return a wrench (..., 6) at a point `arm` (..., 3) further: f' = f, M' = M - arm × f."""
     wrench = np.asarray(wrench, dtype=np.float64)
     force, moment = wrench[..., :3], wrench[..., 3:]
     return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
@@ -247,15 +225,7 @@ def compare(
 
     It is, where |f - f_expected| <= max(tolerance_N, tolerance_share |f_expected|); three sigma
     of the measurement have to fit into that too. A load that is a moment alone is judged by its
-    moment, with tolerance_N acting at `MOMENT_LEVER_M`.
-
-    Args:
-        expected: (6,) wrench of the load asked for, N and N·m; zero where nothing may hang.
-        measured: (6,) wrench felt, same point, base axes.
-        std: (6,) its standard uncertainty.
-        tolerance_N: by how much the force may differ.
-        tolerance_share: the same as a share of the force.
-        gravity: (3,) base axes, m/s²; along it a load is given in kg.
+    moment, with tolerance_N acting at `MOMENT_LEVER_M`. Wrenches are at one point, base axes.
     """
     force, moment = (float(np.linalg.norm(part)) for part in (expected[:3], expected[3:]))
     if force == 0.0 and moment > 0.0:
@@ -347,11 +317,7 @@ class ForceMeter:
     The zero of a session is what the sensor reads at the reference pose with nothing on the
     hook, less the tool of the configuration. Wrenches of sessions are comparable after it,
     whatever the sensor's own zero did while it was off; how the real tool differs from the
-    configured one stays in them, the same in all sessions.
-
-    Attributes:
-        zero: (6,) what the sensor reads with nothing on it, N and N·m, sensor axes.
-        identified: whether the tool has been weighed, else it is that of the configuration.
+    configured one stays in them. Once `identified`, the tool is the one that was weighed.
     """
 
     def __init__(
@@ -414,10 +380,10 @@ class ForceMeter:
             self.tool = replace(zero, bias=np.zeros(6))
 
     def turned(self, q: Floats) -> float:
-        """Return how far gravity has turned in the sensor's axes since the tare, m/s².
+        """Return how far gravity has turned in the sensor's axes since the tare, m/s², at q (n,).
 
-        At joint angles (n,); |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not
-        say. Before any tare it is twice gravity, the most that it can be.
+        |R(q)ᵀ g - R_tareᵀ g|, by which each kg is felt that [tool] does not say; twice gravity, the
+        most that it can be, before any tare.
         """
         gravity = self._cell.gravity
         if self._tared_down is None:
@@ -425,11 +391,10 @@ class ForceMeter:
         return float(np.linalg.norm(self.frame(q).rotation.T @ gravity - self._tared_down))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
-        """Find the real tool from unloaded readings.
+        """Find the real tool from unloaded readings; the numbers of those left out, None: too few.
 
         A reading whose force the tool does not explain to the tolerance was not unloaded, or
-        somebody leaned on the tool: the worst is left out until all are explained. Returned are the
-        numbers of those; None where the readings are too few.
+        somebody leaned on the tool: the worst is left out until all are explained.
         """
         kept = list(range(len(unloaded)))
         while len(kept) >= ENOUGH_POSES:
@@ -458,10 +423,7 @@ class ForceMeter:
     def verify(
         self, load: CellLoad | None, tared: TaredWrench, operator: Operator
     ) -> tuple[bool, str]:
-        """Whether a load is what hangs, within the operator's tolerance; and the finding.
-
-        Compared at the load point, where a dead weight and a pull have no moment.
-        """
+        """Whether a load is what hangs, within the operator's tolerance; and the finding."""
         gravity, frame = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)

@@ -30,10 +30,7 @@ SWINGING_S = 2.0
 
 
 def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
-    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight.
-
-    m = m_tool + m_load, c = (m_tool c_tool + m_load p_load) / m; pulls have no mass.
-    """
+    """Return mass (kg) and centre of mass (3,) at the flange of the tool with a dead weight."""
     hung = 0.0 if load is None else load.mass_kg
     mass = cell.tool_mass + hung
     if mass == 0.0:
@@ -43,11 +40,7 @@ def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
 
 
 class Hook:
-    """What hangs at the arm.
-
-    Every question raises DeviceError where the person gives up; WrongLoadError where what hangs is
-    wrong `TRIES` times.
-    """
+    """What hangs at the arm; WrongLoadError where what hangs is wrong `TRIES` times."""
 
     def __init__(
         self,
@@ -72,10 +65,7 @@ class Hook:
         return next((load for load in self._config.loads if load.name == name), None)
 
     def begin(self) -> None:
-        """Have every load taken off before anything moves, for what hangs is unknown.
-
-        The force sensor confirms it where its zero is known from an earlier session.
-        """
+        """Have every load taken off before anything moves, for what hangs is unknown."""
         self._ask(None, self._still_hangs)
         self.hanging, self.since = UNLOADED, self._clock.now()
 
@@ -150,8 +140,7 @@ class Hook:
     ) -> None:
         """Ask until nothing is wrong, `TRIES` times; an arm moved meanwhile is put back.
 
-        `why` tells why it is asked for, empty at the first time; `answered` is told what hangs
-        after each answer, before anything moves.
+        `answered` is told what hangs after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
         person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
@@ -189,9 +178,8 @@ class Hook:
     def _still_hangs(self) -> str:
         """What seems to hang still: a load that fits better than nothing does.
 
-        By the zero of an earlier session, since the sensor's own may have changed meanwhile.
-        Without one it is the sensor's own, which may be far off: then a second answer that nothing
-        hangs is believed, and said to be.
+        By the zero of an earlier session. Without one it is the sensor's own, which may be far off:
+        then a second answer that nothing hangs is believed, and said to be.
         """
         if self._meter is None:
             return ""

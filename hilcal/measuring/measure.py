@@ -70,15 +70,11 @@ class Average:
 
 
 def average(samples: Sequence[TrackerSample], systematic_share: float = 0.0) -> Average:
-    """Average K samples of one target at rest; the law is that of the module.
+    """Average at least 2 samples of one target at rest; the law is that of the module.
 
     A gross outlier among them is left out: its squared distance from the median, whitened by
     Σ̄ and relative to what is usual in the window (never less than stated), is less probable
-    than `GROSS_SIGMA`.
-
-    Args:
-        samples: at least 2, of one target at rest.
-        systematic_share: s, 0 to 1.
+    than `GROSS_SIGMA`. DeviceError: they are more than one in five (and more than one).
     """
     values = np.array([sample.value for sample in samples])
     stated = np.array([sample.covariance for sample in samples])
@@ -128,10 +124,7 @@ def deviations(values: Floats) -> tuple[Floats, Floats]:
 
 
 def _trace_test(residuals: Floats, prior: Floats) -> tuple[float, float]:
-    """T / (m (K - 1)) and P(chi² >= T), with T = Σ_k r_kᵀ Σ̄⁻¹ r_k.
-
-    Under the stated noise T follows chi² with m (K - 1) degrees of freedom.
-    """
+    """T / (m (K - 1)), T = Σ_k r_kᵀ Σ̄⁻¹ r_k, and P(chi² >= T) with as many degrees of freedom."""
     count, m = residuals.shape
     white = residuals @ inverse_root(prior).T
     total, dof = float(np.sum(white**2)), m * (count - 1)
@@ -298,8 +291,7 @@ class Measurer:
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 
-        `find` finds a lost target again, the tracker's search where None; `force` is the wrench
-        where it was averaged at this stop already.
+        `find` finds a lost target again; `force` is the wrench where it was averaged already.
         """
         remarks: list[str] = []
         searches = repeats = 0

@@ -40,10 +40,7 @@ class Guard:
     def check(
         self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
     ) -> str | None:
-        """Return in one line what is wrong, or None.
-
-        `felt` is the wrench (6,) on the force sensor, N and N·m; None where there is none.
-        """
+        """Return in one line what is wrong, or None; `felt` is the wrench (6,) of the sensor."""
         return (
             self.state(sample)
             or self._speed(sample)
@@ -117,10 +114,6 @@ class LoadWatch:
     more for a pull (`PULL`) and in motion for what swings to the side (`SWING`) and is accelerated.
     A tool that is not weighed yet may differ from [tool] by `UNKNOWN_KG`: the tare holds that at
     its pose, so the limit grows by how far the sensor has turned against gravity since.
-
-    Attributes:
-        watching: whether anything is compared now.
-        differed: how many looks have found a difference so far.
     """
 
     def __init__(self, meter: ForceMeter, cell: Cell, config: CellConfig) -> None:
@@ -165,8 +158,7 @@ class LoadWatch:
     def _compared(self, tared: TaredWrench, *, moving: bool) -> tuple[float, float]:
         """How far force (or moment) is from what should hang, and how far it may be, N.
 
-        A weight that swings pulls to the side; its vertical force changes by little, and is
-        compared by itself in motion.
+        A weight that swings pulls to the side; its vertical force is compared by itself in motion.
         """
         load, operator, cell = self._load, self._config.operator, self._cell
         hung = np.zeros(6) if load is None else load.wrench(cell.gravity)
@@ -236,11 +228,7 @@ class Mover:
 
     Every motion is checked from where the arm stands when it starts. Nothing here stops the arm:
     whatever is wrong is raised at once, and the run stops the arm before it does anything else.
-
-    Attributes:
-        goal: (n,) joint angles where the arm has been left, or goes; None while that is unknown.
-        side: (n,) from which each joint arrived, -1 or +1; 0 before its first motion.
-        watch: compares what the force sensor feels with what should hang; None without a sensor.
+    `goal` (n,) is where the arm has been left, or goes; None while that is unknown.
     """
 
     def __init__(
@@ -310,8 +298,7 @@ class Mover:
     def agreed(self, goal: Floats, name: str, left: Floats, ask: Callable[[str], None]) -> Floats:
         """Return where the arm stands (n,), once its way to a goal is free and people have agreed.
 
-        Where it does not stand where it was `left` (n,), rad, that is asked first, and checked anew
-        after; `ask` raises DeviceError where that is refused.
+        Where it does not stand where it was `left`, that is asked first, and checked anew after.
         """
         while True:
             sample = self._arm.sample()
@@ -355,10 +342,7 @@ class Mover:
                 )
 
     def move(self, q: Floats, name: str) -> None:
-        """Move to `q` (n,), rad, straight in joint space.
-
-        The way is checked from where the arm stands.
-        """
+        """Move straight to `q` (n,), rad; the way is checked from where the arm stands."""
         sample = self.look()
         start = sample.q
         if self.goal is not None and np.abs(start - self.goal).max() <= self._motion.arrival_rad:
@@ -405,10 +389,7 @@ class Mover:
     def _check_progress(
         self, start: Floats, goal: Floats, sample: ArmSample, last: ArmSample | None, name: str
     ) -> ArmSample:
-        """Check that a motion keeps its straight line and goes on.
-
-        `last` is the first sample with the joint angles of before; returned is that of now.
-        """
+        """Check that a motion keeps its line and goes on; the first sample that stood here."""
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)
         off = np.abs(sample.q - start - share * way)

@@ -37,10 +37,7 @@ def home(plan: Plan) -> str:
 
 
 def beside(q: Floats, arm: Arm, margin: float) -> Floats:
-    """Return (n,) where the arm comes from to a reference pose (n,) at the start, rad.
-
-    `margin` is the distance kept from the joint limits, rad.
-    """
+    """Return (n,) whence the arm comes to a reference pose, `margin` from its limits, rad."""
     side = np.where(q - APPROACH_RAD >= arm.q_min + margin, 1.0, -1.0)
     return np.asarray(q - side * APPROACH_RAD)
 
@@ -49,9 +46,8 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
     """Return every stop for the steps of a plan.
 
     The first two stops, at a little distance from the reference pose and there, move every joint,
-    so that the approach sides of all readings are known; limits and margin (rad) say from which
-    side the reference pose can be approached. Loads are changed there. A reading that repeats the
-    one before it is approached anew.
+    so that the approach sides of all readings are known. Loads are changed there. A reading that
+    repeats the one before it is approached anew.
     """
     base = home(plan)
     q_home = plan.joints(base)
@@ -72,8 +68,7 @@ def route(plan: Plan, arm: Arm, margin: float = 0.0) -> tuple[Stop, ...]:
 def approach_sides(stops: Sequence[Stop]) -> Floats:
     """Return (S, n) from which side each joint arrives at the readings of a route, -1 or +1.
 
-    It is the direction of the joint's last motion, also of one to a stop without a reading, as
-    where a load is changed; 0 where it has not moved.
+    It is the direction of the joint's last motion; 0 where it has not moved.
     """
     side, sides = np.zeros(len(stops[0].q)), []
     for before, stop in pairwise(stops):
@@ -123,8 +118,7 @@ def dry_run(cell: Cell, config: CellConfig, plan: Plan) -> DryRun:
     """Check a plan against every limit of the cell; all problems at once.
 
     Checked are all stops of the route and the straight paths in joint space between them by
-    `Feasibility`, the tracker's sight of the target at each reading, the speed, and the names of
-    the loads.
+    `Feasibility`, the tracker's sight of the target at each reading, the speed, and the loads.
     """
     limits = Feasibility(cell, config)
     problems = _cell_problems(config) + _load_problems(limits, plan)
@@ -182,10 +176,7 @@ def route_problems(cell: Cell, config: CellConfig, stops: tuple[Stop, ...]) -> l
 
 
 def on_route(limits: Feasibility, stops: tuple[Stop, ...]) -> list[str]:
-    """Return what is wrong with stops and with the paths between them, one line each.
-
-    What a path and one of its ends break alike is told of the end.
-    """
+    """Return what is wrong with stops and the paths between them, one line each."""
     lines, at_stops = [], []
     for stop in stops:
         where, loads = f"pose {stop.name}", {stop.hanging: None, stop.change_to: None}
@@ -239,10 +230,7 @@ def _duration(config: CellConfig, stops: tuple[Stop, ...], changes: int, reading
 
 
 def seconds_at_rest(config: CellConfig) -> float:
-    """Return how long the arm rests at a step, cell seconds: for the readings of all targets.
-
-    `[planning] reading_s` where it is given, which is of one target; the wrench is averaged once.
-    """
+    """Return how long the arm rests at a step for the readings of all targets, cell seconds."""
     acquire, targets = config.acquire, max(len(config.tool.targets), 1)
     once = 0.0 if config.force_sensor is None else acquire.force_window_s
     each = config.planning.reading_s

@@ -68,11 +68,7 @@ def run(
 
 
 def refuse(checked: DryRun) -> None:
-    """Refuse a plan with problems.
-
-    Raises:
-        InputError: names the first problem, and how many more there are.
-    """
+    """Refuse a plan with problems: InputError names the first, and how many more there are."""
     if checked.problems:
         raise InputError(f"the plan is not safe to run, nothing has moved: {checked.first}")
 

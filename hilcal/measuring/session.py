@@ -237,11 +237,7 @@ class Session:
             self._event("tare", {"force": sample_json(sample), "q": q.tolist()})
 
     def _zero(self) -> tuple[WrenchSample, Floats] | None:
-        """Set the force sensor's zero at the present pose, with nothing on the hook.
-
-        Returns:
-            the mean wrench and the joint angles (n,), rad; None without a sensor.
-        """
+        """Set the zero at the present pose, with nothing on the hook; mean wrench and joints."""
         meter, watch = self._meter, self._mover.watch
         if meter is None or watch is None:
             return None
@@ -325,10 +321,7 @@ class Session:
         return first, sum(one.measured.settling for one in found)
 
     def _check(self, found: Sequence[TargetReading], details: list[dict[str, Any]]) -> None:
-        """Refuse the readings of an arrival of another target or another load.
-
-        They are kept as doubted.
-        """
+        """Refuse the readings of an arrival of another target or load; they are doubted."""
         wrong = next(filter(None, map(self._doubt, found)), None)
         if wrong is not None:
             for told in details:

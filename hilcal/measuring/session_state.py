@@ -109,19 +109,8 @@ def reading_of(
 ) -> Readings:
     """Return one reading; its covariance is the instrument's alone.
 
-    Args:
-        step: which one.
-        q: (n,) commanded joint angles, rad.
-        measured: what was measured.
-        wrench: (6,) of the load at the load point, base axes, N and N·m.
-        time: since the campaign's start, cell s.
-        load_time: since the load's last change, cell s.
-        side: (n,) from which each joint arrived, -1 or +1.
-        joint_temperature: (n,) °C; None in a campaign without.
-        torque: (n,) that the drives were measured to exert, N·m, NaN where this reading has none;
-            None in a campaign without.
-        target: number of the target that was read; None where there is one.
-        target_names: the cell's names of them.
+    `wrench` (6,) is at the load point, base axes; times are in cell s; `torque` is NaN where this
+    reading has none, and None, as temperature and target, in a campaign without.
     """
     states = States(
         q=q[None].copy(),
@@ -154,11 +143,7 @@ def detail(
     zero: Floats | None,
     session: dict[str, Any],
 ) -> dict[str, Any]:
-    """Return everything raw behind a reading.
-
-    `tared` is the mean wrench against the session's zero (6,), None without a force sensor;
-    `session` has further keys: times, losses, sides.
-    """
+    """Return everything raw behind a reading; `session` has further keys: times, losses, sides."""
     out: dict[str, Any] = {
         "pose": step.pose,
         "load": step.load,
@@ -239,10 +224,7 @@ class Drift:
     _first: tuple[Floats, Floats] | None = field(default=None)
 
     def add(self, step: Step, position: Floats, covariance: Floats) -> Shift | None:
-        """Add a position (3,), m; returns its shift where it is a return, else None.
-
-        Sensor axes; `covariance` (3, 3) is that of instrument and arm, m².
-        """
+        """Add a position (3,), m; returns its shift where it is a return, else None."""
         if step.pose != REFERENCE or step.load != UNLOADED:
             return None
         if self._first is None:
@@ -293,12 +275,7 @@ class Eta:
 
 
 class SessionState:
-    """Everything that is carried from reading to reading, and from session to session.
-
-    Attributes:
-        tared_wrenches: the unloaded wrenches, from which the tool is identified.
-        last_q: (n,) actual joint angles of the last reading, rad; None before the first.
-    """
+    """Everything that is carried from reading to reading, and from session to session."""
 
     def __init__(self, cell: Cell, joint_std: Floats) -> None:
         """Start empty; `joint_std` (n,) is the arm's repeatability as configured, rad."""
@@ -321,8 +298,8 @@ class SessionState:
     ) -> Shift | None:
         """Add a reading; returns its shift where it is a return to the reference.
 
-        Joint angles `q` (n,) are the actual ones, rad; `value` (m,) is in sensor axes, `covariance`
-        (m, m) the instrument's alone. Drift, scatter and wrench are taken from the first target.
+        `q` (n,) are the actual joint angles; `covariance` (m, m) is the instrument's alone. Drift,
+        scatter and wrench are taken from the first target.
         """
         position = value[:3]
         self.last_q = q

@@ -35,10 +35,7 @@ class GoalCheck:
         self._watcher, self._event = watcher, event
 
     def newly_met(self, last: bool) -> bool:
-        """Apply the rule; returns whether the goal has just been met.
-
-        The result is stored and reported when the goal is met, and stored at the plan's end.
-        """
+        """Apply the rule; whether the goal has just been met, which is stored and reported."""
         if self._rule is None or (self.status is not None and self.status.met):
             return False
         readings = self._store.readings()
@@ -60,8 +57,7 @@ def way_home(
 
     The arm goes straight where that is clear; else back the way it came, which is clear, until the
     straight way is. The reading is the next return to the reference pose that the plan holds.
-    `behind` is where the arm has been in this session, the reference pose among it; it stands at
-    the last of these stops. `done` are the steps that are measured.
+    `behind` is where the arm has been in this session; it stands at the last of these stops.
     """
     base = home(plan)
     q_home, here = plan.joints(base), behind[-1]
