@@ -104,18 +104,26 @@ def setter(target: object, name: str, kind: Callable[[Any], Any] = bool) -> Call
     return store
 
 
-def device_parser(doc: str | None) -> argparse.ArgumentParser:
-    """Return the parser of what the process of every device is told."""
+NETWORK: dict[str, dict[str, Any]] = {"--host": {"required": True}, "--port": {"type": int}}
+NOISE: dict[str, dict[str, Any]] = {
+    f"--{name}-std": {"type": float, "nargs": 2, "required": True}
+    for name in ("range", "transverse")
+}
+
+
+def begin(doc: str | None, more: Mapping[str, dict[str, Any]]) -> argparse.Namespace:
+    """Return the options of a device's process, which ends at once when standard input closes.
+
+    The parent holds its other end; `more` options are arguments of `add_argument` by name.
+    """
     parser = argparse.ArgumentParser(
         description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--directory", type=Path, required=True, help="where the devices meet")
     parser.add_argument("--seed", type=int, default=0, help="of everything random")
-    return parser
-
-
-def end_with_parent() -> None:
-    """Exit at once when standard input closes: the parent holds its other end."""
+    for name, how in more.items():
+        parser.add_argument(name, **how)
+    options = parser.parse_args()
 
     def wait() -> None:
         while os.read(sys.stdin.fileno(), 4096):
@@ -124,3 +132,4 @@ def end_with_parent() -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the one who started it
     threading.Thread(target=wait, daemon=True).start()
+    return options

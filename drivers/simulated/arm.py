@@ -126,31 +126,6 @@ class ArmController:
         return goal
 
 
-def main() -> int:
-    """Run until the parent ends; returns the exit code."""
-    options = admin.device_parser(__doc__).parse_args()
-    admin.end_with_parent()
-    try:
-        world, _ = read_world(options.directory / "world.json")
-        board = Blackboard.attach(options.directory / "world.bin")
-    except HilcalError as error:
-        sys.stderr.write(f"{error}\n")
-        return error.exit_code
-    controller = ArmController(world.cell.arm, board, np.random.default_rng(options.seed))
-    controller.step()
-    asked = {
-        name: getattr(controller, name)
-        for name in ("move", "stop", "payload", "jog", "protective_stop", "release")
-    }
-    handler = admin.Operations({**asked, "sample": controller.sample}, controller.sample)
-    admin.serve(options.directory / "arm.sock", handler)
-    while True:
-        time.sleep(_STEP_S if controller.step() else _REFRESH_S)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
-
 _STOPPED_S = 5.0
 """In which a stopped arm has to stand, real s."""
 
@@ -248,3 +223,25 @@ def open_arm(config: CellConfig) -> SimulatedArm:
     arm = SimulatedArm(Path(socket))
     arm.sample()
     return arm
+
+
+def main() -> int:
+    """Run until the parent ends; returns the exit code."""
+    options = admin.begin(__doc__, {})
+    try:
+        world, _ = read_world(options.directory / "world.json")
+        board = Blackboard(options.directory / "world.bin")
+    except HilcalError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    controller = ArmController(world.cell.arm, board, np.random.default_rng(options.seed))
+    controller.step()
+    names = ("move", "stop", "payload", "jog", "protective_stop", "release", "sample")
+    asked = {name: getattr(controller, name) for name in names}
+    admin.serve(options.directory / "arm.sock", admin.Operations(asked, controller.sample))
+    while True:
+        time.sleep(_STEP_S if controller.step() else _REFRESH_S)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

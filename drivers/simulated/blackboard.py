@@ -66,7 +66,7 @@ def _offsets(n: int) -> tuple[dict[str, int], int]:
 
 
 class Blackboard:
-    """An open shared file; use `create` once and `attach` in every process."""
+    """An open shared file; use `create` once."""
 
     def __init__(self, path: Path) -> None:
         """Map an existing file."""
@@ -93,11 +93,6 @@ class Blackboard:
         start = time.monotonic_ns() - round(1e9 * begun / scale)
         board.write("world", start_ns=start, scale=scale)
         return board
-
-    @classmethod
-    def attach(cls, path: Path) -> "Blackboard":
-        """Map the file of a running world."""
-        return cls(path)
 
     def write(self, section: str, **fields: Any) -> None:
         """Set fields of a section, all at once for readers; only its one writer may."""

@@ -329,10 +329,10 @@ def _devices(
         "tracker": device("tracker", f"{tracker}_server", 1, trackers[tracker]),
     }
     if sensor is not None:
-        made: tuple[str, dict[str, Any]] = "force_server", {"kind": sensor.driver}
+        kind: dict[str, Any] = {"kind": sensor.driver}
         if sensor.driver == "netft":
-            made = "netft_server", {"host": host, "port": RDT_PORT, "web_port": WEB_PORT}
-        out["force"] = device("force", made[0], 2, made[1])
+            kind |= {"host": host, "port": RDT_PORT, "web_port": WEB_PORT}
+        out["force"] = device("force", "force_server", 2, kind)
     return out
 
 

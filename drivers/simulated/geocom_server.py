@@ -223,6 +223,11 @@ class Station:
         self.distance, self.distance_ms = 0.0, 0
         self.ranging = time.monotonic() + self.meas_s / self.board.scale
 
+    def stop_ranging(self, *, clear: bool) -> None:
+        """Measure no distance any more, and forget the last one."""
+        self.ranging = None
+        self.distance = 0.0 if clear else self.distance
+
     def finish_ranging(self, patience: float) -> None:
         """Wait for a running distance measurement, at most `patience` s of world time."""
         if self.ranging is not None:
@@ -258,11 +263,15 @@ class Station:
 
 
 OK = 0
-CANNOT_DECODE = 3080  # COM_CANT_DECODE_REQ
-UNKNOWN_PROCEDURE = 3081  # COM_PROC_UNAVAIL
+INVALID_PARAMETER = 2
+ANGLES_ONLY = 1285  # TMC_ANGLE_OK: no distance, which is given as 0
+DISTANCE_ERROR, BUSY = 1292, 1293
+CANNOT_DECODE, UNKNOWN_PROCEDURE = 3080, 3081  # COM_CANT_DECODE_REQ, COM_PROC_UNAVAIL
 BAD_CHECKSUM = 3101  # COM_SRVR_RX_CHECKSUM_ERROR
+NO_TARGET, NOT_ENABLED = 8710, 8714
 
 _REQUEST = re.compile(r"%R1Q,(\d{1,5})(?:,(\d{1,5}))?(?:,(\d{1,5}))?:(.*)")
+NAME, SERIAL = "SIM LASER STATION", 123456
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,11 +293,9 @@ def parse(line: str) -> GeocomRequest | None:
     if match is None:
         return GeocomRequest(-1, 0, (), False, CANNOT_DECODE)
     rpc, transaction, crc, rest = match.groups()
+    bare = f"%R1Q,{rpc},{transaction}:{rest}".encode("ascii", "replace")
+    error = OK if crc is None or int(crc) == crc16(bare, 0) else BAD_CHECKSUM
     parameters = tuple(rest.split(",")) if rest else ()
-    error = OK
-    if crc is not None:
-        bare = f"%R1Q,{rpc},{transaction}:{rest}"
-        error = OK if int(crc) == crc16(bare.encode("ascii", "replace"), 0) else BAD_CHECKSUM
     return GeocomRequest(int(rpc), int(transaction or 0), parameters, crc is not None, error)
 
 
@@ -303,27 +310,19 @@ def reply(
     return f"{head}:{body}\r\n".encode()
 
 
-INVALID_PARAMETER = 2
-ANGLES_ONLY = 1285  # TMC_ANGLE_OK: no distance, which is given as 0
-DISTANCE_ERROR = 1292
-BUSY = 1293
-NO_TARGET = 8710
-NOT_ENABLED = 8714
-
 Answer = tuple[int, list[str]]
-Procedure = Callable[[Station, tuple[str, ...]], Answer]
+Parameters = tuple[str, ...]
+Procedure = Callable[[Station, Parameters], Answer | None]
+"""None is `OK` without values."""
 
-NAME = "SIM LASER STATION"
-SERIAL = 123456
 
-
-def answer(station: Station, rpc: int, parameters: tuple[str, ...]) -> Answer:
+def answer(station: Station, rpc: int, parameters: Parameters) -> Answer:
     """Carry out a procedure; takes the time that it takes."""
     procedure = _PROCEDURES.get(rpc)
     if procedure is None:
         return UNKNOWN_PROCEDURE, []
     try:
-        return procedure(station, parameters)
+        return procedure(station, parameters) or (OK, [])
     except (ValueError, IndexError):  # too few parameters or no numbers
         return INVALID_PARAMETER, []
 
@@ -337,9 +336,8 @@ def _constant(*values: str) -> Procedure:
 
 
 def _setting(number: int) -> Procedure:
-    def store(station: Station, parameters: tuple[str, ...]) -> Answer:
+    def store(station: Station, parameters: Parameters) -> None:
         station.settings[number] = str(int(parameters[0]))
-        return OK, []
 
     return store
 
@@ -348,69 +346,65 @@ def _stored(number: int) -> Procedure:
     return lambda station, parameters: (OK, [station.settings[number]])
 
 
-def _set_precision(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _tells(values: Callable[[Station], list[str]]) -> Procedure:
+    return lambda station, parameters: (OK, values(station))
+
+
+def _set_precision(station: Station, parameters: Parameters) -> None:
     digits = int(parameters[0])
     if not 0 <= digits <= 15:
-        return INVALID_PARAMETER, []
+        raise ValueError
     station.digits = digits
-    return OK, []
 
 
-def _date(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _date(station: Station, parameters: Parameters) -> Answer:
     now = datetime.now(UTC)
     rest = (now.month, now.day, now.hour, now.minute, now.second)
     return OK, [str(now.year), *(f"'{value:02x}'" for value in rest)]
 
 
-def _set_atmosphere(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _set_atmosphere(station: Station, parameters: Parameters) -> None:
     wavelength, pressure, dry, wet = map(float, parameters)
     station.atmosphere = (wavelength, pressure, dry, wet)
-    return OK, []
 
 
-def _switch_atr(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _switch_atr(station: Station, parameters: Parameters) -> None:
     station.atr_enabled = bool(int(parameters[0]))
-    return OK, []
 
 
-def _switch_lock(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _switch_lock(station: Station, parameters: Parameters) -> None:
     station.lock_enabled = bool(int(parameters[0]))
-    if not station.lock_enabled:
-        station.locked = False
-    return OK, []
+    station.locked = station.locked and station.lock_enabled
 
 
-def _lock_in(station: Station, parameters: tuple[str, ...]) -> Answer:
-    if not station.lock_enabled:
-        return NOT_ENABLED, []
-    return _acquire(station, parameters)
+def _lock_in(station: Station, parameters: Parameters) -> Answer:
+    return _acquire(station, parameters) if station.lock_enabled else (NOT_ENABLED, [])
 
 
-def _acquire(station: Station, parameters: tuple[str, ...]) -> Answer:
-    return (OK if station.acquire() else NO_TARGET), []
-
-
-def _fine_adjust(station: Station, parameters: tuple[str, ...]) -> Answer:
-    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
-    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+def _acquire(station: Station, parameters: Parameters, window: float = np.inf) -> Answer:
     return (OK if station.acquire(window) else NO_TARGET), []
 
 
-def _turn(station: Station, parameters: tuple[str, ...]) -> Answer:
-    hz, v = float(parameters[0]), float(parameters[1])
-    station.turn(hz, v)
+def _fine_adjust(station: Station, parameters: Parameters) -> Answer:
+    """AUT_FineAdjust: within a window, rad; the reference manual's are whole widths."""
+    window = 0.5 * max(float(parameters[0]), float(parameters[1]))
+    return _acquire(station, parameters, window)
+
+
+def _turn(station: Station, parameters: Parameters) -> Answer | None:
+    station.turn(float(parameters[0]), float(parameters[1]))
     if len(parameters) > 3 and int(parameters[3]) == 1:  # AUT_TARGET: find it there
         return _acquire(station, parameters)
     station.wait(AIM_S)
-    return OK, []
+    return None
 
 
-def _lock_quality(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _lock_quality(station: Station, parameters: Parameters) -> Answer:
     """0 not locked, 1 locked, 2 prediction: it was lost from sight."""
     return OK, ["0" if not station.locked else "1" if station.target() is not None else "2"]
 
 
-def _start_measuring(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _start_measuring(station: Station, parameters: Parameters) -> Answer | None:
     """TMC_DoMeasure: 0 stop, 1 distance, 2 track, 3 clear, 6 restart."""
     if station.busy:
         return BUSY, []
@@ -419,64 +413,56 @@ def _start_measuring(station: Station, parameters: tuple[str, ...]) -> Answer:
     if command in (1, 2, 6):
         station.start_ranging()
     elif command in (0, 3):
-        station.ranging = None
-        station.distance = 0.0 if command == 3 else station.distance
+        station.stop_ranging(clear=command == 3)
     else:
-        return INVALID_PARAMETER, []
-    return OK, []
+        raise ValueError
+    return None
 
 
-def _angles(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _angles(station: Station, parameters: Parameters) -> Answer:
     if station.busy:
         return BUSY, []
     seen = station.look() or station.pointing
     return station.warning, _number(station, seen.hz, seen.v)
 
 
-def _with_distance(station: Station, patience: float) -> tuple[int, float, float, float]:
-    """Return code, hz, v and distance of the measurement that 2008 has started."""
-    if station.busy:
-        return BUSY, 0.0, 0.0, 0.0
-    if station.tracking and station.ranging is None:
-        station.start_ranging()
-    station.finish_ranging(patience)
-    if station.dist_error:
-        return DISTANCE_ERROR, 0.0, 0.0, 0.0
-    seen = station.look() or station.pointing
-    code = station.warning if station.distance > 0.0 else ANGLES_ONLY
-    return code, seen.hz, seen.v, station.distance
+def _with_distance(full: bool) -> Procedure:
+    """TMC_GetSimpleMea, and TMC_GetFullMeas: of the measurement that 2008 has started.
+
+    hz, v, in full their accuracy, inclinations and theirs; distance, in full its time in ms.
+    """
+
+    def measured(station: Station, parameters: Parameters) -> Answer:
+        if station.busy:
+            return BUSY, []
+        if station.tracking and station.ranging is None:
+            station.start_ranging()
+        station.finish_ranging(int(parameters[0]) * 1e-3)
+        if station.dist_error:
+            return DISTANCE_ERROR, []
+        seen, distance = station.look() or station.pointing, station.distance
+        code = station.warning if distance > 0.0 else ANGLES_ONLY
+        if not full:
+            return code, _number(station, seen.hz, seen.v, distance)
+        accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
+        values = (seen.hz, seen.v, accuracy, *station.inclination(), distance)
+        return code, [*_number(station, *values), str(station.distance_ms)]
+
+    return measured
 
 
-def _simple(station: Station, parameters: tuple[str, ...]) -> Answer:
-    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
-    if code in (BUSY, DISTANCE_ERROR):
-        return code, []
-    return code, _number(station, hz, v, distance)
-
-
-def _full(station: Station, parameters: tuple[str, ...]) -> Answer:
-    """TMC_GetFullMeas: hz, v, their accuracy, inclinations and theirs, distance, its time in ms."""
-    code, hz, v, distance = _with_distance(station, int(parameters[0]) * 1e-3)
-    if code in (BUSY, DISTANCE_ERROR):
-        return code, []
-    accuracy = station.beam.angle_std(distance) if distance > 0.0 else 0.0
-    cross, length, inclination = station.inclination()
-    values = (hz, v, accuracy, cross, length, inclination, distance)
-    return code, [*_number(station, *values), str(station.distance_ms)]
-
-
-def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
+def _measure(station: Station, parameters: Parameters) -> Answer:
     """BAP_MeasDistanceAngle: 0 last values, 1 angles, 2 to 4 distance, 5 clear, 6 stop."""
     if station.busy:
         return BUSY, []
     mode = int(parameters[0])
     if not 0 <= mode <= 6:
-        return INVALID_PARAMETER, []
+        raise ValueError
+    seen, distance = station.pointing, 0.0
     if mode in (5, 6):
-        station.ranging, station.tracking = None, False
-        station.distance = 0.0 if mode == 5 else station.distance
-        return OK, [*_number(station, station.pointing.hz, station.pointing.v, 0.0), str(mode)]
-    distance = 0.0
+        station.stop_ranging(clear=mode == 5)
+        station.tracking = False
+        return OK, [*_number(station, seen.hz, seen.v, 0.0), str(mode)]
     if mode >= 2:
         if not station.locked:
             station.wait(AIM_S)
@@ -485,8 +471,7 @@ def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
         station.finish_ranging(station.meas_s)
         if station.dist_error:
             return DISTANCE_ERROR, []
-        distance = station.distance
-        seen = station.pointing
+        seen, distance = station.pointing, station.distance
     else:
         seen = station.look() or station.pointing
         distance = station.distance if mode == 0 else 0.0
@@ -497,31 +482,31 @@ def _measure(station: Station, parameters: tuple[str, ...]) -> Answer:
 _PROCEDURES: dict[int, Procedure] = {
     0: _constant(),
     107: _set_precision,
-    108: lambda station, parameters: (OK, [str(station.digits)]),
+    108: _tells(lambda s: [str(s.digits)]),
     110: _constant("1", "50", "0"),
     2007: _constant("1"),
     2008: _start_measuring,
     2020: _setting(2020),
     2021: _stored(2020),
-    2022: lambda station, parameters: (OK, [*_number(station, 80.0), str(int(station.board.time))]),
+    2022: _tells(lambda s: [*_number(s, 80.0), str(int(s.board.time))]),
     2026: _constant("0"),
     2028: _set_atmosphere,
-    2029: lambda station, parameters: (OK, _number(station, *station.atmosphere)),
+    2029: _tells(lambda s: _number(s, *s.atmosphere)),
     2107: _angles,
-    2108: _simple,
-    2167: _full,
+    2108: _with_distance(full=False),
+    2167: _with_distance(full=True),
     5003: _constant(str(SERIAL)),
     5004: _constant(f'"{NAME}"'),
     5008: _date,
-    5011: lambda station, parameters: (OK, _number(station, station.temperature())),
+    5011: _tells(lambda s: _number(s, s.temperature())),
     5034: _constant("6", "20", "0"),
     5039: _constant("100", "1", "1"),
     6021: _lock_quality,
     9013: _lock_in,
     9018: _switch_atr,
-    9019: lambda station, parameters: (OK, [str(int(station.atr_enabled))]),
+    9019: _tells(lambda s: [str(int(s.atr_enabled))]),
     9020: _switch_lock,
-    9021: lambda station, parameters: (OK, [str(int(station.locked))]),
+    9021: _tells(lambda s: [str(int(s.locked))]),
     9027: _turn,
     9037: _fine_adjust,
     11001: _constant(),
@@ -610,18 +595,11 @@ def serve(station: Station, port: PtyPort) -> None:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--range-std", type=float, nargs=2, required=True)
-    parser.add_argument("--transverse-std", type=float, nargs=2, required=True)
-    parser.add_argument("--baud", type=int, default=115200)
-    options = parser.parse_args()
-    admin.end_with_parent()
+    baud: dict[str, Any] = {"--baud": {"type": int, "default": 115200}}
+    options = admin.begin(__doc__, {**admin.NOISE, **baud})
     measuring, faults = np.random.default_rng(options.seed).spawn(2)
-    station = Station(
-        Blackboard.attach(options.directory / "world.bin"),
-        Beam(tuple(options.range_std), tuple(options.transverse_std)),
-        measuring,
-    )
+    beam = Beam(tuple(options.range_std), tuple(options.transverse_std))
+    station = Station(Blackboard(options.directory / "world.bin"), beam, measuring)
     port = PtyPort(options.directory / "tracker", options.baud, faults)
     admin.serve(options.directory / "tracker.sock", operations(station, port))
     serve(station, port)

@@ -96,10 +96,10 @@ def build(
     moments: Floats | None = None,
     guides: bool = False,
 ) -> ElasticTree:
-    """Build the tree from the true links (n + 1, 4, 4), m.
+    """Build the tree from the true links (n + 1, 4, 4), m; first moments (n, 3) add to the bodies'.
 
-    First moments (n, 3) add to those of the bodies, kg·m. Only where the flange (`tool`) can tilt is
-    no constant transform left behind the last degree of freedom.
+    Only where the flange (`tool`) can tilt is no constant transform left behind the last degree of
+    freedom.
     """
     model = pin.Model()
     model.gravity.linear = np.asarray(gravity, dtype=float)

@@ -32,6 +32,7 @@ from hilcal.drivers.natnet_frames import (
     DESCRIPTIONS,
     FRAME,
     KEEP_ALIVE,
+    PORT,
     REQUEST,
     REQUEST_DESCRIPTIONS,
     RESPONSE,
@@ -206,19 +207,20 @@ def operations(cameras: Cameras) -> admin.Operations:
 
 def main() -> None:
     """Run until the parent ends."""
-    parser = admin.device_parser(__doc__)
-    parser.add_argument("--host", required=True)
-    parser.add_argument("--port", type=int, default=1510)
-    parser.add_argument("--version", default="4.1")
-    parser.add_argument("--multicast", default="")
-    parser.add_argument("--frame-std", type=float, default=5e-5)
-    parser.add_argument("--distortion", type=float, default=1e-4)
-    options = parser.parse_args()
-    admin.end_with_parent()
+    options = admin.begin(
+        __doc__,
+        {
+            **admin.NETWORK,
+            "--version": {"default": "4.1"},
+            "--multicast": {"default": ""},
+            "--frame-std": {"type": float, "default": 5e-5},
+            "--distortion": {"type": float, "default": 1e-4},
+        },
+    )
     seeing, drawn = np.random.default_rng(options.seed).spawn(2)
-    board = Blackboard.attach(options.directory / "world.bin")
+    board = Blackboard(options.directory / "world.bin")
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    line.bind((options.host, options.port))
+    line.bind((options.host, options.port or PORT))
     if options.multicast:
         here = socket.inet_aton(options.host)
         line.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, here)

@@ -229,7 +229,7 @@ _MEASURING = 5.0  # s, to settle and to measure
 def planned_states(
     cell: Cell, config: CellConfig, plan: Plan, begun: float = 0.0
 ) -> CampaignStates:
-    """Return the N states of a plan's steps in order, with times as they will be from `begun` on, s.
+    """Return the N states of a plan's steps in order, with their times from `begun` on, s.
 
     Of several targets, each is read at every step. The arm takes the route of a session; its joints
     warm up as those of the cell behind the wires do.

@@ -22,6 +22,7 @@ import struct
 import time
 from collections.abc import Callable
 from enum import Enum
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from hilcal.drivers.simulated.ur_programs import (
     WaypointProgram,
 )
 from hilcal.drivers.simulated.ur_rtde import Faults
-from hilcal.drivers.simulated.ur_state import ArmState, RobotMode, Runtime, SafetyMode
+from hilcal.drivers.simulated.ur_state import ArmState, Goal, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
 
 SAFETY_STOP = 15.0
@@ -44,11 +45,9 @@ STOP_TIME = 0.25
 """World time in which any program's end brings the arm to rest, s."""
 UNLOCK_AFTER = 5.0
 """Real time before a protective stop can be unlocked, s (the dashboard's own words)."""
-
 PATIENCE = 0.5
 """How much later than the watchdog allows a client on this machine may be, real s. A controller has
 a computer of its own; this one takes turns with its client, which would not have been late."""
-
 _COMPILE = 0.05  # s of real time from the upload of a program to its start
 _POWER_UP = 0.3  # s of real time for each step of powering up; real arms take some seconds
 _READ = 1 << 16  # bytes
@@ -63,20 +62,25 @@ class OrderResult(Enum):
     REFUSED = "refused"
 
 
+_PROGRAMS: dict[str, type[ControlScript | WaypointProgram]] = {
+    "control script": ControlScript,
+    "program of waypoints": WaypointProgram,
+}
+
+
 class Controller:
     """Runs one program at a time, and stops it for every reason there is."""
 
     def __init__(self, arm: ArmState, board: Blackboard) -> None:
         """Take over the state; publishes it."""
-        self.arm = arm
-        self.scripts = 0
-        self.unlock_after = UNLOCK_AFTER
+        self.arm, self._board = arm, board
+        self.scripts, self.unlock_after = 0, UNLOCK_AFTER
         self.hears: Callable[[int], bool] = lambda register: False
-        self._board = board
+        """Whether the client that writes an integer register has an open link."""
         self._program: ControlScript | WaypointProgram | None = None
         self._compiling: tuple[float, str] | None = None
         self._powering: tuple[float, RobotMode] | None = None
-        self._interrupted: tuple[Floats, float, float] | None = None
+        self._interrupted: Goal | None = None
         self._stopped_at = 0.0  # real time of the last protective stop
         self._published: tuple[object, ...] = ()
         self._published_at = 0.0
@@ -94,13 +98,15 @@ class Controller:
 
     def step(self) -> None:
         """Bring everything up to now."""
-        arm, real = self.arm, time.monotonic()
-        motion = arm.trajectory
+        arm, real, motion = self.arm, time.monotonic(), self.arm.trajectory
         motion.advance(arm.clock.now)
-        late = self._program.late if self._program and arm.runtime is Runtime.PLAYING else 0.0
-        waits = 0.0 < late < PATIENCE and self._client_is_there
-        if late and not waits:
-            self.stop_program("watchdog: no input package in time")
+        program, waits = self._program, False
+        if program is not None and program.late and arm.runtime is Runtime.PLAYING:
+            # one whose client has an open link is late for want of a turn
+            heard = isinstance(program, ControlScript) and self.hears(program.register)
+            waits = program.late < PATIENCE and heard
+            if not waits:
+                self.stop_program("watchdog: no input package in time")
         motion.rate = 0.0 if waits else arm.slider * arm.scaling
         if self._powering is not None and real >= self._powering[0]:
             arm.robot_mode, self._powering = self._powering[1], None
@@ -110,22 +116,26 @@ class Controller:
         if arm.runtime is Runtime.PAUSING and not motion.moving:
             arm.runtime = Runtime.PAUSED
         if self._program is not None and not waits and arm.runtime is Runtime.PLAYING:
-            self._poll()
+            try:
+                if not self._program.poll():
+                    self.stop_program("it ended")
+            except ProtectiveStop:
+                self.protective_stop("asked for by the program")
+            except ValueError as error:
+                self.stop_program(str(error))
         self.publish()
 
     def run(self, text: str) -> None:
         """Replace the running program by another one, where that is allowed."""
-        arm = self.arm
         self.scripts += 1
-        if not arm.remote or not arm.able:
-            why = "local mode" if not arm.remote else "the robot is not ready"
-            arm.note(f"script ignored: {why}")
-            return
-        if text.startswith("sec"):  # a secondary program moves nothing and stops nothing
-            arm.note("secondary program")
-            return
-        self.stop_program("replaced by a new script")
-        self._compiling = time.monotonic() + _COMPILE, text
+        if not self.arm.remote or not self.arm.able:
+            why = "the robot is not ready" if self.arm.remote else "local mode"
+            self.arm.note(f"script ignored: {why}")
+        elif text.startswith("sec"):  # a secondary program moves nothing and stops nothing
+            self.arm.note("secondary program")
+        else:
+            self.stop_program("replaced by a new script")
+            self._compiling = time.monotonic() + _COMPILE, text
 
     async def take_programs(self, reader: asyncio.StreamReader) -> None:
         """Run every program that a client sends, until it goes."""
@@ -138,15 +148,14 @@ class Controller:
 
     def stop_program(self, why: str) -> None:
         """End the program; the arm decelerates by itself."""
-        arm = self.arm
-        was = arm.runtime
-        if self.program_runs or arm.trajectory.moving:
+        arm, motion, ran = self.arm, self.arm.trajectory, self.arm.runtime
+        if self.program_runs or motion.moving:
             arm.note(f"program stopped: {why}")
         self._program = self._compiling = self._interrupted = None
         arm.runtime = Runtime.STOPPED
-        speed = float(np.max(np.abs(arm.trajectory.qd)))
-        arm.trajectory.stop(max(PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
-        if was is not arm.runtime:
+        speed = float(np.max(np.abs(motion.qd)))
+        motion.stop(max(PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
+        if ran is not arm.runtime:
             self.publish()
 
     def play(self) -> OrderResult:
@@ -156,9 +165,9 @@ class Controller:
             return OrderResult.REFUSED
         arm.runtime = Runtime.PLAYING
         arm.note("program resumed")
-        if self._interrupted is not None:
-            arm.trajectory.start(*self._interrupted, arm.clock.now)
-            self._interrupted = None
+        interrupted, self._interrupted = self._interrupted, None
+        if interrupted is not None:
+            arm.trajectory.start(*interrupted, arm.clock.now)
         return OrderResult.DONE
 
     def protective_stop(self, why: str) -> None:
@@ -209,10 +218,9 @@ class Controller:
         if mode is RobotMode.POWER_OFF:
             self.stop_program("power off")
             arm.robot_mode, self._powering = mode, None
-            return OrderResult.DONE
-        if arm.safety_mode is not SafetyMode.NORMAL:
+        elif arm.safety_mode is not SafetyMode.NORMAL:
             return OrderResult.REFUSED
-        if arm.robot_mode < mode:
+        elif arm.robot_mode < mode:
             if arm.robot_mode is RobotMode.POWER_OFF:
                 arm.robot_mode = RobotMode.POWER_ON
             self._powering = time.monotonic() + _POWER_UP, mode
@@ -220,11 +228,10 @@ class Controller:
 
     def set_remote(self, remote: bool) -> None:
         """Turn remote control on or off; turning it off ends the network's program."""
-        arm = self.arm
-        if remote is arm.remote:
+        if remote is self.arm.remote:
             return
-        arm.remote = remote
-        arm.note("remote mode" if remote else "local mode")
+        self.arm.remote = remote
+        self.arm.note("remote mode" if remote else "local mode")
         if not remote:
             self.stop_program("local mode")
         self.step()
@@ -233,42 +240,23 @@ class Controller:
         """Write the state to the blackboard where it has changed."""
         arm, motion = self.arm, self.arm.trajectory
         state = (motion.arrivals, motion.moving, arm.payload, *arm.payload_com.tolist())
-        same = state == self._published
-        if same and (not motion.moving or time.monotonic() - self._published_at < _MOST_OFTEN):
-            return
-        self._published, self._published_at = state, time.monotonic()
-        motion.publish(self._board, arm.payload, arm.payload_com)
+        often = time.monotonic() - self._published_at < _MOST_OFTEN
+        if state != self._published or (motion.moving and not often):
+            self._published, self._published_at = state, time.monotonic()
+            motion.publish(self._board, arm.payload, arm.payload_com)
 
     def _start_program(self, text: str) -> None:
         self._compiling = None
-        program: ControlScript | WaypointProgram
-        try:
-            program, what = ControlScript(text, self.arm), "control script"
-        except ValueError:
+        for what, kind in _PROGRAMS.items():
             try:
-                program, what = WaypointProgram(text, self.arm), "program of waypoints"
-            except ValueError:  # another one: it stops whatever moved, does its work and ends
-                self.arm.note(f"foreign program: {text[:60]!r}")
-                return
-        self._program = program
-        self.arm.runtime = Runtime.PLAYING
-        self.arm.note(f"{what} plays")
-
-    @property
-    def _client_is_there(self) -> bool:
-        """Whether the program's client has an open link: then it is late for want of a turn."""
-        program = self._program
-        return isinstance(program, ControlScript) and self.hears(program.register)
-
-    def _poll(self) -> None:
-        assert self._program is not None  # noqa: S101 - for the type checker
-        try:
-            if not self._program.poll():
-                self.stop_program("it ended")
-        except ProtectiveStop:
-            self.protective_stop("asked for by the program")
-        except ValueError as error:
-            self.stop_program(str(error))
+                self._program = kind(text, self.arm)
+            except ValueError:
+                continue
+            self.arm.runtime = Runtime.PLAYING
+            self.arm.note(f"{what} plays")
+            return
+        # another one: it stops whatever moved, does its work and ends
+        self.arm.note(f"foreign program: {text[:60]!r}")
 
 
 GREETING = "Connected: Universal Robots Dashboard Server"
@@ -284,11 +272,12 @@ SERIAL_NUMBER = "20235500001"
 
 
 class ClientServer:
-    """What the servers of a controller share: their open connections."""
+    """Serves the clients of a controller, each until it goes."""
 
     def __init__(self, controller: Controller, faults: Faults, model: str) -> None:
         """Serve a controller; `model` is the arm's name in the catalogue."""
-        self._controller, self._faults, self._model = controller, faults, model
+        self._controller, self._faults = controller, faults
+        self._model = model.upper().replace("E", "e")
         self._writers: set[asyncio.StreamWriter] = set()
 
     @property
@@ -301,59 +290,66 @@ class ClientServer:
         for writer in list(self._writers):
             writer.transport.abort()
 
-
-class DashboardServer(ClientServer):
-    """Answers the lines of every client."""
-
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve a client until it goes."""
         self._writers.add(writer)
-        local = not self._controller.arm.remote
+        gone = (OSError, ValueError, IndexError, asyncio.IncompleteReadError)
         try:
-            if not self._faults.dashboard_mute:
-                writer.write(f"{GREETING}\n".encode())
-            while line := await reader.readline():
-                words = line.decode("utf-8", "replace").strip()
-                if self._faults.dashboard_mute:
-                    continue
-                answer = self.answer(words, local)
-                writer.write(f"{answer}\n".encode())
-                if words.lower() == "quit":
-                    break
-        except (OSError, ValueError):  # gone, or a line without an end
-            pass
+            with contextlib.suppress(*gone):
+                await self.serve(reader, writer)
         finally:
             self._writers.discard(writer)
             writer.close()
 
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer what comes."""
+        raise NotImplementedError
+
+
+class DashboardServer(ClientServer):
+    """Answers the lines of every client."""
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer line by line; a connection made in local mode never gets more rights."""
+        local = not self._controller.arm.remote
+        if not self._faults.dashboard_mute:
+            writer.write(f"{GREETING}\n".encode())
+        while line := await reader.readline():
+            words = line.decode("utf-8", "replace").strip()
+            if not self._faults.dashboard_mute:
+                writer.write(f"{self.answer(words, local)}\n".encode())
+                if words.lower() == "quit":
+                    return
+
     def answer(self, words: str, local: bool) -> str:
-        """Return the answer to a line; a connection made in `local` mode never gets more rights."""
-        command = words.lower()
+        """Return the answer to a line."""
+        command, arm = words.lower(), self._controller.arm
         asked = self._questions().get(command)
         if asked is not None:
             return asked
-        order = self._orders().get(command)
+        order, done = self._orders().get(command, (None, ""))
         if order is None:
             return f"could not understand: '{words}'"
-        arm = self._controller.arm
         if local or not arm.remote:
             arm.note(f"dashboard refused in local mode: {command}")
             return LOCAL
         arm.note(f"dashboard: {command}")
-        return order()
+        result = order()
+        early = EARLY if result is OrderResult.TOO_EARLY else f"Failed to execute: {command}"
+        return done if result in (OrderResult.DONE, None) else early
 
     def _questions(self) -> dict[str, str]:
         arm = self._controller.arm
-        plays = arm.runtime is Runtime.PLAYING
+        plays = str(arm.runtime is Runtime.PLAYING).lower()
         return {
             "polyscopeversion": "URSoftware {}.{}.{}.{} (Jan 01 2023)".format(*arm.version),
             "get serial number": SERIAL_NUMBER,
-            "get robot model": self._model.upper().replace("E", "e"),
+            "get robot model": self._model,
             "is in remote control": str(arm.remote).lower(),
             "robotmode": f"Robotmode: {arm.robot_mode.name}",
             "safetystatus": f"Safetystatus: {arm.safety_mode.name}",
             "safetymode": f"Safetymode: {arm.safety_mode.name}",
-            "running": f"Program running: {str(plays).lower()}",
+            "running": f"Program running: {plays}",
             "programstate": f"{arm.program_state} <unnamed>",
             "get loaded program": "No program loaded",
             "get operational mode": "NONE",
@@ -362,34 +358,16 @@ class DashboardServer(ClientServer):
             "quit": "Disconnected",
         }
 
-    def _orders(self) -> dict[str, Callable[[], str]]:
-        controller = self._controller
-
-        def power(mode: RobotMode, done: str, command: str) -> str:
-            return _said(controller.power(mode), done, command)
-
+    def _orders(self) -> dict[str, tuple[Callable[[], OrderResult | None], str]]:
+        c = self._controller
         return {
-            "play": lambda: _said(controller.play(), "Starting program", "play"),
-            "stop": self._stop,
-            "unlock protective stop": self._unlock,
-            "power on": lambda: power(RobotMode.IDLE, "Powering on", "power on"),
-            "brake release": lambda: power(RobotMode.RUNNING, "Brake releasing", "brake release"),
-            "power off": lambda: power(RobotMode.POWER_OFF, "Powering off", "power off"),
+            "play": (c.play, "Starting program"),
+            "stop": (partial(c.stop_program, "dashboard"), "Stopped"),
+            "unlock protective stop": (c.unlock, "Protective stop releasing"),
+            "power on": (partial(c.power, RobotMode.IDLE), "Powering on"),
+            "brake release": (partial(c.power, RobotMode.RUNNING), "Brake releasing"),
+            "power off": (partial(c.power, RobotMode.POWER_OFF), "Powering off"),
         }
-
-    def _stop(self) -> str:
-        self._controller.stop_program("dashboard")
-        return "Stopped"
-
-    def _unlock(self) -> str:
-        answer = self._controller.unlock()
-        if answer is OrderResult.TOO_EARLY:
-            return EARLY
-        return _said(answer, "Protective stop releasing", "unlock protective stop")
-
-
-def _said(answer: OrderResult, done: str, command: str) -> str:
-    return done if answer is OrderResult.DONE else f"Failed to execute: {command}"
 
 
 BASE = "/universal-robots/robot-api"
@@ -401,39 +379,31 @@ Answer = tuple[int, dict[str, Any]]
 class RobotApiServer(ClientServer):
     """Answers the requests of every client."""
 
-    async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        """Serve a client until it goes, one request after the other."""
-        self._writers.add(writer)
-        try:
-            while line := (await reader.readline()).decode("latin-1").split():
-                head: dict[str, str] = {}
-                while name := (await reader.readline()).decode("latin-1").strip():
-                    key, _, value = name.partition(":")
-                    head[key.lower()] = value.strip()
-                body = await reader.readexactly(min(int(head.get("content-length", 0)), _BODY))
-                if self._faults.dashboard_mute:
-                    continue
-                status, told = self.answer(line[0], line[1], body)
-                text = json.dumps(told).encode()
-                words = f"HTTP/1.1 {status} {http.client.responses[status]}\r\n"
-                words += f"Content-Type: application/json\r\nContent-Length: {len(text)}\r\n\r\n"
-                writer.write(words.encode() + text)
-        except (OSError, ValueError, IndexError, asyncio.IncompleteReadError):
-            pass  # gone, or no HTTP
-        finally:
-            self._writers.discard(writer)
-            writer.close()
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """Answer one request after the other."""
+        while line := (await reader.readline()).decode("latin-1").split():
+            head: dict[str, str] = {}
+            while name := (await reader.readline()).decode("latin-1").strip():
+                key, _, value = name.partition(":")
+                head[key.lower()] = value.strip()
+            body = await reader.readexactly(min(int(head.get("content-length", 0)), _BODY))
+            if self._faults.dashboard_mute:
+                continue
+            status, content = self.answer(line[0], line[1], body)
+            text = json.dumps(content).encode()
+            words = f"HTTP/1.1 {status} {http.client.responses[status]}\r\n"
+            words += f"Content-Type: application/json\r\nContent-Length: {len(text)}\r\n\r\n"
+            writer.write(words.encode() + text)
 
     def answer(self, method: str, path: str, body: bytes) -> Answer:
         """Return status and body of the answer to a request."""
-        paths = self._paths()
+        known, orders = self._questions(), self._orders()
         at = path.removeprefix(BASE).rstrip("/")
-        if not path.startswith(BASE) or at not in paths:
+        if not path.startswith(BASE) or at not in {**known, **(orders if known else {})}:
             return 404, {"message": "Not Found"}
-        ask, order = paths[at]
-        if method == "GET" and ask is not None:
-            return 200, ask()
-        if method != "PUT" or order is None:
+        if method == "GET" and at in known:
+            return 200, known[at]
+        if method != "PUT" or at not in orders:
             return 405, {"message": "Method Not Allowed"}
         arm = self._controller.arm
         try:
@@ -444,63 +414,55 @@ class RobotApiServer(ClientServer):
             arm.note(f"Robot API refused in local mode: {action}")
             return 403, {"message": "The robot must be in remote mode"}
         arm.note(f"Robot API: {action}")
-        return order(action)
+        order = orders[at].get(action) if isinstance(action, str) else None
+        if order is None:
+            return 422, {"message": f"no action {action}"}
+        result = order()
+        if result is None:
+            return 200, {"state": "STOPPED", "message": "Program stopped"}
+        if result is OrderResult.DONE:
+            return 200, {"message": f"{action} done"}
+        return 409, {"message": f"{action} is not possible now: {result.value}"}
 
-    def _paths(
-        self,
-    ) -> dict[str, tuple[Callable[[], dict[str, Any]] | None, Callable[[str], Answer] | None]]:
-        """Questions and orders by path, as the version has them."""
+    def _questions(self) -> dict[str, dict[str, Any]]:
+        """Answers to questions by path, as the version has them; of older ones nothing."""
         arm, version = self._controller.arm, self._controller.arm.version[:2]
         api = next((api for since, api in _API_VERSIONS if version >= since), None)
         if api is None:
             return {}
-        mode, safety = arm.robot_mode.name, arm.safety_mode.name.replace("ROBOT_", "")
-        control = "REMOTE" if arm.remote else "LOCAL"
-        runs = arm.program_state
-        paths: dict[str, Any] = {
-            "/openapi.json": (lambda: {"info": {"title": "Robot API", "version": api}}, None),
-            "/robotstate/v1/state": (None, self._state),
-            "/program/v1/state": (lambda: {"state": runs}, self._program),
+        out: dict[str, dict[str, Any]] = {
+            "/openapi.json": {"info": {"title": "Robot API", "version": api}},
+            "/program/v1/state": {"state": arm.program_state},
         }
         if version >= (10, 12):
-            paths["/robotstate/v1/robotmode"] = (lambda: {"mode": mode}, None)
-            paths["/robotstate/v1/safetymode"] = (lambda: {"mode": safety}, None)
-            paths["/system/v1/controlmode"] = (lambda: {"mode": control}, None)
-            paths["/system/v1/operationalmode"] = (lambda: {"mode": "AUTOMATIC"}, None)
+            out |= {
+                "/robotstate/v1/robotmode": {"mode": arm.robot_mode.name},
+                "/robotstate/v1/safetymode": {"mode": arm.safety_mode.name.replace("ROBOT_", "")},
+                "/system/v1/controlmode": {"mode": "REMOTE" if arm.remote else "LOCAL"},
+                "/system/v1/operationalmode": {"mode": "AUTOMATIC"},
+            }
         if version >= (10, 14):
-            name = self._model.upper().replace("E", "e").replace("UR8LONG", "UR8L")
+            name = self._model.replace("UR8LONG", "UR8L")
             about = {"robotType": name, "serialNumber": SERIAL_NUMBER}
-            paths["/system/v1/information"] = (lambda: about, None)
-            whole = ".".join(map(str, arm.version[:3]))
-            paths["/versions/v1"] = (lambda: {"marketingVersion": whole}, None)
-        return paths
+            out["/system/v1/information"] = about
+            out["/versions/v1"] = {"marketingVersion": ".".join(map(str, arm.version[:3]))}
+        return out
 
-    def _program(self, action: str) -> Answer:
-        match action:
-            case "stop":
-                self._controller.stop_program("Robot API")
-                return 200, {"state": "STOPPED", "message": "Program stopped"}
-            case "play" | "resume":
-                return _api_said(self._controller.play(), action)
-        return 422, {"message": f"no action {action}"}
-
-    def _state(self, action: str) -> Answer:
-        powers = {
-            "POWER_ON": RobotMode.IDLE,
-            "BRAKE_RELEASE": RobotMode.RUNNING,
-            "POWER_OFF": RobotMode.POWER_OFF,
+    def _orders(self) -> dict[str, dict[str, Callable[[], OrderResult | None]]]:
+        c = self._controller
+        return {
+            "/program/v1/state": {
+                "stop": partial(c.stop_program, "Robot API"),
+                "play": c.play,
+                "resume": c.play,
+            },
+            "/robotstate/v1/state": {
+                "POWER_ON": partial(c.power, RobotMode.IDLE),
+                "BRAKE_RELEASE": partial(c.power, RobotMode.RUNNING),
+                "POWER_OFF": partial(c.power, RobotMode.POWER_OFF),
+                "UNLOCK_PROTECTIVE_STOP": c.unlock,
+            },
         }
-        if action in powers:
-            return _api_said(self._controller.power(powers[action]), action)
-        if action == "UNLOCK_PROTECTIVE_STOP":
-            return _api_said(self._controller.unlock(), action)
-        return 422, {"message": f"no action {action}"}
-
-
-def _api_said(result: OrderResult, action: str) -> Answer:
-    if result is OrderResult.DONE:
-        return 200, {"message": f"{action} done"}
-    return 409, {"message": f"{action} is not possible now: {result.value}"}
 
 
 STATE, MESSAGE = 16, 20
@@ -514,7 +476,7 @@ class PrimaryPort:
     """Sends states to every client, and takes programs from them."""
 
     def __init__(self, controller: Controller, rows: Floats, status: int) -> None:
-        """Serve a controller of the kinematics `rows` (4, 6), theta, a, d, alpha, with a `status`."""
+        """Serve a controller whose kinematics are `rows` (4, 6): theta, a, d, alpha, rad and m."""
         self._controller, self._rows, self._status = controller, rows, status
 
     async def run(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
@@ -550,16 +512,12 @@ class PrimaryPort:
             *(True, True, arm.robot_mode.value >= 4, arm.safety_bits & 0b11000000 > 0),
             *(arm.safety_bits & 4 > 0, program, arm.runtime is Runtime.PAUSED),
         )
-        body = struct.pack(
-            ">Q7?BBdddB", time.monotonic_ns() // 1000, *flags, arm.robot_mode.value, 0,
-            arm.slider, arm.scaling, 1.0, 0,
-        )  # fmt: skip
-        return _package(MODE, body)
+        values = (*flags, arm.robot_mode.value, 0, arm.slider, arm.scaling, 1.0, 0)
+        return _package(MODE, struct.pack(">Q7?BBdddB", time.monotonic_ns() // 1000, *values))
 
     def _kinematics(self) -> bytes:
         valid = 0 if self._status == LINEARISED else 0xFFFFFFFF
-        body = struct.pack(">6I", *([valid] * 6))
-        body += struct.pack(">24d", *self._rows.ravel()) + struct.pack(">I", self._status)
+        body = struct.pack(">6I24dI", *[valid] * 6, *self._rows.ravel(), self._status)
         return _package(KINEMATICS, body)
 
 

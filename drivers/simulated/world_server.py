@@ -19,7 +19,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -430,31 +430,23 @@ def open_board(directory: Path, scale: float, begun: float = 0.0, joints: int = 
         board = Blackboard.create(new, scale, begun, joints)
         new.replace(path)  # the mapping goes with the file
         return board
-    return Blackboard.attach(path)
+    return Blackboard(path)
 
 
 def main() -> int:
     """Run until the parent ends; returns the exit code."""
-    parser = admin.device_parser(__doc__)
-    arguments = parser.parse_args()
-    admin.end_with_parent()
+    options = admin.begin(__doc__, {})
     try:
-        world, config = read_world(arguments.directory / "world.json")
-        board = open_board(arguments.directory, config.simulation.clock, joints=world.cell.arm.n)
-        living = WorldState(world, config, board, arguments.seed)
+        world, config = read_world(options.directory / "world.json")
+        board = open_board(options.directory, config.simulation.clock, joints=world.cell.arm.n)
+        living = WorldState(world, config, board, options.seed)
     except HilcalError as error:
-        print(error, file=sys.stderr)
+        sys.stderr.write(f"{error}\n")
         return error.exit_code
     living.step(time.monotonic_ns())
-    asked: dict[str, Callable[..., Any]] = {
-        "hang": living.hang,
-        "mistake": living.mistake,
-        "push": living.push,
-        "swing": living.swing,
-        "state": living.state,
-        "log": living.log,
-    }
-    admin.serve(arguments.directory / "world.sock", admin.Operations(asked))
+    names = ("hang", "mistake", "push", "swing", "state", "log")
+    asked = {name: getattr(living, name) for name in names}
+    admin.serve(options.directory / "world.sock", admin.Operations(asked))
     while True:
         living.step(time.monotonic_ns())
         time.sleep(_POLL)

@@ -342,7 +342,7 @@ class Brakes:
             time.sleep(_TAKEN_S)
 
     def _until_still(self, seconds: float, *, program: bool) -> Reading | None:
-        """The second of two readings at rest in a row; with `program` none may run that could go on."""
+        """The second of two readings at rest in a row; with `program`, of one that ended."""
         end, still = time.monotonic() + seconds, 0
         while time.monotonic() < end:
             reading = self.receiver.read(STALE_S)

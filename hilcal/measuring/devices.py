@@ -130,9 +130,9 @@ class ArmDevice(Protocol):
     def moving(self) -> bool:
         """Whether the motion is still going on; call at least every 0.1 s (real time).
 
-        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself. It raises
-        DeviceError, the arm stopped, where the motion failed or the robot is not in a state to move:
-        protective stop, emergency stop, program stopped, link lost.
+        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself. DeviceError,
+        the arm stopped: the motion failed or the robot is not in a state to move (protective stop,
+        emergency stop, program stopped, link lost).
         """
         ...
 

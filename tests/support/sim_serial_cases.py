@@ -62,7 +62,7 @@ class Instrument:
 def start(module: str, name: str, directory: Path, scale: float, *options: str) -> Instrument:
     """Start `python -m hilcal.drivers.simulated.<module>` and wait until it is ready."""
     world = directory / "world.bin"
-    board = Blackboard.attach(world) if world.exists() else Blackboard.create(world, scale)
+    board = Blackboard(world) if world.exists() else Blackboard.create(world, scale)
     process = subprocess.Popen(
         [
             sys.executable,

@@ -36,7 +36,7 @@ def test_instruments_see_the_one_world(
         try:
             assert [a.problems for a in answers] == [()] * 4
             sample = rig.tracker.measure()
-            truth = Blackboard.attach(tmp_path / "world.bin").read("truth")
+            truth = Blackboard(tmp_path / "world.bin").read("truth")
             off = sample.value.copy()
             off[:3] -= truth["target"]
             if len(off) == 6:

@@ -148,7 +148,7 @@ def test_a_killed_device_comes_back_at_the_same_place(cell, device):
 
 def test_the_truth_goes_on_with_the_arm_after_a_restart_of_the_world(cell):
     cell.restart("world")
-    board = Blackboard.attach(cell.directory / "world.bin")
+    board = Blackboard(cell.directory / "world.bin")
     cell.ask("world", "hang", name="5kg")
     truth, state = board.read("truth"), cell.ask("world", "state")
     arm = board.read("arm")

@@ -33,7 +33,7 @@ def process(tmp_path):
 
 
 def test_a_world_that_died_goes_on_where_it_was(process, tmp_path):
-    board = Blackboard.attach(tmp_path / "world.bin")
+    board = Blackboard(tmp_path / "world.bin")
     ask(process.socket, "hang", name="pull")
     since, begun = board.read("truth")["load_since"], board.time
     ask(process.socket, "die")
