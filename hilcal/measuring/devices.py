@@ -106,43 +106,35 @@ class ArmDevice(Protocol):
 
     def report(self) -> Report:
         """Return identity, versions, state, and every problem at once; moves nothing."""
-        ...
 
     def sample(self) -> ArmSample:
         """Return a sample younger than 0.2 s (real time), or raise DeviceError."""
-        ...
 
     def take_control(self, mass: float, com: Floats) -> None:
         """Take control of the arm; set its payload, kg and m (flange axes)."""
-        ...
 
     def set_payload(self, mass: float, com: Floats) -> None:
         """Set the payload in the controller, kg and m (flange axes), and verify it."""
-        ...
 
     def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
         """Start a straight line in joint space to q (n,) and return at once.
 
         Speed and acceleration are those of the leading joint, rad/s and rad/s².
         """
-        ...
 
     def moving(self) -> bool:
         """Whether the motion is still going on; call at least every 0.1 s (real time).
 
-        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself. DeviceError,
-        the arm stopped: the motion failed or the robot is not in a state to move (protective stop,
-        emergency stop, program stopped, link lost).
+        If nobody calls for 0.5 s (real time) while the arm moves, the arm stops by itself.
+        DeviceError, the arm stopped: the motion failed, or the robot is not in a state to move
+        (protective stop, emergency stop, program stopped, link lost).
         """
-        ...
 
     def stop(self) -> None:
         """Stop the arm by every way there is; DeviceError: not sure that it stands."""
-        ...
 
     def close(self) -> None:
         """Stop, give control back, end all helpers. Never raises, may be called twice."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,19 +154,15 @@ class TrackerDevice(Protocol):
 
     def report(self) -> Report:
         """Say who answered, versions, lock state, and every problem at once."""
-        ...
 
     def measure(self) -> TrackerSample:
         """Measure once; TargetLostError: no target, beam broken, lock lost, no distance."""
-        ...
 
     def find_target(self) -> None:
         """Search and lock the target again; TargetLostError: not found."""
-        ...
 
     def close(self) -> None:
         """Give the port back. Never raises, may be called twice."""
-        ...
 
 
 @runtime_checkable
@@ -186,7 +174,6 @@ class PointingTracker(TrackerDevice, Protocol):
 
         One farther than `radius` from there is another one; TargetLostError: there is none.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -215,23 +202,18 @@ class ForceSensorDevice(Protocol):
 
     def report(self) -> Report:
         """Say who answered, versions, rate, temperature, and every problem at once."""
-        ...
 
     def latest(self) -> WrenchSample:
         """Return the newest frame, younger than 0.2 s; DeviceError: the stream is dead or stale."""
-        ...
 
     def average(self, seconds: float) -> WrenchSample:
         """Return the mean of the frames of the next so many real seconds; DeviceError: too few."""
-        ...
 
     def losses(self) -> Losses:
         """Return the counters."""
-        ...
 
     def close(self) -> None:
         """Stop the stream, give the port back. Never raises, may be called twice."""
-        ...
 
 
 class OperatorDevice(Protocol):
@@ -239,18 +221,15 @@ class OperatorDevice(Protocol):
 
     def report(self) -> Report:
         """Say who is asked."""
-        ...
 
     def hang(self, load: CellLoad | None, why: str) -> None:
         """Ask for a load (None: take everything off) and wait until it is said to be done.
 
         `why` tells why it is asked for again; DeviceError: the person gives up.
         """
-        ...
 
     def close(self) -> None:
         """Give the terminal back. Never raises, may be called twice."""
-        ...
 
 
 @runtime_checkable
@@ -259,7 +238,6 @@ class ConfirmingOperator(OperatorDevice, Protocol):
 
     def confirm(self, question: str) -> None:
         """Ask about what the arm does next, and wait; DeviceError: the person gives up."""
-        ...
 
 
 @runtime_checkable

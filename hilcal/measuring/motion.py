@@ -11,6 +11,7 @@ from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ArmDevice, ArmSample, Clock, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
 from hilcal.measuring.force import MOMENT_LEVER_M, ForceMeter, TaredWrench
+from hilcal.measuring.progress import ArmAt, Watcher
 from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
@@ -238,16 +239,16 @@ class Mover:
         guard: Guard,
         config: CellConfig,
         clock: Clock,
-        passed: Callable[[Floats], None] = lambda q: None,
+        watcher: Watcher,
     ) -> None:
-        """Use an open arm; `passed` is told where it is (n,) while it moves, and must not wait."""
+        """Use an open arm; the watcher is told where it is while it moves, and must not wait."""
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
         self.side = np.zeros(guard.cell.arm.n)
         self.watch = None if meter is None else LoadWatch(meter, guard.cell, config)
         self._arm, self._meter, self._guard = arm, meter, guard
         self._limits = Feasibility(guard.cell, config)
-        self._motion, self._clock, self._passed = config.motion, clock, passed
+        self._motion, self._clock, self._watcher = config.motion, clock, watcher
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)
 
@@ -367,7 +368,7 @@ class Mover:
         while self._arm.moving():
             sample = self.look()
             last = self._check_progress(start, q, sample, last, name)
-            self._passed(sample.q)
+            self._watcher.notify(ArmAt(tuple(sample.q.tolist())))
             slowest = min(slowest, max(sample.speed_scaling, SLOWEST))
             allowed = 3.0 * usual / slowest + GRACE_S * self._clock.scale
             if self._clock.now() - begun > allowed:
@@ -377,7 +378,7 @@ class Mover:
                 )
             self._clock.sleep(POLL_S * self._clock.scale)
         arrived = self.look().q
-        self._passed(arrived)
+        self._watcher.notify(ArmAt(tuple(arrived.tolist())))
         off = np.abs(arrived - q)
         if not off.max() <= motion.arrival_rad:
             k = int(np.argmax(off))

@@ -1,7 +1,7 @@
 """What is carried from reading to reading, and a reading as it is stored, with all behind it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,6 @@ from hilcal.measuring.arrival import RoughRegistration
 from hilcal.measuring.devices import ArmSample, Clock, Losses, TrackerSample, WrenchSample
 from hilcal.measuring.force import TaredWrench
 from hilcal.measuring.measure import MeasuredStop
-from hilcal.readings.readings import Readings, States
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import REFERENCE, UNLOADED, Step
@@ -94,64 +93,17 @@ def repeatability(visits: Sequence[UnloadedVisit]) -> RepeatabilityEstimate | No
     )
 
 
-def reading_of(
-    step: Step,
-    q: Floats,
-    measured: MeasuredStop,
-    wrench: Floats,
-    time: float,
-    load_time: float,
-    side: Floats,
-    joint_temperature: Floats | None,
-    torque: Floats | None = None,
-    target: int | None = None,
-    target_names: tuple[str, ...] = (),
-) -> Readings:
-    """Return one reading; its covariance is the instrument's alone.
-
-    `wrench` (6,) is at the load point, base axes; times are in cell s; `torque` is NaN where this
-    reading has none, and None, as temperature and target, in a campaign without.
-    """
-    states = States(
-        q=q[None].copy(),
-        wrench=wrench[None].copy(),
-        time=np.array([time]),
-        load_time=np.array([load_time]),
-        joint_temperature=None if joint_temperature is None else joint_temperature[None].copy(),
-        approach=side[None].copy(),
-        q_actual=measured.q[None].copy(),
-        torque=None if torque is None else torque[None].copy(),
-        target=None if target is None else np.array([target]),
-    )
-    return Readings(
-        states=states,
-        pose=np.zeros(1, dtype=np.int64),
-        load=np.zeros(1, dtype=np.int64),
-        cycle=np.array([step.cycle], dtype=np.int64),
-        value=measured.mean.value[None].copy(),
-        covariance=measured.mean.covariance[None].copy(),
-        load_names=(step.load,),
-        pose_names=(step.pose,),
-        target_names=() if target is None else target_names,
-    )
-
-
 def detail(
-    step: Step,
-    measured: MeasuredStop,
-    tared: TaredWrench | None,
-    zero: Floats | None,
-    session: dict[str, Any],
+    step: Step, measured: MeasuredStop, tared: TaredWrench | None, zero: Floats | None
 ) -> dict[str, Any]:
-    """Return everything raw behind a reading; `session` has further keys: times, losses, sides."""
+    """Return everything raw behind a reading; `zero` (6,) is the force sensor's of the session."""
+    mean = measured.mean
     out: dict[str, Any] = {
-        "pose": step.pose,
-        "load": step.load,
-        "cycle": step.cycle,
-        "value": measured.mean.value.tolist(),
-        "tracker_covariance": measured.mean.covariance.tolist(),
-        "scatter": measured.mean.scatter,
-        "left_out": list(measured.mean.left_out),
+        **asdict(step),
+        "value": mean.value.tolist(),
+        "tracker_covariance": mean.covariance.tolist(),
+        "scatter": mean.scatter,
+        "left_out": list(mean.left_out),
         "q_actual": measured.q.tolist(),
         "torque": None if measured.torque is None else measured.torque.tolist(),
         "settling_s": measured.settling,
@@ -162,12 +114,9 @@ def detail(
         "force": sample_json(measured.force),
     }
     if tared is not None and zero is not None:
-        out["felt"] = {
-            "wrench": tared.wrench.tolist(),
-            "covariance": tared.covariance.tolist(),
-            "zero": zero.tolist(),
-        }
-    return out | session
+        felt = {"wrench": tared.wrench, "covariance": tared.covariance, "zero": zero}
+        out["felt"] = {name: array.tolist() for name, array in felt.items()}
+    return out
 
 
 def stored_wrench(stored: dict[str, Any]) -> TaredWrench | None:
@@ -215,24 +164,6 @@ class Shift:
             f"(drift_limit_sigma {limit:g}): is the tracker or the target loose, or the arm "
             "still warming up?"
         )
-
-
-@dataclass(slots=True)
-class Drift:
-    """Compares the unloaded readings at the reference pose with the first of them."""
-
-    _first: tuple[Floats, Floats] | None = field(default=None)
-
-    def add(self, step: Step, position: Floats, covariance: Floats) -> Shift | None:
-        """Add a position (3,), m; returns its shift where it is a return, else None."""
-        if step.pose != REFERENCE or step.load != UNLOADED:
-            return None
-        if self._first is None:
-            self._first = position, covariance
-            return None
-        d = np.asarray(position - self._first[0])
-        square = float(d @ np.linalg.solve(covariance + self._first[1], d))
-        return Shift(d, float(np.sqrt(max(square, 0.0))))
 
 
 LOADING_S = 60.0
@@ -285,7 +216,7 @@ class SessionState:
         self._cell, self._joint_std = cell, joint_std
         self._unloaded: dict[tuple[str, int, int], Floats] = {}
         self._visits: list[UnloadedVisit] = []
-        self._drift = Drift()
+        self._reference: tuple[Floats, Floats] | None = None
 
     def add(
         self,
@@ -316,7 +247,14 @@ class SessionState:
         jac = drive_jacobian(self._cell.arm, chain, chain.point(self._cell.target[:3, 3]))[0, :3]
         instrument = covariance[:3, :3]
         self._visits.append(UnloadedVisit(step.pose, position, instrument, float(np.sum(jac**2))))
-        return self._drift.add(step, position, instrument + scatter)
+        if step.pose != REFERENCE:
+            return None
+        if self._reference is None:
+            self._reference = position, instrument + scatter
+            return None
+        d = np.asarray(position - self._reference[0])
+        square = float(d @ np.linalg.solve(instrument + scatter + self._reference[1], d))
+        return Shift(d, float(np.sqrt(max(square, 0.0))))
 
     def deflection(self, step: Step, position: Floats, target: int = 0) -> float | None:
         """Return how far a loaded reading is from its unloaded one, m; None where that lacks."""
