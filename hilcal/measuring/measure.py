@@ -145,7 +145,7 @@ _LOG_GROSS = float(np.log(2) + stats.norm.logsf(GROSS_SIGMA))
 
 DRIFT_P = 0.04
 """False alarm rate of the drift test. The constants here are choices, traded by hand in
-tests/unit/measuring/test_settle.py: time lost at rest against the bias that a decay leaves."""
+tests/unit/measuring/test_measure.py: time lost at rest against the bias that a decay leaves."""
 AFTER_DRIFT_P = 0.3
 """The same after readings have drifted: the test is repeated at every sample, and none of the
 repeated tests may miss a drift that is there."""

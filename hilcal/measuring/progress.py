@@ -51,19 +51,29 @@ class LiveResidual:
 
 @dataclass(frozen=True, slots=True)
 class GoalStatus:
-    """How far a campaign is from its goal; without `worst` that is not known yet."""
+    """How far a campaign is from its goal; without `worst` that is not known yet.
 
-    text: str  # the goal as it was given
-    met: bool = False  # whether it is met
+    Attributes:
+        text: the goal as it was given.
+        met: whether it is met.
+        worst: the name of the parameter, "position" or "deflection", whose uncertainty is worst.
+        std: its standard uncertainty, in `unit`; infinite where the readings do not determine it.
+        ratio: std over what is asked for; at most 1 where the goal is met.
+        unit: "%" or SI.
+        model: names of the effects that were fitted.
+        fitted: "deflection" or "absolute", the kind of readings that was fitted.
+        quantity: what `std` is, in full; empty while it is not known.
+    """
+
+    text: str
+    met: bool = False
     worst: str | None = None
-    """the name of the parameter, "position" or "deflection", whose uncertainty is worst."""
     std: float | None = None
-    """its standard uncertainty, in `unit`; infinite where the readings do not determine it."""
-    ratio: float | None = None  # std over what is asked for; at most 1 where the goal is met
-    unit: str | None = None  # "%" or SI
-    model: tuple[str, ...] | None = None  # names of the effects that were fitted
-    fitted: str | None = None  # "deflection" or "absolute", the kind of readings that was fitted
-    quantity: str = ""  # what `std` is, in full; empty while it is not known
+    ratio: float | None = None
+    unit: str | None = None
+    model: tuple[str, ...] | None = None
+    fitted: str | None = None
+    quantity: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return it as JSON; a number that is not finite becomes null."""

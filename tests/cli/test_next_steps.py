@@ -239,7 +239,7 @@ HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_st
 PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
 DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
 KINEMATICS = (
-    "tests/wire/test_polyscope_x_cell.py"
+    "tests/wire/test_network_cell.py"
     "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
 )
 TAKEN: dict[str, dict[str, str]] = {

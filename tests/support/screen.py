@@ -27,11 +27,7 @@ STANDING_S = 0.5
 
 
 class AtTerminal:
-    """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen.
-
-    Attributes:
-        gaps: (seconds, line that stood last) of every silence so far, longest first.
-    """
+    """One command of hilcal in a pseudo-terminal of its own, and what stands on its screen."""
 
     def __init__(
         self,

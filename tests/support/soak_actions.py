@@ -55,22 +55,13 @@ CODES = (0, 3, 130, -signal.SIGKILL)
 
 @dataclass
 class Soak:
-    """What is done, and what was found.
+    """What is done, and what was found."""
 
-    Attributes:
-        rng: draws everything.
-        folder: for the files.
-        counts: how often each thing was done, by name.
-        findings: what was wrong: what was being done, and the failed check.
-        starved: runs that ended because this computer gave a process no turn.
-        slowest: by fault, the longest time from it until an arm in motion stood, s.
-    """
-
-    rng: Random
-    folder: Path
-    counts: Counter[str] = field(default_factory=Counter)
+    rng: Random  # draws everything
+    folder: Path  # for the files
+    counts: Counter[str] = field(default_factory=Counter)  # how often each thing was done, by name
     findings: list[str] = field(default_factory=list)
-    starved: int = 0
+    starved: int = 0  # runs that ended because this computer gave a process no turn
     slowest: dict[str, float] = field(default_factory=dict)
     _stack: ExitStack = field(default_factory=ExitStack)
     _site: Site | None = None
@@ -202,11 +193,7 @@ class Soak:
         return "load falls"
 
     def wrong_weights(self) -> str:
-        """The person hangs another weight than asked for, once or every time.
-
-        Once where no reading is stored yet: by the sensor's own zero a load that nobody took off
-        cannot be told, and the second answer is believed until gravity turns in the sensor.
-        """
+        """The person hangs another weight than asked for, once or every time."""
         before = self.path
         measured = self._count_stored() > 0
         run = self._run()  # may begin another campaign

@@ -93,10 +93,7 @@ def api(sim: Sim) -> RobotApi:
 
 
 def children() -> list[psutil.Process]:
-    """Child processes of the driver (the simulated controllers are children, too).
-
-    A relay to PolyScope X ends by itself with the process that commands, a moment later.
-    """
+    """Child processes of the driver (the simulated controllers are children, too)."""
     end = time.monotonic() + 2.0
     while True:
         mine = psutil.Process().children(recursive=True)

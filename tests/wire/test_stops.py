@@ -78,11 +78,7 @@ def test_ctrl_c_twice_in_a_row_stops_it_too(cell: Site, path: Path) -> None:
 
 
 def _kill_at_random(cell: Site, path: Path, kills: int, seed: int) -> int:
-    """Kill one run after the other; returns in how many of them the arm moved.
-
-    The moment of every second one counts from when all devices are ready: whatever the kill
-    before has left behind, it must not be refused. None may end before it is killed.
-    """
+    """Kill one run after the other; returns in how many of them the arm moved."""
     rng = np.random.default_rng(seed)
     killed = moved = starved = 0
     cell.slider(SLOW)
