@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +76,6 @@ class Deframer:
     """
 
     def __init__(self, frame: FrameFormat) -> None:
-        """Start without any bytes, not in step with the sender."""
         self.frames = self.corrupt = self.skipped = 0
         self._format = frame
         self._buffer = bytearray()
@@ -147,7 +146,6 @@ class ByDeviceClock:
     LONGEST_S = 30.0
 
     def __init__(self, tick_s: float, bits: int) -> None:
-        """Use a counter of so many bits that grows by one in `tick_s`."""
         self.lost = 0
         self._tick, self._wrap = tick_s, 1 << bits
         self._last: int | None = None
@@ -204,7 +202,6 @@ class ByArrival:
     DOUBT = 10.0
 
     def __init__(self, rate: float) -> None:
-        """Expect so many frames per second."""
         self.lost = 0
         self.rate = rate
         self._due: float | None = None  # when the newest frame was due
@@ -264,55 +261,21 @@ class SensorFormat:
     """(wrench (6,), status) to what is wrong with such a frame, "" where nothing."""
 
 
-class Port(Protocol):
-    """What a stream is read from: a serial port, or datagrams behind the same few names."""
-
-    @property
-    def port(self) -> Any:
-        """Its name."""
-
-    @property
-    def baudrate(self) -> int:
-        """Rate of the line, Bd; 0 where there is none."""
-
-    @property
-    def in_waiting(self) -> int:
-        """Bytes that have come."""
-
-    def read(self, size: int) -> bytes:
-        """Return so many of them."""
-
-    def close(self) -> None:
-        """Give it back."""
-
-
-class FrameSource(Protocol):
-    """What takes frames out of bytes, and counts; see `frames.Deframer`."""
-
-    frames: int
-    corrupt: int
-    skipped: int
-
-    def push(self, data: bytes) -> list[bytes]:
-        """Take bytes, return the bodies of the frames in them."""
-        ...
-
-
 class ForceStream:
     """A sensor that is sending; see `hilcal.measuring.devices.ForceSensorDevice`."""
 
     def __init__(
         self,
-        port: Port,
+        port: Any,
         sensor: SensorFormat,
         name: str = "",
         facts: tuple[tuple[str, str], ...] = (),
         *,
-        deframer: FrameSource | None = None,
+        deframer: Any = None,
         failures: Callable[[str, str], AbstractContextManager[None]] = line_failures,
         before_close: Callable[[], None] = lambda: None,
     ) -> None:
-        """Start to read an open port, which `close` closes.
+        """Start to read an open port, which `close` closes: a serial one, or what has its names.
 
         `deframer` takes the frames out of the bytes where `sensor.frame` does not tell how;
         `failures` turns what the port raises into DeviceError; `before_close` must not raise.
@@ -320,7 +283,7 @@ class ForceStream:
         self._name, self._facts, self._before_close = name or sensor.name, facts, before_close
         self._port, self._sensor, self._failures = port, sensor, failures
         self._path = str(port.port)
-        self._deframer: FrameSource = Deframer(sensor.frame) if deframer is None else deframer
+        self._deframer = deframer or Deframer(sensor.frame)
         self._counter = sensor.losses()
         self._lock = threading.Lock()
         self._failure = ""

@@ -52,7 +52,6 @@ class NoAnswerError(DeviceError):
     """No sound answer came; `heard` is whether anything came at all."""
 
     def __init__(self, heard: bool) -> None:
-        """Without a text: the caller knows what device it is."""
         super().__init__("no answer")
         self.heard = heard
 

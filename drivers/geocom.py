@@ -349,7 +349,6 @@ class GeoComTracker:
     def __init__(
         self, link: Link, config: TrackerConfig, options: GeoComOptions, clock: Clock
     ) -> None:
-        """Take over an open link; sends nothing yet."""
         self._link, self._config, self._options, self._clock = link, config, options, clock
         self._full_known = True
         self._last_ms = 0.0

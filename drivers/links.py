@@ -13,7 +13,7 @@ import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import serial
 
@@ -67,14 +67,7 @@ def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
     return False
 
 
-class Closable(Protocol):
-    """What can be closed."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
-def close_port(port: Closable) -> None:
+def close_port(port: Any) -> None:
     """Give the port back, whatever state it is in. Never raises, may be called twice."""
     with contextlib.suppress(OSError, termios.error):
         port.close()

@@ -90,7 +90,6 @@ class Reader:
     """Reads a content from its beginning on; raises struct.error where that ends before."""
 
     def __init__(self, content: bytes, version: Version) -> None:
-        """Begin."""
         self.content, self.version, self.at = content, version, 0
 
     def take(self, layout: struct.Struct) -> tuple[float, ...]:

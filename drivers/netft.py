@@ -78,7 +78,6 @@ class Datagrams:
     skipped = 0
 
     def __init__(self, host: str, port: int) -> None:
-        """Ask the sensor to send."""
         self.port = f"{host}:{port}"
         self.frames = self.corrupt = 0
         self._came = bytearray()

@@ -25,7 +25,6 @@ class TerminalOperator:
     """Asks on standard error and listens to standard input."""
 
     def __init__(self, config: CellConfig) -> None:
-        """Remember where loads act and which way weights pull."""
         self.at_terminal = True
         self._point = config.tool.load_point_m
         self._gravity = config.robot.gravity_m_s2

@@ -83,7 +83,6 @@ class UrArm:
         receiver: Receiver,
         torques: TorqueReader | None = None,
     ) -> None:
-        """Use an open link; `open_arm` makes one."""
         self._torques = torques
         self._host, self._hz, self._model = host, hz, config.robot.model
         self._arrival, self._clock = config.motion.arrival_rad, config.simulation.clock

@@ -80,7 +80,6 @@ class Operations:
     def __init__(
         self, functions: Mapping[str, Callable[..., Any]], state: Callable[[], Any] | None = None
     ) -> None:
-        """Take the functions, and one that returns the state."""
         self._state = state or (lambda: None)
         self.functions = {**functions, "die": threading.Timer(0.02, os._exit, (70,)).start}
         if state is not None:

@@ -39,7 +39,6 @@ class ArmController:
     """The trajectory of the arm, and who may command it; every method from any thread."""
 
     def __init__(self, arm: Arm, board: Blackboard, rng: np.random.Generator) -> None:
-        """Take over where the arm stood, or was told to begin."""
         kept = board.read("arm")
         self._board, self._clock, self._lock = board, WorldClock(board), threading.RLock()
         self._arm, self._kinematics = arm, Kinematics(arm)
@@ -134,7 +133,6 @@ class SimulatedArm:
     """See `hilcal.measuring.devices.ArmDevice`."""
 
     def __init__(self, socket: Path) -> None:
-        """Use the admin line of the simulated controller; `open_arm` makes one."""
         self._socket, self._ours = socket, False
 
     def report(self) -> Report:

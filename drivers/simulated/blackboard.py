@@ -69,7 +69,6 @@ class Blackboard:
     """An open shared file; use `create` once."""
 
     def __init__(self, path: Path) -> None:
-        """Map an existing file."""
         with path.open("r+b") as stream:
             self._map = mmap.mmap(stream.fileno(), 0)
         self.joints = int(np.frombuffer(self._map, "<i8", 1, _SEQUENCE)[0])

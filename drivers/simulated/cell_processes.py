@@ -48,7 +48,6 @@ class DeviceProcess:
     """
 
     def __init__(self, name: str, module: str, directory: Path, arguments: tuple[str, ...]) -> None:
-        """Prepare; nothing is started."""
         self.name = name
         self.socket, self.log = directory / f"{name}.sock", directory / f"{name}.log"
         self._command = (sys.executable, "-m", module, "--directory", str(directory), *arguments)
@@ -129,7 +128,6 @@ class SimulatedCell:
         devices: dict[str, DeviceProcess],
         board: Blackboard,
     ) -> None:
-        """Take over processes that have not been started; use `start`."""
         self.config, self.directory, self._devices, self._board = config, directory, devices, board
 
     @classmethod
@@ -207,11 +205,9 @@ class SimulatedCell:
             device.end()
 
     def __enter__(self) -> Self:
-        """Return the running cell."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End every process."""
         self.close()
 
     def _begin(self, devices: Iterable[DeviceProcess]) -> None:

@@ -164,14 +164,15 @@ class SimulatedTracker:
         position: Floats = seen.distance * seen.direction()
         covariance = a * a * noise.covariance(position[None], 3)[0]
         turn: Floats | None = None
-        turned, angles = np.zeros((3, 3)), np.zeros(3)
+        turned: Floats = np.zeros((3, 3))
+        angles: Floats = np.zeros(3)
         if mode == es.STATIONARY_6D:
             rotation = settled_truth(station.board)["target_rotation"]
             off = Rotation.from_rotvec(noise.orientation_std * self.rng.normal(size=3))
             seen_turn = off * Rotation.from_matrix(rotation)
             turn, angles = np.roll(seen_turn.as_quat(), 1), seen_turn.as_euler("xyz")
             J = _rates(angles)
-            turned = (b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J)
+            turned = np.asarray((b * noise.orientation_std) ** 2 * np.linalg.inv(J.T @ J))
         at = a * (position + moved)
         m = es.Measurement(at, covariance, turn, b * angles, turned, self.environment())
         kind, packed = es.pack_measurement(m, mode)

@@ -117,7 +117,6 @@ class SensorProtocol:
     usual_rate = 1000.0
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on."""
         self.rate = self.usual_rate if rate is None else rate
         self.streaming = True
 
@@ -154,7 +153,6 @@ class Bota(SensorProtocol):
     _body = struct.Struct("<H6fIf")
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on."""
         super().__init__(rate)
         self.saturated = False
         self._start_us = 0
@@ -211,7 +209,6 @@ class Ft300(SensorProtocol):
     scale = np.repeat((100.0, 1000.0), 3)
 
     def __init__(self, rate: float | None = None) -> None:
-        """Switch on: it waits for requests."""
         super().__init__(rate)
         self.streaming = False
         self._stop_bytes = 0

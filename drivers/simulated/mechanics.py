@@ -342,7 +342,6 @@ class _Loaded:
         load_point: Floats,
         sensor: Misreading | None = None,
     ) -> None:
-        """Prepare the work space; `load_point` (3,) in flange axes, m."""
         self.tree, self.law = tree, law
         self.model = tree.model
         self.data = tree.model.createData()

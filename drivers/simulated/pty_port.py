@@ -49,7 +49,6 @@ class PtyPort:
     """
 
     def __init__(self, link: Path, baud: int, rng: np.random.Generator) -> None:
-        """Plug the line in; `link` is the port's name, `baud` the instrument's rate, Bd."""
         if baud not in _SPEEDS:
             raise ValueError(f"baud = {baud}; valid: {sorted(_SPEEDS)}")
         self.link, self.baud = link, baud

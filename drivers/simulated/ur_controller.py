@@ -72,7 +72,6 @@ class Controller:
     """Runs one program at a time, and stops it for every reason there is."""
 
     def __init__(self, arm: ArmState, board: Blackboard) -> None:
-        """Take over the state; publishes it."""
         self.arm, self._board = arm, board
         self.scripts, self.unlock_after = 0, UNLOCK_AFTER
         self.hears: Callable[[int], bool] = lambda register: False
@@ -275,7 +274,6 @@ class ClientServer:
     """Serves the clients of a controller, each until it goes."""
 
     def __init__(self, controller: Controller, faults: Faults, model: str) -> None:
-        """Serve a controller; `model` is the arm's name in the catalogue."""
         self._controller, self._faults = controller, faults
         self._model = model.upper().replace("E", "e")
         self._writers: set[asyncio.StreamWriter] = set()

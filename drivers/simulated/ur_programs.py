@@ -76,7 +76,6 @@ class ControlScript:
     """The uploaded script, once it plays."""
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read what the client has put into the text."""
         found = _OFFSET.search(text)
         if found is None:
             raise ValueError("not a control script")
@@ -231,7 +230,6 @@ class ScriptStream:
     """Cuts what comes on the script port into programs."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._lines: list[str] = []
         self._rest = ""
 

@@ -161,7 +161,6 @@ class Sensors:
     """
 
     def __init__(self, arm: ArmState, board: Blackboard, rng: np.random.Generator) -> None:
-        """Look into the world."""
         self._arm, self._board, self._rng = arm, board, rng
         self._places: dict[bytes, Floats] = {}
         self._readers = self._table()
@@ -267,7 +266,7 @@ class Sensors:
         return arm.kinematics.weight_torque(arm.trajectory.q, arm.payload, arm.payload_com)
 
     def _target_current(self) -> Floats:
-        return self._powered * self._array("target_moment") / _TORQUE_PER_AMPERE
+        return np.asarray(self._powered * self._array("target_moment") / _TORQUE_PER_AMPERE)
 
     def _measured_torque(self) -> Floats:
         """What the drives exert against load, weight, and the friction of the arrival."""
@@ -368,7 +367,6 @@ class RtdeLink:
     def __init__(
         self, links: RtdeLinks, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
-        """Take over an accepted connection."""
         self._links, self._reader, self.writer = links, reader, writer
         self._recipes: dict[int, Recipe] = {}
         self._out: Recipe | None = None

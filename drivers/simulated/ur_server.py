@@ -82,7 +82,6 @@ class UrServer:
         api_port: int = API,
         factory: FactoryKinematics | None = None,
     ) -> None:
-        """Put the parts together; nothing is opened."""
         self.arm, self.faults = state, Faults()
         self.controller = Controller(state, board)
         sensors = Sensors(state, board, rng)

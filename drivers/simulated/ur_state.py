@@ -38,7 +38,6 @@ class Kinematics:
     """Nominal kinematics and weight of the arm, as its controller knows them, by Pinocchio."""
 
     def __init__(self, arm: Arm) -> None:
-        """Take the arm's constants."""
         self.arm = arm
         self._model = pinocchio_model(arm)
         self._model.gravity.linear = GRAVITY
@@ -131,7 +130,6 @@ class Trajectory:
     """
 
     def __init__(self, q: Floats, side: Floats, arrivals: int, now: float) -> None:
-        """Start at rest."""
         self.q = np.array(q, dtype=np.float64)
         self.qd = np.zeros_like(self.q)
         self.side = np.array(side, dtype=np.float64)
@@ -292,7 +290,6 @@ class WorldClock:
     """World time since this controller was switched on, and back to real time."""
 
     def __init__(self, board: Blackboard) -> None:
-        """Start at 0."""
         self._start_ns, self._scale = time.monotonic_ns(), board.scale
 
     @property

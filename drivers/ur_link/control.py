@@ -121,7 +121,6 @@ class Control:
     """Commands the arm; every call may raise WorkerError, and ends by its deadline."""
 
     def __init__(self, worker: Worker) -> None:
-        """Use a worker that has taken control."""
         self._worker = worker
 
     @property

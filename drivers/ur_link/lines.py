@@ -10,7 +10,6 @@ class LinkError(Exception):
     """A connection failed; the text names it and the reason; `refused`: nobody listens there."""
 
     def __init__(self, text: str, *, refused: bool = False) -> None:
-        """Keep the cause."""
         super().__init__(text)
         self.refused = refused
 
@@ -76,11 +75,9 @@ class Connection:
                     break
 
     def __enter__(self) -> Self:
-        """Return the open connection."""
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End the connection."""
         self.close()
 
     def _more(self) -> None:

@@ -35,7 +35,6 @@ class WorkerError(Exception):
     """A worker did not carry out a request, and why; `lost`: the process is gone."""
 
     def __init__(self, text: str, *, lost: bool) -> None:
-        """Keep the cause."""
         super().__init__(text)
         self.lost = lost
 
@@ -182,7 +181,6 @@ class Line:
     """Requests from the parent and answers to it, over the socket that is standard input."""
 
     def __init__(self, parent: int) -> None:
-        """Take over standard input."""
         self._parent = parent
         self._socket = socket.socket(fileno=os.dup(sys.stdin.fileno()))
         self._buffer = b""

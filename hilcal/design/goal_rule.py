@@ -95,7 +95,7 @@ class GoalRule:
         self._ended = self._took = -np.inf
 
     def __call__(self, readings: Readings, last: bool) -> GoalStatus:
-        """Return the status of the goal, see `measuring.stopping_rule.StoppingRule`."""
+        """Return the status of the goal, see `measuring.session.StoppingRule`."""
         begun = self._now()
         if last or (begun - self._ended >= self._took / SHARE and self._news(readings)):
             found = self._fit(readings)

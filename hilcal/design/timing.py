@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.measuring.route import seconds_at_rest
-from hilcal.measuring.route import duration, route
+from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan
 from hilcal.types import Floats

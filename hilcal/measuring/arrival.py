@@ -51,7 +51,6 @@ class RoughRegistration:
     """
 
     def __init__(self, cell: Cell) -> None:
-        """Start with what is configured."""
         self._cell = cell
         self._held: list[Floats] = []
         self._seen: list[Floats] = []
@@ -252,7 +251,6 @@ class ArrivalReader:
         clock: Clock,
         watcher: Watcher,
     ) -> None:
-        """Use open devices."""
         self._cell, self._measurer, self._registration = cell, measurer, registration
         self._clock, self._watcher, self._said = clock, watcher, False
         self._tracker: PointingTracker | None = None

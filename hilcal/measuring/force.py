@@ -99,10 +99,9 @@ def identify_tool_load(
 
     Whitened least squares: x = argmin sum_k |S_k⁻¹ (w_k - D_k x)|² with S_k S_kᵀ = Cov_k.
     """
-    wrench, rotation, gravity = (np.asarray(a, np.float64) for a in (wrench, rotation, gravity))
-    _check(wrench, np.asarray(covariance), rotation, gravity)
+    _check_finite(wrench, covariance, rotation)
     _check_orientations(rotation, gravity)
-    white = np.linalg.inv(_root(np.asarray(covariance, np.float64)))
+    white = np.linalg.inv(_root(covariance))
     A = (white @ design(rotation, gravity)).reshape(-1, PARAMETERS)
     y = (white @ wrench[..., None]).reshape(-1)
     scale = np.linalg.norm(A, axis=0)
@@ -136,12 +135,9 @@ def tare(
 
     Its centre of mass (3,) is in sensor axes from the sensor's origin, m.
     """
-    wrench, rotation, gravity = (np.asarray(a, np.float64) for a in (wrench, rotation, gravity))
-    _check(wrench[None], np.asarray(covariance)[None], rotation[None], gravity)
-    moment = mass * np.asarray(com, dtype=np.float64)
+    _check_finite(wrench, covariance, rotation)
+    moment = mass * com
     tool = design(rotation, gravity)[:, 6:] @ np.concatenate([[mass], moment])
-    if not np.all(np.isfinite(tool)):
-        raise InputError("tool load: mass and centre of mass must be finite")
     cov = np.zeros((PARAMETERS, PARAMETERS))
     cov[:6, :6] = covariance
     return ToolLoad(wrench - tool, float(mass), moment, cov, gravity, chi2=0.0, dof=0, poses=1)
@@ -149,22 +145,13 @@ def tare(
 
 def shift(wrench: Floats, arm: Floats) -> Floats:
     """Return a wrench (..., 6) at a point `arm` (..., 3) further: f' = f, M' = M - arm × f."""
-    wrench = np.asarray(wrench, dtype=np.float64)
     force, moment = wrench[..., :3], wrench[..., 3:]
     return np.concatenate([force, moment - np.cross(arm, force)], axis=-1)
 
 
-def _check(wrench: Floats, covariance: Floats, rotation: Floats, gravity: Floats) -> None:
-    K = len(wrench)
-    wanted = {"wrench": (K, 6), "covariance": (K, 6, 6), "rotation": (K, 3, 3), "gravity": (3,)}
-    given = {
-        "wrench": wrench, "covariance": covariance, "rotation": rotation, "gravity": gravity,
-    }  # fmt: skip
-    for name, shape in wanted.items():
-        if given[name].shape != shape:
-            raise InputError(f"tool load: {name} has shape {given[name].shape}, not {shape}")
-        if not np.all(np.isfinite(given[name])):
-            raise InputError(f"tool load: {name} has values that are no finite numbers")
+def _check_finite(*readings: Floats) -> None:
+    if not all(np.isfinite(values).all() for values in readings):
+        raise InputError("tool load: a reading has values that are no finite numbers")
 
 
 def _root(covariance: Floats) -> Floats:
@@ -295,14 +282,6 @@ _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class SensorFrame:
-    """Where the sensor is at one pose of the arm, base axes."""
-
-    rotation: Floats  # (3, 3) R_base_sensor
-    arm: Floats  # (3,) from the sensor's origin to the load point, m
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class TaredWrench:
     """One mean wrench against the zero of its session, and the pose where it was felt."""
 
@@ -359,11 +338,11 @@ class ForceMeter:
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         return TaredWrench(sample.wrench - self.zero, covariance, np.asarray(q))
 
-    def frame(self, q: Floats) -> SensorFrame:
-        """Return where the sensor is at joint angles (n,)."""
+    def frame(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return R_base_sensor and the way from the sensor to the load point (3,), base axes, m."""
         chain = chains.evaluate(self._cell.arm, np.asarray(q)[None])
         arm = chain.point(self._cell.load_point) - chain.point(self._origin)
-        return SensorFrame(chain.rotation[-1][0] @ self._axes, arm[0])
+        return chain.rotation[-1][0] @ self._axes, arm[0]
 
     def to_flange(self, point: Floats) -> Floats:
         """Return a point (3,) of the sensor's axes in flange axes, m."""
@@ -371,7 +350,7 @@ class ForceMeter:
 
     def set_zero(self, sample: WrenchSample, q: Floats) -> None:
         """Take a mean wrench without load, at joint angles (n,), as the zero."""
-        cell, rotation = self._cell, self.frame(q).rotation
+        cell, rotation = self._cell, self.frame(q)[0]
         self._tared_down = rotation.T @ cell.gravity
         covariance = sample.covariance / max(sample.frames, 1) + _FLOOR
         zero = tare(sample.wrench, covariance, rotation, cell.gravity, cell.tool_mass, self._com)
@@ -388,7 +367,7 @@ class ForceMeter:
         gravity = self._cell.gravity
         if self._tared_down is None:
             return 2.0 * float(np.linalg.norm(gravity))
-        return float(np.linalg.norm(self.frame(q).rotation.T @ gravity - self._tared_down))
+        return float(np.linalg.norm(self.frame(q)[0].T @ gravity - self._tared_down))
 
     def identify(self, unloaded: list[TaredWrench], tolerance_N: float) -> tuple[int, ...] | None:
         """Find the real tool from unloaded readings; the numbers of those left out, None: too few.
@@ -399,7 +378,7 @@ class ForceMeter:
         kept = list(range(len(unloaded)))
         while len(kept) >= ENOUGH_POSES:
             used = [unloaded[k] for k in kept]
-            rotation = np.array([self.frame(f.q).rotation for f in used])
+            rotation = np.array([self.frame(f.q)[0] for f in used])
             wrench = np.array([f.wrench for f in used])
             covariance = np.array([f.covariance for f in used])
             tool = identify_tool_load(wrench, covariance, rotation, self._cell.gravity)
@@ -417,27 +396,21 @@ class ForceMeter:
 
     def load_wrench(self, tared: TaredWrench) -> Floats:
         """Return the (6,) wrench of the load at the load point, base axes, N and N·m."""
-        frame = self.frame(tared.q)
-        return shift(self.tool.load_wrench(tared.wrench, frame.rotation), frame.arm)
+        rotation, arm = self.frame(tared.q)
+        return shift(self.tool.load_wrench(tared.wrench, rotation), arm)
 
     def verify(
         self, load: CellLoad | None, tared: TaredWrench, operator: Operator
     ) -> tuple[bool, str]:
         """Whether a load is what hangs, within the operator's tolerance; and the finding."""
-        gravity, frame = self._cell.gravity, self.frame(tared.q)
+        gravity, (rotation, arm) = self._cell.gravity, self.frame(tared.q)
         expected = np.zeros(6) if load is None else load.wrench(gravity)
         moved = np.eye(6)
-        moved[3:, :3] = -se3.skew(frame.arm)
-        at_sensor = self.tool.load_covariance(tared.covariance, frame.rotation)
+        moved[3:, :3] = -se3.skew(arm)
+        at_sensor = self.tool.load_covariance(tared.covariance, rotation)
         std = np.sqrt(np.diagonal(moved @ at_sensor @ moved.T))
-        return compare(
-            expected,
-            self.load_wrench(tared),
-            std,
-            operator.tolerance_N,
-            operator.tolerance_share,
-            gravity,
-        )
+        limits = operator.tolerance_N, operator.tolerance_share
+        return compare(expected, self.load_wrench(tared), std, *limits, gravity)
 
     def tool_differs(self, tolerance_N: float) -> str | None:
         """Return in one line how the tool differs from [tool]; None where it does not.

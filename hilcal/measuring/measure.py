@@ -279,7 +279,6 @@ class Measurer:
         clock: Clock,
         watcher: Watcher,
     ) -> None:
-        """Use open devices."""
         self._mover, self._tracker, self._meter = mover, tracker, meter
         self._config, self._clock, self._watcher = config, clock, watcher
 

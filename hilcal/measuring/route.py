@@ -238,3 +238,30 @@ def seconds_at_rest(config: CellConfig) -> float:
         return targets * each
     each = acquire.settle_s + acquire.samples * MEASURING_S + (targets > 1) * AIMING_S
     return targets * each + once
+
+
+def way_home(
+    cell: Cell, config: CellConfig, plan: Plan, behind: Sequence[Stop], done: frozenset[Step]
+) -> tuple[Stop, ...]:
+    """Return the way to the reference pose, where the load is taken off and the drift is read.
+
+    The arm goes straight where that is clear; else back the way it came, which is clear, until the
+    straight way is. The reading is the next return to the reference pose that the plan holds.
+    `behind` is where the arm has been in this session; it stands at the last of these stops.
+    """
+    base = home(plan)
+    q_home, here = plan.joints(base), behind[-1]
+    hanging = here.hanging if here.change_to is None else here.change_to
+    to = Stop(base, q_home, hanging, change_to=None if hanging == UNLOADED else UNLOADED)
+    way: list[Stop] = []
+    for stop in reversed(behind):
+        at = Stop(stop.name, stop.q, hanging)
+        way.append(at)
+        if np.array_equal(at.q, q_home) or not route_problems(cell, config, (at, to)):
+            break
+    way = [*way[1:], to]
+    returned = here.step is not None and (here.step.pose, here.step.load) == (base, UNLOADED)
+    missing = [s for s in plan.steps if s not in done and (s.pose, s.load) == (base, UNLOADED)]
+    if missing and not returned:
+        way.append(Stop(base, q_home, UNLOADED, step=missing[0]))
+    return tuple(way)

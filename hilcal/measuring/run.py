@@ -12,8 +12,7 @@ from hilcal.measuring.connect import Rig
 from hilcal.measuring.devices import ArmDevice, Clock
 from hilcal.measuring.progress import Phase, Remark, Watcher
 from hilcal.measuring.route import DryRun, dry_run, route
-from hilcal.measuring.session import LiveModel, Session
-from hilcal.measuring.stopping_rule import StoppingRule
+from hilcal.measuring.session import LiveModel, Session, StoppingRule
 from hilcal.store.plan import Plan
 from hilcal.store.run_log import RunLog
 

@@ -19,8 +19,16 @@ from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.motion import Guard, Mover
-from hilcal.measuring.progress import LiveResidual, Phase, ReadingStored, Remark, Watcher
-from hilcal.measuring.route import Stop
+from hilcal.measuring.progress import (
+    GoalMet,
+    GoalStatus,
+    LiveResidual,
+    Phase,
+    ReadingStored,
+    Remark,
+    Watcher,
+)
+from hilcal.measuring.route import Stop, way_home
 from hilcal.measuring.session_state import (
     Eta,
     SessionState,
@@ -29,7 +37,6 @@ from hilcal.measuring.session_state import (
     sample_json,
     stored_wrench,
 )
-from hilcal.measuring.stopping_rule import GoalCheck, StoppingRule, way_home
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import UNLOADED, Plan, Step
 from hilcal.store.run_log import RunLog
@@ -38,6 +45,9 @@ from hilcal.types import Floats
 Done = TypeVar("Done")
 LiveModel = Callable[[Readings], LiveResidual]
 """Returns the last reading against a model fitted to those before it."""
+StoppingRule = Callable[[Readings, bool], GoalStatus]
+"""Tells from all readings so far how far the goal is. Unless it is told that the plan has no more,
+the answer may be that of a few readings before, so that judging does not delay the campaign."""
 
 
 class Session:
@@ -62,7 +72,8 @@ class Session:
         self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
         self._store, self._clock, self._watcher, self._live = store, clock, watcher, live
         self._wall = wall
-        self._goal = GoalCheck(goal, plan, store, watcher, self._event)
+        self._rule = goal
+        self._goal: GoalStatus | None = None
         window = clock.real(config.acquire.force_window_s)
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
@@ -122,7 +133,7 @@ class Session:
         self._begin(stops[:2])
         pace = self._pace = Eta(self._clock)
         behind, ahead = list(stops[:2]), stops[2:]
-        if self._goal.newly_met(last=False):  # an earlier session was stopped on its way home
+        if self._goal_newly_met(last=False):  # an earlier session was stopped on its way home
             ahead = way_home(self._cell, self._config, self._plan, behind, self._store.done())
         while ahead:
             stop, *rest = ahead
@@ -132,7 +143,7 @@ class Session:
             if stop.step is not None and read is not None:
                 reading, settling = read
                 pace.read()
-                if self._goal.newly_met(last=all(s.step is None for s in ahead)):
+                if self._goal_newly_met(last=all(s.step is None for s in ahead)):
                     done = self._store.done()
                     ahead = way_home(self._cell, self._config, self._plan, behind, done)
                 left = pace.left(
@@ -141,6 +152,19 @@ class Session:
                 )
                 self._tell(stop.step, reading, total, left, settling)
         self._finish()
+
+    def _goal_newly_met(self, last: bool) -> bool:
+        """Apply the stopping rule; whether the goal has just been met, which is stored and told."""
+        readings = None if self._rule is None else self._store.readings()
+        if self._rule is None or readings is None or (self._goal is not None and self._goal.met):
+            return False
+        now = self._goal = self._rule(readings, last)
+        count, planned = len(readings), len(self._plan.steps)
+        if now.met or last:
+            self._event("goal", {**now.to_dict(), "readings": count, "planned": planned})
+        if now.met:
+            self._watcher.notify(GoalMet(now, count, planned))
+        return now.met
 
     def _visit(self, stop: Stop) -> tuple[Readings, float] | None:
         self._move(stop)
@@ -440,7 +464,7 @@ class Session:
                 deflection,
                 live,
                 settling,
-                self._goal.status,
+                self._goal,
                 number,
                 tuple(others),
             )

@@ -174,7 +174,6 @@ class Eta:
     """Measures readings with the motions to them, and changes of the load, in cell seconds."""
 
     def __init__(self, clock: Clock) -> None:
-        """Start now."""
         self._clock = clock
         self._mark = clock.now()
         self._moving = 0.0

@@ -17,8 +17,7 @@ from hilcal.design.feasible import REASONS, Space
 from hilcal.design.run_order import Chosen, Ordering, order_plan
 from hilcal.design.timing import pace
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.route import dry_run
-from hilcal.measuring.route import approach_sides, duration, route
+from hilcal.measuring.route import approach_sides, dry_run, duration, route
 from hilcal.present.calibration import refusals
 from hilcal.present.progress import Say
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns
