@@ -31,18 +31,14 @@ from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
 
 DEVICE = "tracker"
-CONNECT_S = 2.0
-"""How long the connection may take, real s."""
-DEADLINE_S = 4.0
-"""How long a command may take beside what is measured or moved, real s."""
+CONNECT_S = 2.0  # how long the connection may take, real s
+DEADLINE_S = 4.0  # how long a command may take beside what is measured or moved, real s
 SEARCHING_S = 30.0
 """How long turning or a search for the reflector may take, cell s; at least `_LEAST_S` real s."""
-HOMING_S = 120.0
-"""How long the tracker may take to find its zeros, cell s."""
+HOMING_S = 120.0  # how long the tracker may take to find its zeros, cell s
 HOMED = "the tracker was initialised again before this reading: its axes may have moved"
 _LEAST_S, _PAUSE_S = 1.0, 0.1
-_FARTHEST_M = 500.0
-"""Beyond the reach of any tracker."""
+_FARTHEST_M = 500.0  # beyond the reach of any tracker
 _UNITS = struct.pack("<5I", 0, 0, 0, 0, 0)  # m, rad, °C, mbar, % of relative humidity
 _ORDERS = ("xyz", "XYZ")
 _STEP, _SAME = 1e-6, 1e-4

@@ -227,8 +227,7 @@ class ByArrival:
         return [True] * count
 
 
-LossCounter = ByDeviceClock | ByArrival
-"""Counts from what comes."""
+LossCounter = ByDeviceClock | ByArrival  # counts from what comes
 
 DEVICE = "force sensor"
 STALE_S = 0.5
@@ -238,10 +237,8 @@ POLL_S = 0.005
 LOOK_S = 1.0
 """The reader gets so long to look once more; it takes two passes where the computer is idle."""
 SLICE_S = 0.05
-MIN_SHARE = 0.5
-"""Share of the frames due in a window that has to come for a mean."""
-FEW, MAX_LOST = 5, 0.01
-"""So many lost frames, and this share of all, are no problem yet."""
+MIN_SHARE = 0.5  # share of the frames due in a window that has to come for a mean
+FEW, MAX_LOST = 5, 0.01  # so many lost frames, and this share of all, are no problem yet
 RING = 4096
 FIRST_FRAME_S, OLD_S = 1.0, 0.05
 

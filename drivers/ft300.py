@@ -40,8 +40,7 @@ RATE_HZ = 100.0
 FIRMWARE, SERIAL_NUMBER = (500, 6), (510, 4)
 STREAM_REGISTER, STREAM = 410, 0x0200
 STOP = b"\xff" * 50
-RANGE = np.repeat((300.0, 30.0), 3)
-"""Full scale, N and N·m."""
+RANGE = np.repeat((300.0, 30.0), 3)  # full scale, N and N·m
 COMPONENTS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 FIRST_FRAME_S = 0.5
 T = TypeVar("T")

@@ -126,8 +126,7 @@ def failure(doing: str, code: int) -> DeviceError:
 
 
 DEVICE = "tracker"
-ANSWER_S = 1.0
-"""How long an answer may take beside motors and measurements, real s."""
+ANSWER_S = 1.0  # how long an answer may take beside motors and measurements, real s
 _FIRST_ANSWER_S = 0.7
 _TRIES = 8
 _PAUSE_S = 0.1
@@ -298,21 +297,16 @@ class Link:
 
 
 BAUD = 115200
-DEADLINE_S = 4.0
-"""How long a call may take beside what is measured or moved, real s."""
-MEASURING_S = 3.0
-"""How long a distance may take to measure, cell s."""
+DEADLINE_S = 4.0  # how long a call may take beside what is measured or moved, real s
+MEASURING_S = 3.0  # how long a distance may take to measure, cell s
 SEARCHING_S = 20.0
 """How long one search for the target may take, cell s; at least `_LEAST_S` real s."""
 _LEAST_S = 1.0
 _DISTANCE, _CORRECTED, _DISTANCE_PROGRAM = 1, 1, 2  # TMC_DEF_DIST, TMC_AUTO_INC, BAP_DEF_DIST
 _LOW_BATTERY, _INTERNAL = 10, 2  # %, power source
-CIRCLE = 2.0 * np.pi + 1e-6
-"""Of a full circle, rad, with what rounding adds."""
-LARGEST_STD = 0.01
-"""rad; a choice, a thousand times what the poorest total station states (2 mgon)."""
-LARGEST_TILT = 0.5 * np.pi
-"""rad; no station measures upside down."""
+CIRCLE = 2.0 * np.pi + 1e-6  # of a full circle, rad, with what rounding adds
+LARGEST_STD = 0.01  # rad; a choice, a thousand times what the poorest total station states (2 mgon)
+LARGEST_TILT = 0.5 * np.pi  # rad; no station measures upside down
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,13 +28,10 @@ from hilcal.toml import Section, check_section
 DEVICE = "tracker"
 ANSWER_S, TRIES = 0.5, 4
 """How long an answer may take, real s, and how often it is asked for: datagrams may be lost."""
-DEADLINE_S = 4.0
-"""How long frames may take, real s."""
+DEADLINE_S = 4.0  # how long frames may take, real s
 SLOWEST_HZ = 20.0
-LOST_S = 1.0
-"""A body that is not seen for so long is lost, real s."""
-FLOOR = 1e-7
-"""Least standard deviation of a frame, m and rad: frames are in single precision."""
+LOST_S = 1.0  # a body that is not seen for so long is lost, real s
+FLOOR = 1e-7  # least standard deviation of a frame, m and rad: frames are in single precision
 
 
 class NatNetOptions(Section):

@@ -20,8 +20,7 @@ REQUEST_DESCRIPTIONS, DESCRIPTIONS, FRAME, KEEP_ALIVE = 4, 5, 7, 10
 Version = tuple[int, int]
 OLDEST: Version = (3, 0)
 NEWEST: Version = (4, 2)
-SIZED: Version = (4, 1)
-"""From here on lists tell their length in bytes."""
+SIZED: Version = (4, 1)  # from here on lists tell their length in bytes
 LARGEST = 1 << 16
 MARKER_SET, RIGID_BODY = 0, 1
 _HEAD = struct.Struct("<HH")

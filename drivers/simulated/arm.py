@@ -28,8 +28,7 @@ from hilcal.measuring.devices import ArmSample, Report
 from hilcal.robot.arm import Arm
 from hilcal.types import Floats
 
-WATCHDOG_S = 0.5
-"""A motion that nobody has looked at for so long is stopped, real s."""
+WATCHDOG_S = 0.5  # a motion that nobody has looked at for so long is stopped, real s
 PROTECTIVE = "protective stop"
 _STEP_S, _REFRESH_S = 0.004, 0.01  # real s between steps in motion, and at rest
 _STOPPING = 2.0  # rad/s² of the leading joint (a slide: m/s²)
@@ -125,8 +124,7 @@ class ArmController:
         return goal
 
 
-_STOPPED_S = 5.0
-"""In which a stopped arm has to stand, real s."""
+_STOPPED_S = 5.0  # in which a stopped arm has to stand, real s
 
 
 class SimulatedArm:

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-MOST_TARGETS = 8
-"""Targets that a tool can carry in the simulated cell."""
+MOST_TARGETS = 8  # targets that a tool can carry in the simulated cell
 _SEQUENCE = 8
 _TRIES = 10_000
 
@@ -130,8 +129,7 @@ class Blackboard:
         return float(self._content["world"]["scale"][0])
 
 
-_LATE_S = 0.2
-"""How long an instrument waits for the world to catch up with an arm that has arrived."""
+_LATE_S = 0.2  # how long an instrument waits for the world to catch up with an arm that has arrived
 
 
 def settled_truth(board: Blackboard) -> Any:

@@ -34,19 +34,14 @@ from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.pty_port import PtyPort, crc16
 from hilcal.types import Floats
 
-TICK_S = 0.004
-"""Frames are handed over in batches at least so far apart, as a USB adapter does."""
-LATE_S = 2.0
-"""Frames that are later than this are lost: the process was suspended."""
+TICK_S = 0.004  # frames are handed over in batches at least so far apart, as a USB adapter does
+LATE_S = 2.0  # frames that are later than this are lost: the process was suspended
 
-BIAS_STD = np.repeat((4.0, 0.2), 3)
-"""The zero of a sensor as delivered and bolted on, N and N·m."""
+BIAS_STD = np.repeat((4.0, 0.2), 3)  # the zero of a sensor as delivered and bolted on, N and N·m
 DRIFT_STD = np.repeat((0.05, 0.002), 3)
 """Drift of the zero with the sensor's temperature, N/K and N·m/K."""
-WARM_K, WARM_S = 7.0, 600.0
-"""Own heat above the air and how fast it comes (world time)."""
-ROOM = 22.0
-"""Air temperature where the world does not tell, °C."""
+WARM_K, WARM_S = 7.0, 600.0  # own heat above the air and how fast it comes (world time)
+ROOM = 22.0  # air temperature where the world does not tell, °C
 
 
 @dataclass(slots=True, eq=False)
@@ -148,8 +143,7 @@ class Bota(SensorProtocol):
     baud = 460800
     noise = (0.05, 0.002)
     over_range = 1 << 1
-    full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])
-    """Full scale of a SensONE, N and N·m."""
+    full = np.array([500.0, 500.0, 1200.0, 15.0, 15.0, 10.0])  # full scale of a SensONE, N and N·m
     _body = struct.Struct("<H6fIf")
 
     def __init__(self, rate: float | None = None) -> None:
@@ -204,8 +198,7 @@ class Ft300(SensorProtocol):
     baud = 19200
     noise = (0.1, 0.005)
     usual_rate = 100.0
-    full = np.repeat((300.0, 30.0), 3)
-    """Full scale, N and N·m."""
+    full = np.repeat((300.0, 30.0), 3)  # full scale, N and N·m
     scale = np.repeat((100.0, 1000.0), 3)
 
     def __init__(self, rate: float | None = None) -> None:
@@ -373,8 +366,7 @@ class Stream:
 
 COUNTS = np.repeat((1_000_000.0, 1_000_000.0), 3)
 RDT_NOISE = (0.02, 0.0005)
-FULL = np.array([660.0, 660.0, 1980.0, 60.0, 60.0, 60.0])
-"""Full scale, N and N·m; a Delta's."""
+FULL = np.array([660.0, 660.0, 1980.0, 60.0, 60.0, 60.0])  # full scale, N and N·m; a Delta's
 MEASURING_HZ = 7000
 SATURATED = 0x80020000
 _FACTORS = {"N": 1.0, "lbf": 1.0 / 4.4482216152605}

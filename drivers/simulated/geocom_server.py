@@ -86,14 +86,10 @@ class Beam:
 
 
 WARNINGS = (0, 1283, 1284)
-BEHIND_M = 0.2
-"""Two reflectors are at two places."""
-AIM_S = 0.3
-"""World time of a search, a fine adjustment, a lock-in or a turn, s."""
-FIELD_OF_VIEW = 0.026
-"""Half angle in which the camera sees its target, rad (1.5°)."""
-LEVEL_STD = 1e-6
-"""Noise of the inclinations, rad."""
+BEHIND_M = 0.2  # two reflectors are at two places
+AIM_S = 0.3  # world time of a search, a fine adjustment, a lock-in or a turn, s
+FIELD_OF_VIEW = 0.026  # half angle in which the camera sees its target, rad (1.5°)
+LEVEL_STD = 1e-6  # noise of the inclinations, rad
 
 
 @dataclass(slots=True, eq=False)
@@ -312,8 +308,7 @@ def reply(
 
 Answer = tuple[int, list[str]]
 Parameters = tuple[str, ...]
-Procedure = Callable[[Station, Parameters], Answer | None]
-"""None is `OK` without values."""
+Procedure = Callable[[Station, Parameters], Answer | None]  # none is `OK` without values
 
 
 def answer(station: Station, rpc: int, parameters: Parameters) -> Answer:

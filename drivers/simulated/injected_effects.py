@@ -156,10 +156,8 @@ EFFECTS = (
     "tracker_scale",
 )
 """Every effect that can be hidden in any arm."""
-OF_SLIDES = ("guide_error",)
-"""Those that only arms with joints that slide have."""
-ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)
-"""Every effect that can be hidden."""
+OF_SLIDES = ("guide_error",)  # those that only arms with joints that slide have
+ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)  # every effect that can be hidden
 
 HARD_TO_SEPARATE = ("base_compliance", "link_compliance")
 """Effects that a campaign of six poses often does not separate from each other, or from

@@ -9,8 +9,7 @@ import numpy as np
 from hilcal.effects.protocol import Columns, Effect, Parameter, Response, Situation
 from hilcal.types import Floats
 
-JOINT, BY = 2, 4
-"""Index of the joint that gives way, and of the one by whose angle it does."""
+JOINT, BY = 2, 4  # index of the joint that gives way, and of the one by whose angle it does
 
 
 class Invented(Effect):

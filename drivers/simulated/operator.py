@@ -9,8 +9,7 @@ from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Clock, Report
 
-HAND_S = 20.0
-"""Time that a person takes to change a load, s."""
+HAND_S = 20.0  # time that a person takes to change a load, s
 
 _OPTIONS = ("socket", "hand_s", "person")
 

@@ -22,8 +22,7 @@ import numpy as np
 from hilcal.drivers.simulated.admin import setter
 
 BITS_PER_BYTE = 10
-FIFO = 16384
-"""Bytes that wait for a reader beyond what the terminal itself holds."""
+FIFO = 16384  # bytes that wait for a reader beyond what the terminal itself holds
 
 _RATES = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[1:].isdigit()}
 _SPEEDS = {rate: speed for speed, rate in _RATES.items()}

@@ -35,8 +35,7 @@ from hilcal.types import Floats, Ints
 
 NOTHING = "nothing"
 RANDOM = "random"
-INVENTED = "invented"
-"""A law that the catalogue lacks; see `invented_law`."""
+INVENTED = "invented"  # a law that the catalogue lacks; see `invented_law`
 REGISTRATION_XYZ = (2.4, -1.6, -0.5)
 REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 

@@ -136,15 +136,13 @@ def _labels(effect: str, shape: tuple[int, ...], arm: Arm) -> list[str]:
     return [f"{name}.{part}" for name in parts[effect][0] for part in parts[effect][1]]
 
 
-LINK_REFERENCE = 20.0
-"""Temperature at which links have their nominal length, °C (ISO 1)."""
+LINK_REFERENCE = 20.0  # temperature at which links have their nominal length, °C (ISO 1)
 
 _UNKNOWN_TORQUE, _UNKNOWN_FORCE = 150.0, 1500.0  # N·m and N, of a drive of unknown limit
 _CROSSING = 0.01  # of the rated torque: within it a joint crosses its play
 
 
-AIR = 22.0
-"""Air temperature of the cell behind the wires, and of a rehearsal's start, °C."""
+AIR = 22.0  # air temperature of the cell behind the wires, and of a rehearsal's start, °C
 
 _WARM_START = 4.0  # °C above the air at the world's start
 _WARM_RISE = np.array([9.0, 11.0, 10.0, 8.0, 8.0, 7.0])  # °C above the air in the end

@@ -39,10 +39,8 @@ from hilcal.drivers.simulated.ur_rtde import Faults
 from hilcal.drivers.simulated.ur_state import ArmState, Goal, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
 
-SAFETY_STOP = 15.0
-"""Deceleration of protective and emergency stops, rad/s²."""
-STOP_TIME = 0.25
-"""World time in which any program's end brings the arm to rest, s."""
+SAFETY_STOP = 15.0  # deceleration of protective and emergency stops, rad/s²
+STOP_TIME = 0.25  # world time in which any program's end brings the arm to rest, s
 UNLOCK_AFTER = 5.0
 """Real time before a protective stop can be unlocked, s (the dashboard's own words)."""
 PATIENCE = 0.5

@@ -28,8 +28,7 @@ import numpy as np
 from hilcal.drivers.simulated.ur_state import ArmState, Goal, pose, transform
 from hilcal.types import Floats
 
-PROGRAM_STOP = 4.0
-"""Deceleration when a program ends while the arm moves, rad/s²."""
+PROGRAM_STOP = 4.0  # deceleration when a program ends while the arm moves, rad/s²
 
 _READY, _DONE = 1, 2
 _STEADY = 0.5  # s of world time at rest after which the robot says that it is steady
@@ -80,15 +79,13 @@ class ControlScript:
         if found is None:
             raise ValueError("not a control script")
         self._arm = arm
-        self.register = int(found.group(1))
-        """The integer register of commands."""
+        self.register = int(found.group(1))  # the integer register of commands
         self._path = tuple(_moves(text))
         self._executing = False
         self._work: Iterator[None] | None = None
         self._async = False
         self._async_count = self._async_number = 0
-        self.watchdog = 0.0
-        """Least rate of input packages that the program asks for, Hz; 0 is none."""
+        self.watchdog = 0.0  # least rate of input packages that the program asks for, Hz; 0 is none
         self._signal(_READY)
         self._progress(None)
 

@@ -28,8 +28,7 @@ from hilcal.types import Floats
 VERSION = 2
 NOT_FOUND = "NOT_FOUND"
 IN_USE = "IN_USE"
-HEADER = struct.Struct(">HB")
-"""Size of the whole frame in bytes, and its type."""
+HEADER = struct.Struct(">HB")  # size of the whole frame in bytes, and its type
 
 FORMATS = {
     "BOOL": "?",
@@ -315,8 +314,7 @@ class Sensors:
         return np.asarray(std * self._rng.standard_normal(6))
 
 
-FREQUENCY = 500.0
-"""Of the controller, Hz."""
+FREQUENCY = 500.0  # of the controller, Hz
 _DIGITAL_OUTPUTS = {"standard": (0, 0xFF), "configurable": (8, 0xFF), "tool": (16, 3)}
 """First bit in `actual_digital_output_bits` and mask of each group; UR, "RTDE guide"."""
 _INT, _DOUBLE = "input_int_register_", "input_double_register_"

@@ -16,8 +16,7 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.pinocchio_model import FLANGE, pinocchio_model
 from hilcal.types import Floats
 
-REGISTERS = 48
-"""Of each kind and direction."""
+REGISTERS = 48  # of each kind and direction
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 _NOTHING = 1e-9  # rad: no motion
 Goal = tuple[Floats, float, float]

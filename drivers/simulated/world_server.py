@@ -75,8 +75,7 @@ class SimulatedMount:
         return np.concatenate([back @ force, back @ moment])
 
 
-ENCODER_STD = 2e-6
-"""Noise of a motor-side encoder at the joint, rad."""
+ENCODER_STD = 2e-6  # noise of a motor-side encoder at the joint, rad
 
 _REFRESH_NS = 10_000_000  # real time between two publications of an unchanged arm
 _STRONGEST = 2000.0  # N and N·m that may push or swing

@@ -21,14 +21,11 @@ from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.measuring.route import duration
 from hilcal.types import Floats
 
-STANDS_RAD_S = 0.01
-"""Joints slower than this stand; measured speeds are noisy, rad/s."""
+STANDS_RAD_S = 0.01  # joints slower than this stand; measured speeds are noisy, rad/s
 MARGIN_S = 5.0
 """What a motion may take longer than it should, and how long it may be paused, real s."""
-SLACK = 1.5
-"""A motion may take so many times its computed time."""
-SLOWEST = 0.02
-"""A motion is not waited for at a smaller share of its speed."""
+SLACK = 1.5  # a motion may take so many times its computed time
+SLOWEST = 0.02  # a motion is not waited for at a smaller share of its speed
 _TARGET_RAD = 1e-5
 _BRAKE_S = 0.15
 _BRAKE_MIN, _BRAKE_MAX = 2.0, 10.0
@@ -97,12 +94,9 @@ class MotionInProgress:
         )
 
 
-LEASE_S = 0.5
-"""Lease of a motion: not renewed for so long, the motion is stopped, real s."""
-COMMAND_S = 0.5
-"""Deadline of a command, real s."""
-CONNECT_S = 8.0
-"""Deadline for taking control, real s."""
+LEASE_S = 0.5  # lease of a motion: not renewed for so long, the motion is stopped, real s
+COMMAND_S = 0.5  # deadline of a command, real s
+CONNECT_S = 8.0  # deadline for taking control, real s
 _ORPHAN_S = 1.6
 _HZ = 125.0
 _NO_COG = 1e-6
@@ -251,8 +245,7 @@ def _wait_for(receiver: Receiver, wanted: tuple[int, ...], seconds: float) -> No
         time.sleep(0.01)
 
 
-ASK_S = 0.25
-"""Deadline of each way to stop, real s."""
+ASK_S = 0.25  # deadline of each way to stop, real s
 _GENTLE_S = 0.6
 _SURE_S = 1.0
 _AGAIN_S = 0.3

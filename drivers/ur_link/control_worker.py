@@ -17,10 +17,8 @@ from hilcal.drivers.ur_link.worker import Line, answered, outliving, start, word
 WATCHDOG_HZ = 10.0
 REST_HZ = 1.0
 KICK_S = 0.02
-TAKING_S = 8.0
-"""How long taking control may last when the parent has ended meanwhile, s."""
-LATE_S = 0.8 / WATCHDOG_HZ
-"""A longer pause between two kicks may have set off the watchdog, s."""
+TAKING_S = 8.0  # how long taking control may last when the parent has ended meanwhile, s
+LATE_S = 0.8 / WATCHDOG_HZ  # a longer pause between two kicks may have set off the watchdog, s
 
 
 class ControlInterface:

@@ -35,8 +35,7 @@ _HEAD = struct.Struct(">iB")
 _KINEMATICS = struct.Struct(">6I24dI")
 _STATE, _PART = 16, 5
 _LONGEST = 1 << 20
-_PACKAGES = 50
-"""Packages that are looked at: the state comes ten times a second, among messages."""
+_PACKAGES = 50  # packages that are looked at: the state comes ten times a second, among messages
 
 
 def read_kinematics(host: str, seconds: float) -> FactoryKinematics:
@@ -74,11 +73,9 @@ def _kinematics_of(part: bytes) -> FactoryKinematics:
         raise LinkError(f"{_PRIMARY}: {error}") from None
 
 
-N = 6
-"""Joints of every arm of this maker."""
+N = 6  # joints of every arm of this maker
 
-OUTPUTS = tuple(GETTERS)
-"""The outputs of the client library that are recorded."""
+OUTPUTS = tuple(GETTERS)  # the outputs of the client library that are recorded
 
 OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw_wrench"})
 """Outputs that older controllers lack (payload and payload_cog come with 5.5.1, ft_raw_wrench
@@ -108,8 +105,7 @@ the way has changed is as a rule far outside."""
 
 STALE_S = 0.2
 """In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
-PATIENCE_S = 0.8
-"""At rest, new data are waited for so long, real s."""
+PATIENCE_S = 0.8  # at rest, new data are waited for so long, real s
 _ANSWER_S = 0.3
 
 
@@ -220,8 +216,7 @@ class Receiver:
             raise LinkError(f"no data over RTDE: {error}") from None
 
 
-_RATE_S = (0.4, 2.0)
-"""How long packets are counted, and again where they were too few; choices."""
+_RATE_S = (0.4, 2.0)  # how long packets are counted, and again where they were too few; choices
 _SHARE = 0.5
 """Of the packets that were asked for: with fewer the line is not fit for a run; a choice."""
 _ASK_S = 1.5

@@ -93,8 +93,7 @@ def _yes(answer: str) -> bool | None:
 
 
 BASE = "/universal-robots/robot-api"
-_LONGEST = 1 << 20
-"""Bytes of an answer that are read, at most; openapi.json has some 100,000."""
+_LONGEST = 1 << 20  # bytes of an answer that are read, at most; openapi.json has some 100,000
 _REDIRECTS = 3
 _ABSENT = 404
 
@@ -104,8 +103,7 @@ class RobotApi:
     """The Robot API at an address; every call raises LinkError where it fails, in time."""
 
     host: str
-    port: int
-    """Of the controller's web server, 80 on a real one."""
+    port: int  # of the controller's web server, 80 on a real one
 
     @property
     def name(self) -> str:

@@ -21,22 +21,15 @@ from hilcal.robot.chain import drive_jacobian
 from hilcal.store.plan import Step
 from hilcal.types import Floats
 
-ENOUGH = 4
-"""Readings from which a registration is computed: three fix it, one more checks it."""
-WITNESSES = 2
-"""Readings by whose distances another one is judged, at least."""
-SPREAD_M = 0.05
-"""Second extent of a cloud of positions that fixes a rotation, m."""
-PLAUSIBLE_M = 0.1
-"""A reading so far from where the nominal arm holds the target is not believed, m."""
+ENOUGH = 4  # readings from which a registration is computed: three fix it, one more checks it
+WITNESSES = 2  # readings by whose distances another one is judged, at least
+SPREAD_M = 0.05  # second extent of a cloud of positions that fixes a rotation, m
+PLAUSIBLE_M = 0.1  # a reading so far from where the nominal arm holds the target is not believed, m
 FITS_M = 0.02
 """Largest residual of a reading that fits a registration, m; a nominal arm errs by less."""
-STRAYS = 3
-"""Readings that a registration leaves out at most; beyond that the nominal arm is wrong."""
-APART_M = 0.05
-"""Largest error of a distance between two readings, m."""
-STUCK_M = 1e-5
-"""Two readings so close to each other at poses that are not are one old reading, m."""
+STRAYS = 3  # readings that a registration leaves out at most; beyond that the nominal arm is wrong
+APART_M = 0.05  # largest error of a distance between two readings, m
+STUCK_M = 1e-5  # two readings so close to each other at poses that are not are one old reading, m
 STUCK_SHARE = 0.2
 """A target that moves by less than this share of what the arm moves it by is not on the arm."""
 MOVES_M = 0.005

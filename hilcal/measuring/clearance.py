@@ -14,8 +14,7 @@ from hilcal.types import Bools, Floats
 
 TOOL_RADIUS = 0.03
 """Radius of the ways from flange to target and load point, m: a plate or a reflector's nest."""
-CABLE_RADIUS = 0.01
-"""Radius that is kept for a cable, m."""
+CABLE_RADIUS = 0.01  # radius that is kept for a cable, m
 _NEAR = 0.02  # m, beyond touching
 _AT_TARGET, _AT_LOAD = "tool at the target", "tool at the load point"
 _TINY = 1e-18  # m², below which a segment is a point

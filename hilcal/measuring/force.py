@@ -195,8 +195,7 @@ def _check_orientations(rotation: Floats, gravity: Floats) -> None:
     )
 
 
-MOMENT_LEVER_M = 0.1
-"""Lever by which a tolerance in N becomes one in N·m."""
+MOMENT_LEVER_M = 0.1  # lever by which a tolerance in N becomes one in N·m
 STANDARD_GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 
@@ -271,10 +270,8 @@ def _mass(force: Floats, gravity: Floats) -> float | None:
     return along / size if along >= 0.9999 * np.linalg.norm(force) else None
 
 
-MIN_FRAMES = 20
-"""Frames that a mean wrench is made of at least."""
-ENOUGH_POSES = 4
-"""Unloaded readings from which the tool is identified at least."""
+MIN_FRAMES = 20  # frames that a mean wrench is made of at least
+ENOUGH_POSES = 4  # unloaded readings from which the tool is identified at least
 TOOL_OFF_M = 0.01
 """A tool whose centre of mass is so far from the configured one is remarked, m; a guess."""
 _FLOOR = np.diag([1e-3**2] * 3 + [1e-4**2] * 3)

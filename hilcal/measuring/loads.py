@@ -22,11 +22,9 @@ from hilcal.measuring.progress import Answered, Phase, Question, Remark, Watcher
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-Wrong = Callable[[], str]
-"""Returns what is wrong, in one line; empty where nothing is."""
+Wrong = Callable[[], str]  # returns what is wrong, in one line; empty where nothing is
 TRIES = 3
-SWINGING_S = 2.0
-"""A load that seems wrong is weighed once more after so long, cell seconds."""
+SWINGING_S = 2.0  # a load that seems wrong is weighed once more after so long, cell seconds
 
 
 def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:

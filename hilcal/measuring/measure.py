@@ -153,10 +153,8 @@ SCATTER_P = 0.001
 SHRINKING_P = 0.05
 NEGLIGIBLE = 0.5
 """Drift over the window that does not matter, as a share of the standard deviation of a mean."""
-FEW = 12
-"""Fewer samples than this do not estimate a scatter."""
-LONGEST = 10
-"""The window grows to at most so many times K samples."""
+FEW = 12  # fewer samples than this do not estimate a scatter
+LONGEST = 10  # the window grows to at most so many times K samples
 
 
 class SettleWindow:
@@ -242,12 +240,9 @@ def _trend(samples: Sequence[TrackerSample]) -> _Trend:
     return _Trend(root @ slope, moment, span, scatter, p, dof)
 
 
-SEARCHES = 2
-"""How often a lost target is searched for in one reading."""
-AGAIN = 3
-"""How often a reading is tried that is void: the arm moved, or the samples disagree."""
-PATIENCE = 4
-"""Settling is given up after its time and at least so many windows of measurements."""
+SEARCHES = 2  # how often a lost target is searched for in one reading
+AGAIN = 3  # how often a reading is tried that is void: the arm moved, or the samples disagree
+PATIENCE = 4  # settling is given up after its time and at least so many windows of measurements
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,11 +16,9 @@ from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
-NORMAL = "normal"
-"""The safety state of an arm where all is well."""
+NORMAL = "normal"  # the safety state of an arm where all is well
 HOW_ON = "drive it by hand to a free place in the middle of its workspace"
-SLACK_M = 0.005
-"""An arm that sags at the edge of its workspace is not stopped for it, m."""
+SLACK_M = 0.005  # an arm that sags at the edge of its workspace is not stopped for it, m
 SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
 """How much less is kept in motion than in a dry run: an arm sags and follows late, and a motion is
 checked at samples. Nothing may touch."""
@@ -94,16 +92,13 @@ class Guard:
 # Choices, no study set them; tests/unit/measuring/test_run_watched.py shows what they find.
 ALLOWED = 2.0
 """A hung load may differ by so many times what it may when it is hung: a sensor's zero drifts."""
-SWING = 0.3
-"""Share of the load that it exerts to the side while it swings in motion: 17°."""
+SWING = 0.3  # share of the load that it exerts to the side while it swings in motion: 17°
 PULL = 0.5
 """Share by which a pull may differ: its rope turns with the arm, its weight is on a pulley."""
 UNKNOWN_KG = 1.0
 """A tool that has not been weighed yet may differ from [tool] by so much, or by half of it, kg."""
-HOLD_S = 0.2
-"""In motion and between readings a difference has to last for so long, real seconds."""
-LOOKS = 3
-"""The same in looks."""
+HOLD_S = 0.2  # in motion and between readings a difference has to last for so long, real seconds
+LOOKS = 3  # the same in looks
 
 
 class LoadWatch:
@@ -202,14 +197,10 @@ class LoadWatch:
         return words if self._meter.identified else f"{words} Or is [tool] mass_kg or com_m wrong?"
 
 
-POLL_S = 0.02
-"""Between two looks at the devices while the arm moves, real seconds."""
-GRACE_S = 15.0
-"""What a motion may take longer than three times its time, real seconds."""
-SLOWEST = 0.02
-"""The speed slider is not waited for below this share."""
-STILL_RAD = 1e-4
-"""Joints of an arm at rest vary by less, rad (some steps of an encoder)."""
+POLL_S = 0.02  # between two looks at the devices while the arm moves, real seconds
+GRACE_S = 15.0  # what a motion may take longer than three times its time, real seconds
+SLOWEST = 0.02  # the speed slider is not waited for below this share
+STILL_RAD = 1e-4  # joints of an arm at rest vary by less, rad (some steps of an encoder)
 MOVED_RAD = 0.005
 """A joint that stands farther from where hilcal left it has been moved, rad; brakes and sagging
 move it by less. A choice, no study set it: 7 mm at the end of an arm of 1.3 m."""
@@ -220,8 +211,7 @@ FOLLOW_S = 0.05
 """So long after its command a joint is where it was commanded to, at most, s. A choice."""
 FROZEN_S = 0.6
 """Joint angles or a clock that stand still for so long where they have to change, real seconds."""
-FROZEN_RAD = 1e-5
-"""Joint angles that change by less stand still, rad."""
+FROZEN_RAD = 1e-5  # joint angles that change by less stand still, rad
 
 
 class Mover:

@@ -92,8 +92,7 @@ def duration(start: Floats, end: Floats, speed: float, acceleration: float) -> f
 
 MEASURING_S = 1.0
 """How long one tracker measurement is taken to last, s; only for the estimate of time."""
-AIMING_S = 2.0
-"""How long turning the tracker to another target is taken to last, s; a choice."""
+AIMING_S = 2.0  # how long turning the tracker to another target is taken to last, s; a choice
 
 
 @dataclass(frozen=True, slots=True)
