@@ -25,7 +25,14 @@ from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import (
+    Clock,
+    Report,
+    Row,
+    TargetLostError,
+    TrackerSample,
+    report_of,
+)
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
@@ -263,21 +270,23 @@ class EmsconTracker:
         if status == es.OK:
             _, words, number = self._line.unpack("<I64si", body)
             name, serial = es.text(words) or name, number
-        facts: list[tuple[str, str]] = []
-        fields: list[tuple[str, object]] = [("name", name), ("serial_number", serial or None)]
+        rows: list[Row] = [("", "", "name", name), ("", "", "serial_number", serial or None)]
         problems: list[str] = []
         if self._reflector is not None:
-            facts.append(("reflector", self._reflector[1]))
-            fields.append(("reflector", self._reflector[1]))
+            rows.append(("reflector", self._reflector[1], "reflector", self._reflector[1]))
         body = self._do("reading the environment", es.GET_ENVIRONMENT, until=until)
         celsius, mbar, humid = self._line.unpack("<3d", body)
-        facts.append(("environment", f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"))
-        fields += [("temperature_degC", celsius), ("pressure_mbar", mbar), ("humidity", humid)]
+        air = f"{celsius:.1f} °C, {mbar:.1f} mbar, {humid:.0f} %"
         _, state, _, _, *version, weather, _, _ = self._system(until)
         firmware = ".".join(map(str, version))
         station = dict(enumerate(es.WEATHER)).get(weather, f"state {weather}")
-        facts += [("emScon", firmware), ("weather station", station)]
-        fields += [("emscon", firmware), ("weather_station", station)]
+        rows += [
+            ("environment", air, "temperature_degC", celsius),
+            ("", "", "pressure_mbar", mbar),
+            ("", "", "humidity", humid),
+            ("emScon", firmware, "emscon", firmware),
+            ("weather station", station, "weather_station", station),
+        ]
         if state != es.INITIALIZED:
             problems.append("it has not found its zeros (it is not initialised); initialise it")
         elif self._options.target == "pose" or self._holds_reflector(until):
@@ -285,9 +294,9 @@ class EmsconTracker:
                 sample = self.measure()
                 std = 1e6 * float(np.sqrt(np.trace(sample.covariance[:3, :3])))
                 where = f"{self._distance:.4f} m away; standard deviation of a point {std:.1f} µm"
-                facts.append(("target", where))
-                fields += [("distance_m", self._distance), ("std_m", 1e-6 * std)]
-                facts += [("remark", sample.warning)] * bool(sample.warning)
+                rows.append(("target", where, "distance_m", self._distance))
+                remark = "remark" if sample.warning else ""
+                rows.append((remark, sample.warning, "std_m", 1e-6 * std))
             except DeviceError as error:
                 if not self._line.open:
                     raise
@@ -295,7 +304,7 @@ class EmsconTracker:
         else:
             problems.append("it holds no reflector; put the beam on it")
         full = f"{name}, serial {serial}" if serial else name
-        return Report(DEVICE, full, tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, full, rows, problems)
 
     def close(self) -> None:
         """Close the connection; the tracker stays as it is. Never raises, may be called twice."""

@@ -19,7 +19,7 @@ from hilcal.config.rig import PORT
 from hilcal.config.rig import ForceSensor as Section
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Losses, Report, WrenchSample
+from hilcal.measuring.devices import Losses, Report, Row, WrenchSample, report_of
 from hilcal.types import Floats, Ints
 
 
@@ -362,23 +362,19 @@ class ForceStream:
 
     def report(self) -> Report:
         """Say who answered, rate, temperature, counters, and every problem."""
-        count, warm = self.losses(), self._temperature
-        facts = [*self._facts, ("port", self._path)]
-        if self.rate:
-            facts.append(("rate", f"{self.rate:.0f} Hz"))
-        if warm is not None:
-            facts.append(("temperature", f"{warm:.1f} °C"))
-        facts.append(("frames", f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"))
-        fields: list[tuple[str, object]] = [
-            *((what.replace(" ", "_"), value) for what, value in self._facts),
-            ("port", self._path),
-            ("rate_Hz", self.rate or None),
-            ("temperature_degC", warm),
-            ("frames", count.frames),
-            ("lost", count.lost),
-            ("corrupt", count.corrupt),
+        count, warm, rate = self.losses(), self._temperature, self.rate
+        rows: list[Row] = [(what, x, what.replace(" ", "_"), x) for what, x in self._facts]
+        counted = f"{count.frames}, lost {count.lost}, corrupt {count.corrupt}"
+        heat = "" if warm is None else f"{warm:.1f} °C"
+        rows += [
+            ("port", self._path, "port", self._path),
+            ("rate" if rate else "", f"{rate:.0f} Hz", "rate_Hz", rate or None),
+            ("temperature" if heat else "", heat, "temperature_degC", warm),
+            ("frames", counted, "frames", count.frames),
+            ("", "", "lost", count.lost),
+            ("", "", "corrupt", count.corrupt),
         ]
-        return Report(DEVICE, self._name, tuple(facts), self._problems(), tuple(fields))
+        return report_of(DEVICE, self._name, rows, self._problems())
 
     def _problems(self) -> tuple[str, ...]:
         try:

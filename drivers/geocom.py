@@ -29,7 +29,14 @@ from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Clock, Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import (
+    Clock,
+    Report,
+    Row,
+    TargetLostError,
+    TrackerSample,
+    report_of,
+)
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats
@@ -407,52 +414,43 @@ class GeoComTracker:
     def report(self) -> Report:
         """Ask the instrument who it is and how it is, and measure once; nothing turns."""
         until = time.monotonic() + DEADLINE_S + self._clock.real(MEASURING_S)
-        name = self._told(until, NAME, lambda told: told.strip('"')) or ("GeoCOM instrument",)
+        name = self._told(until, NAME, lambda said: said.strip('"')) or ("GeoCOM instrument",)
         serial = self._told(until, SERIAL_NUMBER, int)
-        facts: list[tuple[str, str]] = []
-        fields: list[tuple[str, object]] = [("name", name[0])]
+        rows: list[Row] = [("", "", "name", name[0])]
         if serial:
-            fields.append(("serial_number", str(serial[0])))
+            rows.append(("", "", "serial_number", str(serial[0])))
         for what, request in (("firmware", FIRMWARE), ("GeoCOM", GEOCOM_VERSION)):
-            version = self._told(until, request, int, int, int)
-            if version:
-                facts.append((what, ".".join(map(str, version))))
-                fields.append((what.lower(), facts[-1][1]))
+            numbers = self._told(until, request, int, int, int)
+            if numbers:
+                version = ".".join(map(str, numbers))
+                rows.append((what, version, what.lower(), version))
         face = self._told(until, FACE, int)
         if face:
-            facts.append(("face", "second" if face[0] else "first"))
-            fields.append(("face", 2 if face[0] else 1))
+            rows.append(("face", "second" if face[0] else "first", "face", 2 if face[0] else 1))
         problems: list[str] = []
         power = self._told(until, POWER, int, int, int)
         if power:
-            facts.append(("battery", f"{power[0]} %"))
-            fields.append(("battery_percent", power[0]))
+            rows.append(("battery", f"{power[0]} %", "battery_percent", power[0]))
             if power[0] < _LOW_BATTERY and power[1] == _INTERNAL:
                 problems.append(f"its battery is at {power[0]} %; change it or connect power")
         air = self._told(until, GET_ATMOSPHERE, float, float, float, float)
         if air:
-            facts.append(("atmosphere set", f"{air[1]:.1f} hPa, {air[2]:.1f} °C"))
-            fields += [("pressure_hPa", air[1]), ("temperature_degC", air[2])]
+            said = f"{air[1]:.1f} hPa, {air[2]:.1f} °C"
+            rows.append(("atmosphere set", said, "pressure_hPa", air[1]))
+            rows.append(("", "", "temperature_degC", air[2]))
         locked = self._locked(until)
         if locked is not None:
-            facts.append(("lock", "on the target" if locked else "none"))
-            fields.append(("locked", locked))
+            rows.append(("lock", "on the target" if locked else "none", "locked", locked))
             if self._options.lock and not locked:
                 problems.append("it is not locked on its target")
         try:
-            polar = self._measure()
-            facts += self._sight(polar)
-            along, across = self._spread(polar)
-            fields += [("distance_m", polar.distance), ("tilt_rad", polar.tilt)]
-            fields += [("std_along_m", along), ("std_across_m", across)]
-        except TargetLostError as error:
-            problems.append(str(error).removeprefix(f"{DEVICE}: "))
+            rows += self._sight(self._measure())
         except DeviceError as error:
-            if not self._answers(until):
+            if not isinstance(error, TargetLostError) and not self._answers(until):
                 raise
             problems.append(str(error).removeprefix(f"{DEVICE}: "))
         full_name = f"{name[0]}, serial {serial[0]}" if serial else str(name[0])
-        return Report(DEVICE, full_name, tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, full_name, rows, problems)
 
     def close(self) -> None:
         """Give the port back. Never raises, may be called twice."""
@@ -522,22 +520,21 @@ class GeoComTracker:
         across = known.transverse_std_m + known.transverse_std_per_m * d
         return known.range_std_m + known.range_std_per_m * d, max(across, polar.angle_std * d)
 
-    def _sight(self, polar: PolarReading) -> list[tuple[str, str]]:
-        """Facts about a measurement for people."""
+    def _sight(self, polar: PolarReading) -> list[Row]:
         along, across = self._spread(polar)
-        facts = [
-            (
-                "target",
-                f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along "
-                f"the beam, {1e6 * across:.1f} µm across",
-            )
+        seen = (
+            f"{polar.distance:.4f} m away; standard deviation {1e6 * along:.1f} µm along the "
+            f"beam, {1e6 * across:.1f} µm across"
+        )
+        tilt = polar.tilt
+        leans = tuple(f"{1e3 * angle:.3f} mrad" for angle in tilt or ())
+        said = " across, ".join(leans) + " along"
+        return [
+            ("target", seen, "distance_m", polar.distance),
+            ("inclination" if tilt else "", said, "tilt_rad", tilt),
+            ("remark" if polar.warning else "", polar.warning, "std_along_m", along),
+            ("", "", "std_across_m", across),
         ]
-        if polar.tilt is not None:
-            cross, length = (1e3 * angle for angle in polar.tilt)
-            facts.append(("inclination", f"{cross:.3f} mrad across, {length:.3f} mrad along"))
-        if polar.warning:
-            facts.append(("remark", polar.warning))
-        return facts
 
     def _locked(self, until: float) -> bool | None:
         """Whether it follows the target; None where the instrument does not report it."""

@@ -22,7 +22,7 @@ from hilcal.config.rig import Whole
 from hilcal.drivers import natnet_frames as nn
 from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import Report, TargetLostError, TrackerSample
+from hilcal.measuring.devices import Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.toml import Section, check_section
 
 DEVICE = "tracker"
@@ -106,18 +106,21 @@ class NatNetTracker:
         s = self._server
         version = f"{s.version[0]}.{s.version[1]}"
         sent = f"multicast {s.group}:{s.data_port}" if s.group else "to this computer"
-        facts = [("NatNet", version), ("frames", sent), ("rigid body", self._name)]
-        fields: list[tuple[str, object]] = [("name", s.name), ("natnet", version)]
-        fields.append(("rigid_body", self._name))
+        rows: list[Row] = [
+            ("", "", "name", s.name),
+            ("NatNet", version, "natnet", version),
+            ("frames", sent, "", None),
+            ("rigid body", self._name, "rigid_body", self._name),
+        ]
         problems: list[str] = []
         try:
             sample = self.measure()
             std = float(np.sqrt(self._options.frames * sample.covariance[0, 0]))
-            facts.append(("target", f"a frame scatters by {1e6 * std:.0f} µm along each axis"))
-            fields.append(("frame_std_m", std))
+            said = f"a frame scatters by {1e6 * std:.0f} µm along each axis"
+            rows.append(("target", said, "frame_std_m", std))
         except TargetLostError as error:
             problems.append(str(error).removeprefix(f"{DEVICE} at {self.where}: "))
-        return Report(DEVICE, f"{s.name} {s.program}", tuple(facts), tuple(problems), tuple(fields))
+        return report_of(DEVICE, f"{s.name} {s.program}", rows, problems)
 
     def close(self) -> None:
         """Close the sockets. Never raises, may be called twice."""

@@ -22,10 +22,10 @@ from hilcal.drivers.ur_link import probe, states
 from hilcal.drivers.ur_link.lines import Connection, LinkError
 from hilcal.drivers.ur_link.probe import ControllerFacts
 from hilcal.drivers.ur_link.receive_worker import GETTERS
-from hilcal.drivers.ur_link.supervision import RobotFacts, Supervision
+from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.errors import InputError
-from hilcal.measuring.devices import ArmSample, Report
+from hilcal.measuring.devices import ArmSample, Report, Row, report_of
 from hilcal.robot.factory import FactoryKinematics, of_rows
 from hilcal.types import Floats
 
@@ -234,54 +234,60 @@ def survey(
 ) -> Report:
     """Ask everything that can be asked without moving; `silent` is why nobody supervises."""
     version = states.version_word(controller.version)
-    facts = [("address", host), ("controller version", version)]
-    fields: list[tuple[str, object]] = [("address", host), ("controller_version", version)]
+    rows: list[Row] = [
+        ("address", host, "address", host),
+        ("controller version", version, "controller_version", version),
+    ]
     problems: list[str] = []
-    name = "Universal Robots arm"
-    kinematics = None
+    name, kinematics = "Universal Robots arm", None
     try:
         kinematics = read_kinematics(host, _ASK_S)
+        rows.append(("", "", "kinematics", kinematics.to_dict()))
     except LinkError as error:
-        facts.append(("its kinematics", f"not told: {error}"))
+        rows.append(("its kinematics", f"not told: {error}", "", None))
         if needs_primary:
             problems.append(
                 f"{error}; programs go by it, so that the arm cannot be controlled without it: "
                 "enable the primary client interface in the controller's settings, under services"
             )
-    else:
-        fields.append(("kinematics", kinematics.to_dict()))
     if silent:
-        facts.append((supervision.name, silent))
-        problems.append(f"{silent}; the arm cannot be controlled without it")
+        rows.append((supervision.name, silent, "", None))
+    try:
+        if silent:
+            raise LinkError(silent)
+        robot = supervision.describe(_ASK_S)
+    except LinkError as error:
+        problems.append(f"{error}; the arm cannot be controlled without it")
     else:
-        try:
-            robot = supervision.describe(_ASK_S)
-        except LinkError as error:
-            problems.append(f"{error}; the arm cannot be controlled without it")
-        else:
-            serial = f", serial number {robot.serial}" if robot.serial else ""
-            name = f"Universal Robots {robot.model or 'arm'}{serial}"
-            facts += _facts(robot)
-            fields += [
-                ("model", robot.model),
-                ("serial_number", robot.serial),
-                ("software_version", robot.version),
-                ("remote_control", robot.remote),
-                ("program", robot.program),
-            ]
-            problems += _problems(robot, model)
+        serial = f", serial number {robot.serial}" if robot.serial else ""
+        name = f"Universal Robots {robot.model or 'arm'}{serial}"
+        remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
+        rows += [
+            ("model", robot.model, "model", robot.model),
+            ("serial number", robot.serial, "serial_number", robot.serial),
+            ("PolyScope", robot.version, "software_version", robot.version),
+            ("remote control", remote[robot.remote], "remote_control", robot.remote),
+            ("program", robot.program, "program", robot.program),
+        ]
+        if robot.remote is False:
+            problems.append("it is in local mode; switch it to remote control on the pendant")
+        # "UR10" may stand for an UR10e or UR12e as well: only the size decides
+        size, configured = _size(robot.model), _size(model)
+        if size and configured and configured != size:
+            problems.append(f'it is a {robot.model}; the configuration says model = "{model}"')
     try:
         reading = receiver.read()
         rate = settled_rate(receiver.rate, hz)
     except LinkError as error:
         problems.append(str(error))
     else:
-        facts += [*_state(reading), ("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz")]
-        fields += [*_state_fields(reading), ("rtde_rate_Hz", rate), ("rtde_rate_asked_Hz", hz)]
+        rows += _state(reading)
+        rows.append(("RTDE rate", f"{rate:.0f} Hz of {hz:g} Hz", "rtde_rate_Hz", rate))
+        rows.append(("", "", "rtde_rate_asked_Hz", hz))
         problems += _hindrances(reading)
         if rate < _SHARE * hz:
             problems.append(f"RTDE comes at {rate:.0f} Hz instead of {hz:g} Hz; check the network")
-    return Report("arm", name, tuple(facts), tuple(problems), tuple(fields), kinematics)
+    return report_of("arm", name, rows, problems, kinematics)
 
 
 def settled_rate(count: Callable[[float], float], hz: float) -> float:
@@ -290,60 +296,29 @@ def settled_rate(count: Callable[[float], float], hz: float) -> float:
     return rate if rate >= _SHARE * hz else count(_RATE_S[1])
 
 
-def _facts(robot: RobotFacts) -> list[tuple[str, str]]:
-    remote = {True: "yes", False: "no (local mode)", None: "not known to this controller"}
-    return [
-        ("model", robot.model),
-        ("serial number", robot.serial),
-        ("PolyScope", robot.version),
-        ("remote control", remote[robot.remote]),
-        ("program", robot.program),
-    ]
-
-
-def _problems(robot: RobotFacts, model: str) -> list[str]:
-    out = []
-    if robot.remote is False:
-        out.append("it is in local mode; switch it to remote control on the pendant")
-    # "UR10" may stand for an UR10e or UR12e as well: only the size decides
-    size, told = _size(robot.model), _size(model)
-    if size and told and told != size:
-        out.append(f'it is a {robot.model}; the configuration says model = "{model}"')
-    return out
-
-
 def _size(model: str) -> str:
     """Return the number in the name of an arm of this maker; UR7e and UR12e have their old one."""
     found = re.match(r"ur(\d+)", model.lower())
     return "" if found is None else {"7": "5", "12": "10"}.get(found[1], found[1])
 
 
-def _state(reading: Reading) -> list[tuple[str, str]]:
-    sample = reading.sample
-    com = "" if sample.payload_com is None else f" at {_list(1e3 * sample.payload_com, 1)} mm"
-    payload = "not reported" if math.isnan(sample.payload) else f"{sample.payload:.3f} kg{com}"
+def _state(reading: Reading) -> list[Row]:
+    sample, mode = reading.sample, states.mode_word(reading.mode)
+    com, warm = sample.payload_com, sample.joint_temperature
+    at = "" if com is None else f" at {_list(1e3 * com)} mm"
+    mass = None if math.isnan(sample.payload) else sample.payload
+    payload = "not reported" if mass is None else f"{mass:.3f} kg{at}"
     return [
-        ("robot mode", states.mode_word(reading.mode)),
-        ("safety", sample.safety),
-        ("payload", payload),
-        ("joint temperatures", f"{_list(sample.joint_temperature, 1)} °C"),
-    ]
-
-
-def _state_fields(reading: Reading) -> list[tuple[str, object]]:
-    sample = reading.sample
-    return [
-        ("robot_mode", states.mode_word(reading.mode)),
-        ("safety", sample.safety),
-        ("payload_kg", None if math.isnan(sample.payload) else sample.payload),
-        ("payload_com_m", None if sample.payload_com is None else sample.payload_com.tolist()),
-        ("joint_temperature_degC", sample.joint_temperature.tolist()),
+        ("robot mode", mode, "robot_mode", mode),
+        ("safety", sample.safety, "safety", sample.safety),
+        ("payload", payload, "payload_kg", mass),
+        ("", "", "payload_com_m", None if com is None else com.tolist()),
+        ("joint temperatures", f"{_list(warm)} °C", "joint_temperature_degC", warm.tolist()),
     ]
 
 
 def _hindrances(reading: Reading) -> list[str]:
-    out = []
-    sample = reading.sample
+    out, sample = [], reading.sample
     if sample.safety != states.NORMAL:
         out.append(f"{sample.safety}: {states.safety_advice(reading.safety_bits)}")
     if reading.mode != states.RUNNING:
@@ -356,5 +331,5 @@ def _hindrances(reading: Reading) -> list[str]:
     return out
 
 
-def _list(values: object, digits: int) -> str:
-    return ", ".join(f"{v:.{digits}f}" for v in values)  # type: ignore[attr-defined]
+def _list(values: Floats) -> str:
+    return ", ".join(f"{v:.1f}" for v in values)

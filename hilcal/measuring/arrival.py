@@ -1,6 +1,7 @@
 """What is read in one arrival of the arm, and where the tracker roughly stands, to be aimed."""
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -268,12 +269,11 @@ class ArrivalReader:
         if places is None:
             if not self._said:
                 held, *others = self._cell.target_names
-                self._watcher.notify(
-                    Remark(
-                        f"only target {held} is read until the first positions have located "
-                        f"the tracker; {', '.join(others)} after that"
-                    )
+                text = (
+                    f"only target {held} is read until the first positions have located the "
+                    f"tracker; {', '.join(others)} after that"
                 )
+                self._watcher.notify(Remark(text))
                 self._said = True
             return [TargetReading(0, self._measurer.measure(name), self._clock.now())]
         found: list[TargetReading] = []
@@ -301,10 +301,7 @@ class ArrivalReader:
         name: str,
         force: WrenchSample | None,
     ) -> MeasuredStop:
-
-        def aim() -> None:
-            tracker.aim(places[k], self._radius)
-
+        aim = partial(tracker.aim, places[k], self._radius)
         try:
             aim()
         except TargetLostError:  # once more: somebody may have walked through the beam

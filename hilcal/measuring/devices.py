@@ -6,6 +6,7 @@ a device that does not answer raises `DeviceError` with one clear line, within i
 """
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -69,6 +70,24 @@ class Report:
     """(name, value) of the facts for scripts: numbers with their unit in the name."""
     kinematics: FactoryKinematics | None = None
     """of an arm, by which its controller computes poses; None where it does not tell."""
+
+
+Row = tuple[str, str, str, object]
+"""Of a report: what and how it is, for people; its name and value for scripts; "": not for them."""
+
+
+def report_of(
+    device: str,
+    name: str,
+    rows: Iterable[Row],
+    problems: Iterable[str] = (),
+    kinematics: FactoryKinematics | None = None,
+) -> Report:
+    """Return a report of rows."""
+    rows = tuple(rows)
+    facts = tuple((what, text) for what, text, *_ in rows if what)
+    fields = tuple((key, value) for *_, key, value in rows if key)
+    return Report(device, name, facts, tuple(problems), fields, kinematics)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -99,10 +99,14 @@ class Hook:
         operator = self._operator
         if not isinstance(operator, ConfirmingOperator):
             raise DeviceError(f"arm: {question}: look at it, and start again")
-        if not (isinstance(operator, TerminalPerson) and operator.at_terminal):
+        if not self._at_terminal:
             self._watcher.notify(Remark(question))
         self._watcher.notify(Phase("waiting for the operator to look at the arm"))
         self._asked(partial(operator.confirm, question))
+
+    @property
+    def _at_terminal(self) -> bool:
+        return isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
 
     def _carry(self, load: CellLoad | None) -> None:
         self._arm.set_payload(*payload(self._cell, load))
@@ -122,11 +126,10 @@ class Hook:
 
     def _asked(self, ask: Callable[[], None]) -> None:
         """Ask a person; one at the terminal gets it from the display."""
-        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
-        if person:
+        if self._at_terminal:
             self._watcher.notify(Question())
         ask()
-        if person:
+        if self._at_terminal:
             self._watcher.notify(Answered())
 
     def _ask(
@@ -141,7 +144,6 @@ class Hook:
         `answered` is told what hangs after each answer, before anything moves.
         """
         what = "take everything off" if load is None else f"hang {load.name}"
-        person = isinstance(self._operator, TerminalPerson) and self._operator.at_terminal
         for _ in range(TRIES):
             self._watcher.notify(Phase(f"waiting for the operator to {what}"))
             self._asked(partial(self._operator.hang, load, why))
@@ -153,7 +155,7 @@ class Hook:
             why = wrong()
             if not why:
                 return
-            if not person:  # a person is told with the next question
+            if not self._at_terminal:  # a person is told with the next question
                 self._watcher.notify(Remark(f"asked to {what}: {why}"))
         if load is None:
             why += ". If nothing does, the tool was touched while the sensor was tared"

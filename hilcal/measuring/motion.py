@@ -1,7 +1,7 @@
 """Moving the arm from pose to pose while every limit, and that the load hangs, is checked."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,17 +24,12 @@ SLACK = Margins(joint=-0.01, inside=-SLACK_M, clear=0.0, itself=0.0, bear=1.02)
 checked at samples. Nothing may touch."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Guard:
     """The limits of a cell, checked against samples of its devices."""
 
-    cell: Cell
-    config: CellConfig
-    _limits: Feasibility = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        """Build the shapes once."""
-        object.__setattr__(self, "_limits", Feasibility(self.cell, self.config, SLACK))
+    def __init__(self, cell: Cell, config: CellConfig) -> None:
+        self.cell, self.config = cell, config
+        self._limits = Feasibility(cell, config, SLACK)
 
     def check(
         self, sample: ArmSample, felt: Floats | None = None, hanging: str = UNLOADED
@@ -74,18 +69,16 @@ class Guard:
         sensor = self.config.force_sensor
         if felt is None or sensor is None:
             return None
-        force, moment = float(np.linalg.norm(felt[:3])), float(np.linalg.norm(felt[3:]))
-        # negated, so that what is not a number is refused
-        if not force <= sensor.max_force_N:
-            return (
-                f"force sensor: {force:.4g} N; max_force_N is {sensor.max_force_N:g}. Look what "
-                "the arm or its load touches"
-            )
-        if not moment <= sensor.max_moment_Nm:
-            return (
-                f"force sensor: {moment:.4g} N·m; max_moment_Nm is {sensor.max_moment_Nm:g}. "
-                "Look what the arm or its load touches"
-            )
+        for part, unit, key, limit in (
+            (felt[:3], "N", "max_force_N", sensor.max_force_N),
+            (felt[3:], "N·m", "max_moment_Nm", sensor.max_moment_Nm),
+        ):
+            size = float(np.linalg.norm(part))
+            if not size <= limit:  # negated, so that what is not a number is refused
+                return (
+                    f"force sensor: {size:.4g} {unit}; {key} is {limit:g}. Look what the arm or "
+                    "its load touches"
+                )
         return None
 
 
@@ -268,11 +261,9 @@ class Mover:
             (sample.q_target, "another program, or somebody at the pendant, has commanded"),
             (sample.q, "somebody has moved"),
         ):
-            off = np.abs(where - self.goal)
-            k = int(np.argmax(off))
-            if not off[k] <= MOVED_RAD:
-                name = self._guard.cell.arm.joint_names[k]
-                return f"{who} it since it came here: {name} by {off[k]:.3g} rad"
+            name, off = self._worst(where - self.goal)
+            if not off <= MOVED_RAD:
+                return f"{who} it since it came here: {name} by {off:.3g} rad"
         return None
 
     def wait(self, seconds: float) -> None:
@@ -298,13 +289,11 @@ class Mover:
                 raise DeviceError(unfit)
             q = sample.q
             self.check_way(q, goal, name)
-            off = np.abs(q - left)
-            k = int(np.argmax(off))
-            if off[k] <= MOVED_RAD:
+            joint, off = self._worst(q - left)
+            if off <= MOVED_RAD:
                 return q
-            joint = self._guard.cell.arm.joint_names[k]
             ask(
-                f"the arm does not stand where it was left: {joint} is {off[k]:.3g} rad off. Its "
+                f"the arm does not stand where it was left: {joint} is {off:.3g} rad off. Its "
                 f"way from there to {name} has been checked. It goes there next"
             )
             left = q
@@ -369,13 +358,17 @@ class Mover:
             self._clock.sleep(POLL_S * self._clock.scale)
         arrived = self.look().q
         self._watcher.notify(ArmAt(tuple(arrived.tolist())))
-        off = np.abs(arrived - q)
-        if not off.max() <= motion.arrival_rad:
-            k = int(np.argmax(off))
+        joint, off = self._worst(arrived - q)
+        if not off <= motion.arrival_rad:
             raise DeviceError(
-                f"arm: {self._guard.cell.arm.joint_names[k]} stands {off[k]:.3g} rad off {name}; "
-                f"arrival_rad is {motion.arrival_rad:g}"
+                f"arm: {joint} stands {off:.3g} rad off {name}; arrival_rad is "
+                f"{motion.arrival_rad:g}"
             )
+
+    def _worst(self, off: Floats) -> tuple[str, float]:
+        """Name of the joint that is off the most, and by how much, rad."""
+        k = int(np.argmax(np.abs(off)))
+        return self._guard.cell.arm.joint_names[k], float(np.abs(off[k]))
 
     def _check_progress(
         self, start: Floats, goal: Floats, sample: ArmSample, last: ArmSample | None, name: str
@@ -383,20 +376,16 @@ class Mover:
         """Check that a motion keeps its line and goes on; the first sample that stood here."""
         way = goal - start
         share = np.clip((sample.q - start) @ way / max(float(way @ way), 1e-30), 0.0, 1.0)
-        off = np.abs(sample.q - start - share * way)
-        k = int(np.argmax(off))
-        joint = self._guard.cell.arm.joint_names[k]
-        if not off[k] <= OFF_WAY_RAD:
+        joint, off = self._worst(sample.q - start - share * way)
+        if not off <= OFF_WAY_RAD:
             raise DeviceError(
-                f"arm: {joint} has left the straight way to {name} by {off[k]:.3g} rad; does "
+                f"arm: {joint} has left the straight way to {name} by {off:.3g} rad; does "
                 "another program command the arm, or does somebody push it?"
             )
-        behind = np.abs(sample.q_target - sample.q)
-        k = int(np.argmax(behind))
-        joint = self._guard.cell.arm.joint_names[k]
-        if not behind[k] <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
+        joint, behind = self._worst(sample.q_target - sample.q)
+        if not behind <= OFF_WAY_RAD + FOLLOW_S * self._motion.speed_rad_s:
             raise DeviceError(
-                f"arm: {joint} is told to be {behind[k]:.3g} rad from where it is, on the way to "
+                f"arm: {joint} is told to be {behind:.3g} rad from where it is, on the way to "
                 f"{name}: its angle is old, or something holds the joint"
             )
         if last is None or np.abs(sample.q - last.q).max() > FROZEN_RAD:

@@ -23,8 +23,7 @@ from random import Random
 
 from hilcal.errors import CannotAnswerError, DeviceError, InputError
 
-BATCH = 200
-"""Inputs of one random stream; a choice."""
+BATCH = 200  # inputs of one random stream; a choice
 MEMORY = 3 << 30
 """Address space beyond what the process has, bytes; a choice: a table of readings needs little."""
 

@@ -18,8 +18,7 @@ from hilcal.types import Floats
 from tests.support.campaign_run import EndedError, Run
 from tests.support.campaign_site import Site, site
 
-LONG = 900.0
-"""A whole campaign may take so long, s."""
+LONG = 900.0  # a whole campaign may take so long, s
 STARVED = re.compile(
     r"no new data over RTDE|no answer within|by its watchdog|too busy|nothing came for|"
     r"nobody watched its motion"

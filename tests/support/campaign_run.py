@@ -20,8 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 BEGUN = "waiting for the operator to take everything off"
 """What a run says as soon as every device is there and ready."""
 TAKEN = re.compile(r"\d+/\d+ ")
-SLOW = 0.1
-"""Position of the speed slider while an arm is to be stopped on its way."""
+SLOW = 0.1  # position of the speed slider while an arm is to be stopped on its way
 LOOK_S = 0.25
 """Time between two looks at the processes that a run has started; each reads those of the whole
 machine."""

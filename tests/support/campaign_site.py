@@ -24,8 +24,7 @@ from tests.support.spread_plan import spread_plan
 if TYPE_CHECKING:
     from tests.support.campaign_run import Run
 
-DEADLINE = 60.0
-"""Nothing here may take longer, s; far above what it takes."""
+DEADLINE = 60.0  # nothing here may take longer, s; far above what it takes
 HAND_S = 2.0
 """The simulated person is quick, s of cell time: nothing here depends on how long it takes."""
 

@@ -27,16 +27,13 @@ from tests.wire import test_fault_matrix_person as person
 from tests.wire.test_fault_matrix_arm import MOTION, REST
 from tests.wire.test_fault_matrix_serial import FORCE, OVERCOME, TRACKER
 
-PATIENCE = 25.0
-"""So long a program may go on with a fault before it counts as overcome, s."""
+PATIENCE = 25.0  # so long a program may go on with a fault before it counts as overcome, s
 STANDS = 1.0
 """So long after its program was killed an arm may move, s: half of it to be noticed, and a ramp."""
-IN_MOTION = 1.0
-"""So long an arm in motion may go on after what it has to be stopped for, s."""
+IN_MOTION = 1.0  # so long an arm in motion may go on after what it has to be stopped for, s
 NOTICED = re.compile(r"touch the tool|does not stand|asked \d times")
 """What is said of a load that fell."""
-DONE = "readings are in"
-"""What a run says at its end."""
+DONE = "readings are in"  # what a run says at its end
 STOP_MOVING = (*MOTION, *person.MOTION)
 """Faults for which an arm in motion has to be stopped and the run ended."""
 STOP_MEASURING = (*REST, *TRACKER, *FORCE, *person.REST)
@@ -49,8 +46,7 @@ BESIDE = (
     ("report", "-o", "/dev/null"),
 )
 """Commands that are run on a campaign while it is measured."""
-CODES = (0, 3, 130, -signal.SIGKILL)
-"""Exit codes: done, a device failed, interrupted, killed."""
+CODES = (0, 3, 130, -signal.SIGKILL)  # exit codes: done, a device failed, interrupted, killed
 
 
 @dataclass

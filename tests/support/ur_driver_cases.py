@@ -18,8 +18,7 @@ from tests.support import sim_ur_cases
 
 MASS, COM = 2.5, np.array([0.01, -0.02, 0.08])
 SPEED, ACCELERATION = 0.5, 4.0
-STOP_NS = 500_000_000
-"""In this time the arm has to stand after a fault (the requirement)."""
+STOP_NS = 500_000_000  # in this time the arm has to stand after a fault (the requirement)
 
 Sim = sim_ur_cases.SimulatedUr
 

@@ -36,8 +36,7 @@ from tests.support.sim_ur_cases import (
 )
 
 SPEED, ACCELERATION = 0.5, 1.0
-STOP_NS = 500_000_000
-"""The arm has to stand so soon after a fault."""
+STOP_NS = 500_000_000  # the arm has to stand so soon after a fault
 
 
 @pytest.fixture(scope="module")

@@ -32,10 +32,8 @@ from tests.support.campaign_site import Site
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 
-LONGEST = 5.0
-"""The moment of a kill is drawn up to here, s; a run takes longer."""
-SLOW = 0.3
-"""Position of the speed slider meanwhile: the arm moves for about half of the time."""
+LONGEST = 5.0  # the moment of a kill is drawn up to here, s; a run takes longer
+SLOW = 0.3  # position of the speed slider meanwhile: the arm moves for about half of the time
 
 
 @pytest.mark.parametrize(
