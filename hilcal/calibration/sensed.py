@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.measuring.tool_load import shift
+from hilcal.measuring.force import shift
 from hilcal.robot import se3
 from hilcal.robot.chain import evaluate
 from hilcal.types import Floats

@@ -54,7 +54,7 @@ from hilcal.errors import CannotAnswerError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.names import quoted
 from hilcal.present.calibration import improvement_report
 from hilcal.present.diagnosis import (

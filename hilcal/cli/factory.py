@@ -12,8 +12,7 @@ from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError, StoppedError
-from hilcal.measuring.connect import ConnectionResult
-from hilcal.measuring.kinematics import nominal_arm, told_by
+from hilcal.measuring.connect import ConnectionResult, nominal_arm, told_by
 from hilcal.present.progress import working
 from hilcal.present.running import factory_words
 from hilcal.store.run_log import create_run

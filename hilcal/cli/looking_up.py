@@ -26,7 +26,7 @@ from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
 from hilcal.drivers.geocom import GeoComOptions as GeoComOptions
 from hilcal.drivers.natnet import NatNetOptions as NatNetOptions
 from hilcal.drivers.netft import NetFtOptions as NetFtOptions
-from hilcal.drivers.ur_link.services import UrOptions
+from hilcal.drivers.ur_link.supervision import UrOptions
 from hilcal.effects import template
 from hilcal.effects.catalogue import BUILT_IN, Catalogue, installed
 from hilcal.effects.check import NAME, ROBOT, example_cell, example_states

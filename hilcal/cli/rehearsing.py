@@ -41,7 +41,7 @@ from hilcal.drivers.simulated.rehearsal import (
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import DeviceError, InputError
 from hilcal.identification.full_covariance import full_readings
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.progress import Say, counting, working
 from hilcal.procedure.procedure import Measure, Procedure

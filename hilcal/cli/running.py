@@ -37,9 +37,8 @@ from hilcal.errors import (
     MovedFileError,
     StoppedError,
 )
-from hilcal.measuring.connect import ConnectionResult, Rig, connect
+from hilcal.measuring.connect import ConnectionResult, Rig, connect, with_kinematics
 from hilcal.measuring.devices import Clock
-from hilcal.measuring.kinematics import with_kinematics
 from hilcal.measuring.progress import Watcher
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan

@@ -7,7 +7,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.summary import PlanSummary
 from hilcal.errors import InputError
-from hilcal.measuring.dry_run import DryRun, dry_run
+from hilcal.measuring.route import DryRun, dry_run
 from hilcal.shown import Shown, Tabular
 from hilcal.store.plan import Plan
 from hilcal.whole_file import replace_file

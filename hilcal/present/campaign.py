@@ -8,7 +8,7 @@ import numpy as np
 from hilcal import numbers
 from hilcal.config.changes import Changes, write_value
 from hilcal.identification.fit import Fit
-from hilcal.measuring.repeatability import RepeatabilityEstimate
+from hilcal.measuring.session_state import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, heading, note, pairs, table
 from hilcal.present.fit import error_words, model_name
 from hilcal.present.registration import observed_words

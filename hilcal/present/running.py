@@ -32,7 +32,7 @@ from hilcal.present.document import Block, table
 
 if TYPE_CHECKING:
     from hilcal.measuring.connect import ConnectionResult
-    from hilcal.measuring.dry_run import DryRun
+    from hilcal.measuring.route import DryRun
     from hilcal.transfer.factory import FactoryCheck
 
 

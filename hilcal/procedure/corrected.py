@@ -16,8 +16,7 @@ from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import REASONS, Space
 from hilcal.design.run_order import Chosen, Ordering, order_plan, pace
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
-from hilcal.measuring.route import approach_sides, duration, route
+from hilcal.measuring.route import approach_sides, dry_run, duration, route
 from hilcal.present.calibration import refusals
 from hilcal.present.progress import Say
 from hilcal.procedure.validation_plan import DRAWS, RECORDED, fewer_returns

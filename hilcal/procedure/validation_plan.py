@@ -12,7 +12,7 @@ from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import Space, draw
 from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.present.progress import Say
 from hilcal.readings.readings import Readings, States
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step

@@ -239,7 +239,7 @@ HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_st
 PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
 DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
 KINEMATICS = (
-    "tests/wire/test_polyscope_x_cell.py"
+    "tests/wire/test_network_cell.py"
     "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
 )
 TAKEN: dict[str, dict[str, str]] = {
@@ -306,8 +306,8 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
     "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
-    "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
-    "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "measuring/connect": {"check CELL.toml --save-calibration": KINEMATICS},
+    "measuring/route": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {
         "hilcal accept RUN N": f"{HERE}what_a_report_names",
         "None yet: hilcal identify": f"{HERE}without_a_revision",

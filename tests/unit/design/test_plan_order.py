@@ -16,8 +16,7 @@ from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.run_order import Chosen, Ordered, Ordering, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.dry_run import dry_run
-from hilcal.measuring.route import route
+from hilcal.measuring.route import dry_run, route
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats
 from tests.support.campaigns import configuration

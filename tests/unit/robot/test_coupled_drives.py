@@ -8,7 +8,7 @@ from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.mechanics import rotation_vector
 from hilcal.drivers.simulated.truth import Truth
-from hilcal.drivers.simulated.ur.state import GRAVITY, Kinematics
+from hilcal.drivers.simulated.ur_state import GRAVITY, Kinematics
 from hilcal.drivers.simulated.world import SimulatedNoise, World
 from hilcal.effects.protocol import Situation
 from hilcal.identification.full_covariance import joint_factors

@@ -21,16 +21,14 @@ right, the way is not. Blends (r) are left out: every waypoint is reached. Sourc
 import re
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
 
-from hilcal.drivers.simulated.ur.state import ArmState, pose, transform
+from hilcal.drivers.simulated.ur_state import ArmState, Goal, pose, transform
 from hilcal.types import Floats
 
-PROGRAM_STOP = 4.0
-"""Deceleration when a program ends while the arm moves, rad/s²."""
+PROGRAM_STOP = 4.0  # deceleration when a program ends while the arm moves, rad/s²
 
 _READY, _DONE = 1, 2
 _STEADY = 0.5  # s of world time at rest after which the robot says that it is steady
@@ -77,24 +75,17 @@ class ControlScript:
     """The uploaded script, once it plays."""
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read what the client has put into the text.
-
-        Raises:
-            ValueError: it is not ur_rtde's control script.
-        """
         found = _OFFSET.search(text)
         if found is None:
             raise ValueError("not a control script")
         self._arm = arm
-        self.register = int(found.group(1))
-        """The integer register of commands."""
+        self.register = int(found.group(1))  # the integer register of commands
         self._path = tuple(_moves(text))
         self._executing = False
         self._work: Iterator[None] | None = None
         self._async = False
         self._async_count = self._async_number = 0
-        self.watchdog = 0.0
-        """Least rate of input packages that the program asks for, Hz; 0 is none."""
+        self.watchdog = 0.0  # least rate of input packages that the program asks for, Hz; 0 is none
         self._signal(_READY)
         self._progress(None)
 
@@ -107,12 +98,7 @@ class ControlScript:
         return max(0.0, silence - 1.0 / self.watchdog)
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on.
-
-        Raises:
-            ProtectiveStop: the program asks for one.
-            ValueError: a command that is not emulated: the program ends.
-        """
+        """Do what there is to do; return whether the program goes on."""
         if self._async and not self._arm.trajectory.moving:
             self._async = False
             self._progress(None)
@@ -142,20 +128,12 @@ class ControlScript:
         arm, motion, now = self._arm, self._arm.trajectory, self._arm.clock.now
         match number:
             case ScriptCommand.MOVE_J | ScriptCommand.MOVE_L_FK | ScriptCommand.MOVE_PATH:
-                if arm.refuses_motion:
-                    raise ValueError("the motion is refused")
                 given = self._doubles(0, 8)
                 goals = [(given[:6], float(given[6]), float(given[7]))]
                 if number == ScriptCommand.MOVE_PATH:
                     goals = list(self._path)
                 for goal, speed, acceleration in goals:
-                    if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
-                        raise ValueError(f"move with speed {speed}, acceleration {acceleration}")
-                    if not np.all(np.abs(goal) <= _JOINT_LIMIT):
-                        arm.note(f"goal beyond the joint limits: {goal.tolist()}")
-                        raise ProtectiveStop
-                    motion.start(goal, speed, acceleration, arm.clock.now)
-                    arm.note(f"move to {np.round(goal, 6).tolist()}")
+                    _begin(arm, goal, speed, acceleration)
                     if self._int(1) and number != ScriptCommand.MOVE_PATH:
                         self._async = True
                         self._progress(0)
@@ -201,10 +179,10 @@ class ControlScript:
                 raise ValueError(f"command {number} is not emulated")
 
     def _realtime(self, number: int) -> None:
+        arm = self._arm
         if number == ScriptCommand.JOINT_TORQUES:
-            arm = self._arm
-            torque = arm.kinematics.weight_torque(arm.trajectory.q, arm.payload, arm.payload_com)
-            self._answer(torque)
+            q = arm.trajectory.q
+            self._answer(arm.kinematics.weight_torque(q, arm.payload, arm.payload_com))
         elif number == ScriptCommand.GET_STEPTIME:
             self._answer(np.array([_STEP]))
         else:
@@ -227,9 +205,8 @@ class ControlScript:
         self._arm.registers.out_int[self.register] = value
 
     def _answer(self, values: Floats) -> None:
-        self._arm.registers.out_double[self.register : self.register + len(values)] = (
-            values.tolist()
-        )
+        part = slice(self.register, self.register + len(values))
+        self._arm.registers.out_double[part] = values.tolist()
 
     def _int(self, k: int) -> int:
         return self._arm.registers.in_int[self.register + k]
@@ -239,7 +216,7 @@ class ControlScript:
         return np.array(self._arm.registers.in_double[start : start + count])
 
 
-def _moves(text: str) -> Iterator[tuple[Floats, float, float]]:
+def _moves(text: str) -> Iterator[Goal]:
     """Yield (goal, speed, acceleration) of the joint moves of an uploaded path."""
     body = _PATH.search(text)
     for q, acceleration, speed in _MOVE.findall(body.group(1)) if body else ():
@@ -250,7 +227,6 @@ class ScriptStream:
     """Cuts what comes on the script port into programs."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._lines: list[str] = []
         self._rest = ""
 
@@ -276,66 +252,57 @@ _LEVER = 1.0
 """Distance of the tool from a joint that turns tool speeds into joint speeds, m; a choice."""
 _WAYPOINT = re.compile(r"(movej|movel|movep)\(\s*\[([^\]]*)\]\s*((?:,[^)]*)?)\)")
 _SLEEP = re.compile(r"sleep\(\s*([0-9.eE+-]+)\s*\)")
-_IGNORED = re.compile(r"(textmsg|set_tcp|set_payload|popup)\(.*\)|(?:global\s+)?\w+\s*=.*|end")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Move:
-    """A motion to joint values (6,), rad, with its speed and acceleration at the joints."""
-
-    goal: Floats
-    speed: float
-    acceleration: float
+_IGNORED = re.compile(
+    r"(textmsg|set_tcp|set_payload|popup)\(.*\)|(?:global\s+)?\w+\s*=.*|end|def\s+\w+\(\s*\)\s*:|"
+)
 
 
 class WaypointProgram:
     """A program of moves, while it plays."""
 
-    watchdog = 0.0
-    late = 0.0
+    watchdog = late = 0.0
 
     def __init__(self, text: str, arm: ArmState) -> None:
-        """Read the program.
-
-        Raises:
-            ValueError: it has statements that are not emulated, or no moves.
-        """
-        self._arm = arm
-        self._steps = list(_steps(text))
-        if not any(isinstance(step, Move) for step in self._steps):
+        """Read the program; ValueError: statements that are not emulated, or no moves."""
+        self._arm, self._steps = arm, list(_steps(text))
+        if all(isinstance(step, float) for step in self._steps):
             raise ValueError("no waypoints")
         self._work = self._run()
 
     def poll(self) -> bool:
-        """Do what there is to do; return whether the program goes on.
-
-        Raises:
-            ValueError: a motion that is refused: the program ends.
-        """
+        """Do what there is to do; return whether the program goes on."""
         return next(self._work, False)
 
     def _run(self) -> Iterator[bool]:
-        motion = self._arm.trajectory
+        arm = self._arm
         for step in self._steps:
             if isinstance(step, float):
-                end = self._arm.clock.now + step
-                while self._arm.clock.now < end:
+                end = arm.clock.now + step
+                while arm.clock.now < end:
                     yield True
                 continue
-            if self._arm.refuses_motion:
-                raise ValueError("the motion is refused")
-            motion.start(step.goal, step.speed, step.acceleration, self._arm.clock.now)
-            self._arm.note(f"move to {np.round(step.goal, 6).tolist()}")
-            while motion.moving:
+            _begin(arm, *step)
+            while arm.trajectory.moving:
                 yield True
 
 
-def _steps(text: str) -> Iterator[Move | float]:
+def _begin(arm: ArmState, goal: Floats, speed: float, acceleration: float) -> None:
+    """Begin a motion of a program; ValueError: it is refused, and the program ends."""
+    if arm.refuses_motion:
+        raise ValueError("the motion is refused")
+    if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
+        raise ValueError(f"move with speed {speed}, acceleration {acceleration}")
+    if not np.all(np.abs(goal) <= _JOINT_LIMIT):
+        arm.note(f"goal beyond the joint limits: {goal.tolist()}")
+        raise ProtectiveStop
+    arm.trajectory.start(goal, speed, acceleration, arm.clock.now)
+    arm.note(f"move to {np.round(goal, 6).tolist()}")
+
+
+def _steps(text: str) -> Iterator[Goal | float]:
     """Yield the moves, and the waits in s."""
     for line in text.splitlines():
         statement = line.split("#")[0].strip()
-        if not statement or re.match(r"def\s+\w+\(\s*\)\s*:", statement):
-            continue
         move, sleep = _WAYPOINT.fullmatch(statement), _SLEEP.fullmatch(statement)
         if move:
             yield _move(move[1], move[2], move[3])
@@ -345,15 +312,16 @@ def _steps(text: str) -> Iterator[Move | float]:
             raise ValueError(f"not emulated: {statement}")
 
 
-def _move(function: str, numbers: str, options: str) -> Move:
+def _move(function: str, numbers: str, options: str) -> Goal:
     goal = np.array([float(x) for x in numbers.split(",")])
     if goal.shape != (6,) or not np.all(np.abs(goal) <= _JOINT_LIMIT):
         raise ValueError(f"no joint values: {numbers}")
     given = dict(re.findall(r"([avtr])\s*=\s*([0-9.eE+-]+)", options))
+    lever = 1.0 if function == "movej" else _LEVER
     acceleration, speed = (
-        float(given.get(key, usual)) for key, usual in zip("av", SPEEDS[function], strict=True)
+        float(given.get(key, usual)) / lever
+        for key, usual in zip("av", SPEEDS[function], strict=True)
     )
     if not (0.0 < speed < np.inf and 0.0 < acceleration < np.inf):
         raise ValueError(f"move with speed {speed}, acceleration {acceleration}")
-    lever = 1.0 if function == "movej" else _LEVER
-    return Move(goal, speed / lever, acceleration / lever)
+    return goal, speed, acceleration

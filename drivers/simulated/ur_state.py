@@ -16,11 +16,11 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.scene import FLANGE, pinocchio_model
 from hilcal.types import Floats
 
-REGISTERS = 48
-"""Of each kind and direction."""
-
+REGISTERS = 48  # of each kind and direction
 GRAVITY = np.array([0.0, 0.0, -9.80665])
 _NOTHING = 1e-9  # rad: no motion
+Goal = tuple[Floats, float, float]
+"""Joint angles (n,), rad, speed and acceleration of the leading joint."""
 
 
 def transform(pose: Floats) -> Floats:
@@ -37,7 +37,6 @@ class Kinematics:
     """Nominal kinematics and weight of the arm, as its controller knows them, by Pinocchio."""
 
     def __init__(self, arm: Arm) -> None:
-        """Take the arm's constants."""
         self.arm = arm
         self._model = pinocchio_model(arm)
         self._model.gravity.linear = GRAVITY
@@ -55,10 +54,7 @@ class Kinematics:
         return by_angle if self.arm.coupling is None else by_angle @ self.arm.coupling
 
     def weight_torque(self, q: Floats, mass: float, com: Floats) -> Floats:
-        """Return the (n,) torque that the arm's weight and a payload exert at its drives, N·m.
-
-        `com` (3,) is the payload's, flange axes, m.
-        """
+        """Return the (n,) torque that arm and payload at `com` (3,) exert at its drives, N·m."""
         held = pin.computeGeneralizedGravity(self._model, self._data, self.arm.chain_angles(q))
         place = self.flange(q)
         lifted = self._by_angle(q, place[:3, :3] @ com + place[:3, 3])[:3]
@@ -69,16 +65,14 @@ class Kinematics:
         angle, axes = self.arm.chain_angles(q), pin.LOCAL_WORLD_ALIGNED
         origin = self.flange(q)[:3, 3]
         at = pin.computeFrameJacobian(self._model, self._data, angle, self._frame, axes)
-        velocity = at[:3] + np.cross(at[3:], (point - origin)[:, None], axis=0)
-        return np.concatenate([velocity, at[3:]])
+        return np.concatenate(
+            [at[:3] + np.cross(at[3:], (point - origin)[:, None], axis=0), at[3:]]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearMotion:
-    """A motion along a line; s is the way of the leading joint.
-
-    q(s) = origin + direction * s, s' piecewise linear.
-    """
+    """A motion q(s) = origin + direction * s with a piecewise linear speed of s."""
 
     origin: Floats  # (n,) rad
     direction: Floats  # (n,) the leading joint's element is -1 or +1
@@ -92,15 +86,18 @@ class LinearMotion:
 
     def at(self, time: float) -> tuple[float, float]:
         """Return way and speed of the leading joint at a time since the start."""
-        way, speed = 0.0, 0.0
-        for duration, speed0, acceleration in self.pieces:
+        way = 0.0
+        for duration, speed, acceleration in self.pieces:
             t = min(time, duration)
-            way += speed0 * t + 0.5 * acceleration * t * t
-            speed = speed0 + acceleration * t
+            way += speed * t + 0.5 * acceleration * t * t
             if time < duration:
-                return way, speed
+                return way, speed + acceleration * t
             time -= duration
         return way, 0.0
+
+    def point(self, way: float) -> Floats:
+        """Return the joint angles (n,) there, rad."""
+        return self.origin + self.direction * way
 
     @property
     def length(self) -> float:
@@ -126,37 +123,28 @@ def line(origin: Floats, goal: Floats, speed: float, acceleration: float) -> Lin
 
 
 class Trajectory:
-    """Where the commanded arm is, and what has been told to it.
+    """Where the commanded arm is, and from which `side` (n,), -1 or +1, each joint came there.
 
-    Attributes:
-        q: (n,) rad.
-        qd: (n,) rad/s.
-        side: (n,) direction of each joint's last motion, -1 or +1.
-        arrivals: motions that have ended, in whatever way.
-        rest_time: world time at which the arm last came to rest.
-        rate: speed slider, 0 to 1; time along the path runs so much slower.
+    `arrivals` are motions that have ended, in whatever way; at `rate`, 0 to 1, the arm goes slower.
     """
 
     def __init__(self, q: Floats, side: Floats, arrivals: int, now: float) -> None:
-        """Start at rest."""
         self.q = np.array(q, dtype=np.float64)
         self.qd = np.zeros_like(self.q)
         self.side = np.array(side, dtype=np.float64)
-        self.arrivals = arrivals
-        self.rest_time = now
-        self.rate = 1.0
+        self.arrivals, self.rest_time, self.rate = arrivals, now, 1.0
         self._now = now
         self._segment: LinearMotion | None = None
         self._time = 0.0  # along the segment
         self._stands: float | None = None  # since when it stands within the segment, at rate 0
         self._stopping = False
-        self._next: tuple[Floats, float, float] | None = None
-        self._told: tuple[Floats, float, float] | None = None
+        self._next: Goal | None = None
+        self._goal: Goal | None = None
 
     @property
-    def told(self) -> tuple[Floats, float, float] | None:
-        """Goal, speed and acceleration of the motion that goes on and is not being stopped."""
-        return None if self._segment is None or self._stopping else self._told
+    def goal(self) -> Goal | None:
+        """That of the motion that goes on and is not being stopped."""
+        return None if self._segment is None or self._stopping else self._goal
 
     @property
     def moving(self) -> bool:
@@ -168,8 +156,7 @@ class Trajectory:
         """World time until the motion ends at the present rate, s; infinite at rate 0."""
         if self._segment is None:
             return 0.0
-        left = self._segment.duration - self._time
-        rate = 1.0 if self._stopping else self.rate
+        left, rate = self._segment.duration - self._time, 1.0 if self._stopping else self.rate
         return left / rate if rate > 0.0 else float("inf")
 
     def start(self, goal: Floats, speed: float, acceleration: float, now: float) -> None:
@@ -177,22 +164,18 @@ class Trajectory:
         self.advance(now)
         if self._segment is not None:
             self.stop(acceleration, now)
-            self._next = (goal, speed, acceleration)
-            return
-        self._begin(goal, speed, acceleration)
+            self._next = goal, speed, acceleration
+        else:
+            self._begin(goal, speed, acceleration)
 
     def place(self, q: Floats) -> None:
         """Stand at joint angles (n,), rad, at once: the arm was moved by hand."""
-        self._segment = self._next = None
-        self._stopping = False
+        self._segment, self._next, self._stopping = None, None, False
         self.q, self.qd = np.array(q, dtype=np.float64), np.zeros_like(self.q)
         self.arrivals += 1
 
     def stop(self, deceleration: float, now: float) -> None:
-        """Decelerate along the line, rad/s² of the leading joint, and forget what was next.
-
-        A motion that would have ended sooner by itself ends sooner.
-        """
+        """Decelerate along the line, rad/s² of the leading joint; forget what was next."""
         self.advance(now)
         self._next = None
         if self._segment is None:
@@ -200,7 +183,7 @@ class Trajectory:
         way, speed = self._segment.at(self._time)
         speed *= self.rate
         if speed <= 1e-9:
-            self.q = self._segment.origin + self._segment.direction * way
+            self.q = self._segment.point(way)
             self._end(now if self._stands is None else self._stands)
             return
         if not self._stopping:
@@ -208,17 +191,15 @@ class Trajectory:
             deceleration = max(deceleration, 0.5 * speed**2 / rest)
         elif deceleration <= -self._segment.pieces[0][2]:
             return  # a stop is never made slower
-        origin = self._segment.origin + self._segment.direction * way
         pieces = ((speed / deceleration, speed, -deceleration),)
-        self._segment = LinearMotion(origin, self._segment.direction, pieces)
+        self._segment = LinearMotion(self._segment.point(way), self._segment.direction, pieces)
         self._time, self._stopping = 0.0, True
 
     def advance(self, now: float) -> None:
         """Go on to a world time."""
         while self._segment is not None and now > self._now:
             rate = 1.0 if self._stopping else self.rate
-            step = (now - self._now) * rate
-            left = self._segment.duration - self._time
+            step, left = (now - self._now) * rate, self._segment.duration - self._time
             if rate > 0.0:
                 self._stands = None
             elif self._stands is None:
@@ -226,32 +207,23 @@ class Trajectory:
             if step < left:
                 self._time += step
                 way, speed = self._segment.at(self._time)
-                self.q = self._segment.origin + self._segment.direction * way
-                self.qd = self._segment.direction * speed * rate
+                self.q, self.qd = self._segment.point(way), self._segment.direction * speed * rate
                 break
-            self.q = self._segment.origin + self._segment.direction * self._segment.length
+            self.q = self._segment.point(self._segment.length)
             self._now += left / rate
             self._end(self._now)
         self._now = max(self._now, now)
 
     def publish(self, board: Blackboard, payload: float, com: Floats) -> None:
         """Write what the arm does, and the payload (kg, m) that its controller was told."""
-        board.write(
-            "arm",
-            alive=1.0,
-            q=self.q,
-            qd=self.qd,
-            side=self.side,
-            arrivals=self.arrivals,
-            moving=float(self.moving),
-            payload=payload,
-            payload_com=com,
-        )
+        state = {"q": self.q, "qd": self.qd, "side": self.side, "arrivals": self.arrivals}
+        carried = {"payload": payload, "payload_com": com}
+        board.write("arm", alive=1.0, moving=float(self.moving), **state, **carried)
 
     def _begin(self, goal: Floats, speed: float, acceleration: float) -> None:
         self._segment = line(self.q, goal, speed, acceleration)
         self._time, self._stopping, self._stands = 0.0, False, None
-        self._told = goal, speed, acceleration
+        self._goal = goal, speed, acceleration
         if self._segment is not None:
             moved = np.abs(goal - self.q) > _NOTHING
             self.side = np.where(moved, np.sign(goal - self.q), self.side)
@@ -261,10 +233,9 @@ class Trajectory:
         self.qd = np.zeros_like(self.q)
         self.arrivals += 1
         self.rest_time = when
-        if self._next is not None:
-            goal, speed, acceleration = self._next
-            self._next = None
-            self._begin(goal, speed, acceleration)
+        following, self._next = self._next, None
+        if following is not None:
+            self._begin(*following)
 
 
 class RobotMode(IntEnum):
@@ -305,13 +276,20 @@ class SafetyMode(IntEnum):
     ROBOT_EMERGENCY_STOP = 7
 
 
+_BITS = {
+    SafetyMode.NORMAL: Safety.NORMAL,
+    SafetyMode.PROTECTIVE_STOP: Safety.PROTECTIVE_STOP | Safety.STOPPED,
+    SafetyMode.ROBOT_EMERGENCY_STOP: (
+        Safety.ROBOT_EMERGENCY_STOP | Safety.EMERGENCY_STOP | Safety.STOPPED
+    ),
+}
+
+
 class WorldClock:
     """World time since this controller was switched on, and back to real time."""
 
     def __init__(self, board: Blackboard) -> None:
-        """Start at 0."""
-        self._start_ns = time.monotonic_ns()
-        self._scale = board.scale
+        self._start_ns, self._scale = time.monotonic_ns(), board.scale
 
     @property
     def now(self) -> float:
@@ -320,7 +298,7 @@ class WorldClock:
 
     def real_ns(self, now: float) -> int:
         """Return `time.monotonic_ns` at a world time."""
-        return self._start_ns + round(now / self._scale * 1e9)
+        return self._start_ns + round(self.real(now) * 1e9)
 
     def real(self, seconds: float) -> float:
         """Return how many real seconds so many world seconds take."""
@@ -329,7 +307,7 @@ class WorldClock:
 
 @dataclass(slots=True)
 class Registers:
-    """General-purpose registers; `inputs` are written by RTDE clients, `outputs` by scripts."""
+    """General-purpose registers; `in_` are written by RTDE clients, `out_` by scripts."""
 
     in_int: list[int] = field(default_factory=lambda: [0] * REGISTERS)
     in_double: list[float] = field(default_factory=lambda: [0.0] * REGISTERS)
@@ -350,8 +328,7 @@ class ArmState:
     registers: Registers = field(default_factory=Registers)
     payload: float = 0.0  # what the controller has been told, kg
     payload_com: Floats = field(default_factory=lambda: np.zeros(3))  # (3,) flange axes, m
-    tcp: Floats = field(default_factory=lambda: np.zeros(6))
-    """(6,) of the tool point on the flange, m and rad."""
+    tcp: Floats = field(default_factory=lambda: np.zeros(6))  # (6,) on the flange, m and rad
     robot_mode: RobotMode = RobotMode.RUNNING
     runtime: Runtime = Runtime.STOPPED
     safety_mode: SafetyMode = SafetyMode.NORMAL
@@ -360,8 +337,7 @@ class ArmState:
     slider: float = 1.0
     digital_outputs: int = 0  # RTDE `actual_digital_output_bits`
     refuses_motion: bool = False  # whether a motion that is commanded ends the program instead
-    frozen_q: Floats | None = None
-    """(n,) what the encoders tell in spite of any motion, rad; None is the truth."""
+    frozen_q: Floats | None = None  # (n,) told in spite of any motion, rad; None is the truth
     fault_ns: int = 0  # `time.monotonic_ns` of the last fault that was switched on
     input_ns: int = 0  # the same of the last input package
     log: deque[tuple[int, str]] = field(default_factory=lambda: deque(maxlen=2000))
@@ -370,13 +346,7 @@ class ArmState:
     @property
     def safety_bits(self) -> Safety:
         """RTDE `safety_status_bits`."""
-        match self.safety_mode:
-            case SafetyMode.PROTECTIVE_STOP:
-                return Safety.PROTECTIVE_STOP | Safety.STOPPED
-            case SafetyMode.ROBOT_EMERGENCY_STOP:
-                return Safety.ROBOT_EMERGENCY_STOP | Safety.EMERGENCY_STOP | Safety.STOPPED
-            case _:
-                return Safety.NORMAL
+        return _BITS[self.safety_mode]
 
     @property
     def program_state(self) -> str:

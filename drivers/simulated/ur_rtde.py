@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur.state import (
+from hilcal.drivers.simulated.ur_state import (
     GRAVITY,
     REGISTERS,
     ArmState,
@@ -28,8 +28,7 @@ from hilcal.types import Floats
 VERSION = 2
 NOT_FOUND = "NOT_FOUND"
 IN_USE = "IN_USE"
-HEADER = struct.Struct(">HB")
-"""Size of the whole frame in bytes, and its type."""
+HEADER = struct.Struct(">HB")  # size of the whole frame in bytes, and its type
 
 FORMATS = {
     "BOOL": "?",
@@ -122,82 +121,66 @@ class Recipe:
         """Return the recipe of variables of which each is in `table`."""
         names = tuple(names)
         kinds = tuple(table[name] for name in names)
-        layout = struct.Struct(">B" + "".join(FORMATS[kind] for kind in kinds))
-        return cls(number, names, kinds, layout)
-
-    def pack(self, values: Iterable[float]) -> bytes:
-        """Return the payload of a data frame; `values` are all numbers in order, flat."""
-        return self.layout.pack(self.number, *values)
+        return cls(number, names, kinds, struct.Struct(">B" + "".join(FORMATS[k] for k in kinds)))
 
     def unpack(self, payload: bytes) -> Iterator[tuple[str, float]]:
-        """Yield (name, first number) of each variable in the payload of a data frame.
-
-        Raises:
-            struct.error: the payload has another size.
-        """
-        numbers = iter(self.layout.unpack(payload)[1:])
+        """Yield (name, first number) of each variable in the payload of a data frame."""
+        numbers, at = self.layout.unpack(payload), 1
         for name, kind in zip(self.names, self.kinds, strict=True):
-            count = 3 if "3D" in kind else 6 if kind.startswith("VECTOR6") else 1
-            group = [next(numbers) for _ in range(count)]
-            yield name, group[0]
+            yield name, numbers[at]
+            at += int(FORMATS[kind][:-1] or 1)
 
 
 Numbers = tuple[float, ...]
 
 _ENCODER_STD = 3e-6  # rad, while the arm moves
 _SPEED_STD = 2e-4  # rad/s
+_CURRENT_STD = 0.02  # A
 # Torque per motor current at the joint, N·m/A: plausible for gear ratios of about 100.
 _TORQUE_PER_AMPERE = np.array([13.0, 13.0, 11.0, 9.0, 9.0, 9.0])
 _DEVIATION_STOP = 0.1  # rad at which a controller stops the arm (C153), a guess
-_CURRENT_STD = 0.02  # A
 _FRICTION = np.array([6.0, 6.0, 4.0, 1.2, 1.2, 1.2])  # N·m that a gear holds at rest, a guess
 _TEMPERATURES = np.array([29.0, 30.0, 30.5, 33.0, 34.0, 33.5])  # °C, a guess
 _FORCE_OFFSET = np.array([3.1, -2.4, 4.2, 0.12, -0.21, 0.08])  # N and N·m, flange axes
 _FORCE_STD = np.array([0.4, 0.4, 0.5, 0.02, 0.02, 0.01])
 _REGISTER = re.compile(r"output_(int|double)_register_(\d+)")
-_REAL = frozenset({"DOUBLE", "VECTOR3D", "VECTOR6D"})
-_ZEROS = {"VECTOR6D": 6, "VECTOR6INT32": 6, "VECTOR3D": 3}
-_POWERED = 253  # joint mode "running"
-_UNPOWERED = 239  # joint mode "power off"
+_POWERED, _UNPOWERED = (253.0,) * 6, (239.0,) * 6  # joint modes "running" and "power off"
+_FIXED = {
+    "actual_joint_voltage": (47.5,) * 6,
+    "actual_main_voltage": (48.0,),
+    "actual_robot_voltage": (48.0,),
+    "actual_robot_current": (0.5,),
+}
 
 
 class Sensors:
     """Values of one instant; `refresh` begins the next.
 
     Where nobody has written the truth, the arm is rigid and carries what it has been told.
-    The sensor in the flange is taken as aligned with the cell's force sensor.
     """
 
     def __init__(self, arm: ArmState, board: Blackboard, rng: np.random.Generator) -> None:
-        """Look into the world."""
         self._arm, self._board, self._rng = arm, board, rng
-        self._now = 0.0
-        self._known: dict[str, Numbers] = {}
-        self._truth = board.read("truth")
         self._places: dict[bytes, Floats] = {}
         self._readers = self._table()
+        self.refresh()
 
     def refresh(self) -> None:
         """Forget the last instant."""
         self._now = self._arm.clock.now
-        self._known = {}
+        self._known: dict[str, Numbers] = {}
         self._truth = self._board.read("truth")
 
     def value(self, name: str) -> Numbers:
         """Return the numbers of an output variable at this instant."""
         if name not in self._known:
-            found = self._read(name)
-            numbers = found.tolist() if isinstance(found, np.ndarray) else map(float, found)
-            self._known[name] = tuple(numbers)
+            self._known[name] = tuple(np.asarray(self._read(name), dtype=float).tolist())
         return self._known[name]
-
-    def integers(self, name: str) -> tuple[int, ...]:
-        """Return the same where its type is a whole number."""
-        return tuple(int(x) for x in self.value(name))
 
     def packed(self, name: str) -> tuple[float, ...]:
         """Return the numbers as `struct` wants them."""
-        return self.value(name) if OUTPUTS[name] in _REAL else self.integers(name)
+        values = self.value(name)
+        return values if FORMATS[OUTPUTS[name]].endswith("d") else tuple(map(int, values))
 
     def _read(self, name: str) -> Floats | Numbers:
         if name in self._readers:
@@ -207,37 +190,31 @@ class Sensors:
             registers = self._arm.registers
             file = registers.out_int if register[1] == "int" else registers.out_double
             return (file[int(register[2])],)
-        return (0.0,) * _ZEROS.get(OUTPUTS[name], 1)
+        return _FIXED.get(name) or (0.0,) * int(FORMATS[OUTPUTS[name]][:-1] or 1)
+
+    def _array(self, name: str) -> Floats:
+        return np.array(self.value(name))
 
     def _table(self) -> dict[str, Callable[[], Floats | Numbers]]:
         arm, motion = self._arm, self._arm.trajectory
-        powered = (_POWERED,) * 6, (_UNPOWERED,) * 6
         return {
             "timestamp": lambda: (self._now,),
             "actual_q": self._q,
             "target_q": lambda: motion.q,
-            "actual_qd": lambda: (
-                motion.qd + self._noise(_SPEED_STD) if motion.moving else motion.qd
-            ),
+            "actual_qd": lambda: motion.qd + motion.moving * self._noise(_SPEED_STD),
             "target_qd": lambda: motion.qd,
             "target_moment": self._torque,
             "target_current": self._target_current,
-            "actual_current": lambda: (
-                np.array(self.value("target_current")) + self._noise(_CURRENT_STD)
-            ),
+            "actual_current": lambda: self._array("target_current") + self._noise(_CURRENT_STD),
             "actual_current_as_torque": self._measured_torque,
             "joint_control_output": self._target_current,
             "joint_temperatures": lambda: (
-                self._truth["joint_temperature"] if self._is_told else _TEMPERATURES
+                self._truth["joint_temperature"] if self._has_truth else _TEMPERATURES
             ),
-            "joint_mode": lambda: powered[arm.robot_mode is not RobotMode.RUNNING],
-            "actual_joint_voltage": lambda: (47.5,) * 6,
-            "actual_main_voltage": lambda: (48.0,),
-            "actual_robot_voltage": lambda: (48.0,),
-            "actual_robot_current": lambda: (0.5,),
-            "actual_TCP_pose": lambda: self._tool_pose(np.array(self.value("actual_q"))),
+            "joint_mode": lambda: _POWERED if self._powered else _UNPOWERED,
+            "actual_TCP_pose": lambda: self._tool_pose(self._array("actual_q")),
             "target_TCP_pose": lambda: self._tool_pose(motion.q),
-            "actual_TCP_speed": lambda: self._tool_speed(np.array(self.value("actual_qd"))),
+            "actual_TCP_speed": lambda: self._tool_speed(self._array("actual_qd")),
             "target_TCP_speed": lambda: self._tool_speed(motion.qd),
             "actual_TCP_force": self._tool_force,
             "ft_raw_wrench": self._wrench,
@@ -259,45 +236,39 @@ class Sensors:
         }
 
     @property
-    def _is_told(self) -> bool:
+    def _powered(self) -> bool:
+        return self._arm.robot_mode is RobotMode.RUNNING
+
+    @property
+    def _has_truth(self) -> bool:
         """Whether somebody tells the truth."""
         return bool(self._truth["flange"][3, 3] == 1.0)
 
-    @property
-    def _at_rest(self) -> bool:
-        """Whether the truth is that of the arm where it rests."""
-        motion = self._arm.trajectory
-        same = int(self._truth["arrivals"]) == motion.arrivals
-        return self._is_told and same and not motion.moving
-
     def _q(self) -> Floats:
+        motion = self._arm.trajectory
         if self._arm.frozen_q is not None:
             return self._arm.frozen_q
-        if self._at_rest:
+        rests = int(self._truth["arrivals"]) == motion.arrivals and not motion.moving
+        if self._has_truth and rests:
             return np.asarray(self._truth["encoder"])
-        return self._arm.trajectory.q + self._noise(_ENCODER_STD)
+        return motion.q + self._noise(_ENCODER_STD)
 
     def _deviation(self) -> Numbers:
         """Largest deviation of a joint from its command, over the one that stops the arm."""
-        off = np.abs(np.array(self.value("actual_q")) - np.array(self.value("target_q")))
+        off = np.abs(self._array("actual_q") - self._array("target_q"))
         return (float(off.max() / _DEVIATION_STOP),)
 
     def _torque(self) -> Floats:
-        if self._is_told:
+        if self._has_truth:
             return np.asarray(self._truth["drive_torque"])
         arm = self._arm
         return arm.kinematics.weight_torque(arm.trajectory.q, arm.payload, arm.payload_com)
 
     def _target_current(self) -> Floats:
-        if self._arm.robot_mode is not RobotMode.RUNNING:
-            return np.zeros(6)
-        return np.asarray(np.array(self.value("target_moment")) / _TORQUE_PER_AMPERE)
+        return np.asarray(self._powered * self._array("target_moment") / _TORQUE_PER_AMPERE)
 
     def _measured_torque(self) -> Floats:
-        """What the drives exert: against load and weight, and against the friction of the arrival.
-
-        A gear that has stopped on its way in direction s keeps on being pushed in it.
-        """
+        """What the drives exert against load, weight, and the friction of the arrival."""
         held = _FRICTION[: len(self._torque())] * self._arm.trajectory.side - self._torque()
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
@@ -315,23 +286,23 @@ class Sensors:
     def _weight(self) -> Floats:
         """Wrench of the payload that has been told, at the flange, flange axes."""
         arm = self._arm
-        turn = self._flange(arm.trajectory.q)[:3, :3]
-        force = arm.payload * (turn.T @ GRAVITY)
+        force = arm.payload * (self._flange(arm.trajectory.q)[:3, :3].T @ GRAVITY)
         return np.concatenate([force, np.cross(arm.payload_com, force)])
 
     def _wrench(self) -> Floats:
         """What the sensor in the flange feels, flange axes, with its offset and noise."""
-        felt = self._truth["sensor_wrench"] if self._is_told else self._weight()
+        felt = self._truth["sensor_wrench"] if self._has_truth else self._weight()
         return np.asarray(felt + _FORCE_OFFSET + _FORCE_STD * self._rng.standard_normal(6))
 
     def _tool_force(self) -> Floats:
         """Remainder after the compensation of the payload, at the tool point, base axes."""
-        left = np.array(self.value("ft_raw_wrench")) - self._weight()
+        left = self._array("ft_raw_wrench") - self._weight()
         turn = self._flange(self._arm.trajectory.q)[:3, :3]
         moment = left[3:] - np.cross(self._arm.tcp[:3], left[:3])
         return np.concatenate([turn @ left[:3], turn @ moment])
 
     def _flange(self, q: Floats) -> Floats:
+        """T_base_flange; a few variables of one instant ask for the same ones."""
         key = q.tobytes()
         if key not in self._places:
             if len(self._places) > 4:
@@ -343,8 +314,7 @@ class Sensors:
         return np.asarray(std * self._rng.standard_normal(6))
 
 
-FREQUENCY = 500.0
-"""Of the controller, Hz."""
+FREQUENCY = 500.0  # of the controller, Hz
 _DIGITAL_OUTPUTS = {"standard": (0, 0xFF), "configurable": (8, 0xFF), "tool": (16, 3)}
 """First bit in `actual_digital_output_bits` and mask of each group; UR, "RTDE guide"."""
 _INT, _DOUBLE = "input_int_register_", "input_double_register_"
@@ -372,7 +342,7 @@ class RtdeLinks:
     owners: dict[str, "RtdeLink"] = field(default_factory=dict)
     """Which connection may write an input variable."""
 
-    def due(self, now: float) -> float:
+    def due(self) -> float:
         """Return when the next package is due, real time in s; infinite where none is."""
         return min((link.due for link in self.links if link.started), default=float("inf"))
 
@@ -395,13 +365,11 @@ class RtdeLink:
     def __init__(
         self, links: RtdeLinks, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
-        """Take over an accepted connection."""
         self._links, self._reader, self.writer = links, reader, writer
         self._recipes: dict[int, Recipe] = {}
         self._out: Recipe | None = None
         self._period = 1.0 / FREQUENCY
-        self.started = False
-        self.due = float("inf")
+        self.started, self.due = False, float("inf")
 
     async def run(self) -> None:
         """Serve the client until it goes."""
@@ -443,9 +411,8 @@ class RtdeLink:
     def _data(self) -> bytes:
         if self._out is None:
             return frame("U", b"\0" * 20)
-        sensors = self._links.sensors
-        numbers = [x for name in self._out.names for x in sensors.packed(name)]
-        return frame("U", self._out.pack(numbers))
+        numbers = [x for name in self._out.names for x in self._links.sensors.packed(name)]
+        return frame("U", self._out.layout.pack(self._out.number, *numbers))
 
     def _write(self, data: bytes) -> None:
         if self.writer.is_closing():
@@ -456,27 +423,23 @@ class RtdeLink:
             self.writer.transport.abort()
 
     def _take(self, kind: str, body: bytes) -> None:
-        match kind:
-            case "V":
-                (version,) = struct.unpack(">H", body)
-                self._write(frame("V", bytes([version == VERSION])))
-            case "v":
-                self._write(frame("v", struct.pack(">4I", *self._links.arm.version)))
-            case "O":
-                self._write(frame("O", self._outputs(body)))
-            case "I":
-                self._write(frame("I", self._inputs(body)))
-            case "S":
-                self.started = self._out is not None
-                self.due = time.monotonic()
-                self._write(frame("S", b"\x01"))
-            case "P":
-                self.started = False
-                self._write(frame("P", b"\x01"))
-            case "U":
-                self._input(body)
-            case _:
-                self._links.arm.note(f"rtde package {kind!r} ignored")
+        arm = self._links.arm
+        if kind == "U":
+            self._input(body)
+        elif kind == "S":
+            self.started, self.due = self._out is not None, time.monotonic()
+            self._write(frame("S", b"\x01"))
+        elif kind == "P":
+            self.started = False
+            self._write(frame("P", b"\x01"))
+        elif kind == "V":
+            self._write(frame("V", bytes([struct.unpack(">H", body)[0] == VERSION])))
+        elif kind == "v":
+            self._write(frame("v", struct.pack(">4I", *arm.version)))
+        elif kind in "OI":
+            self._write(frame(kind, (self._outputs if kind == "O" else self._inputs)(body)))
+        else:
+            arm.note(f"rtde package {kind!r} ignored")
 
     def _outputs(self, body: bytes) -> bytes:
         (frequency,) = struct.unpack_from(">d", body)
@@ -492,14 +455,8 @@ class RtdeLink:
     def _inputs(self, body: bytes) -> bytes:
         names = [name for name in body.decode("ascii").split(",") if name]
         owners = self._links.owners
-        kinds = [
-            NOT_FOUND
-            if name not in INPUTS
-            else IN_USE
-            if owners.get(name, self) is not self
-            else INPUTS[name]
-            for name in names
-        ]
+        taken = {name: IN_USE for name in names if owners.get(name, self) is not self}
+        kinds = [(INPUTS | taken).get(name, NOT_FOUND) for name in names]
         number = 0
         if NOT_FOUND not in kinds and IN_USE not in kinds:
             number = len(self._recipes) + 1
@@ -520,8 +477,7 @@ class RtdeLink:
         for name, value in values.items():
             if name.startswith(_INT):
                 k = int(name.removeprefix(_INT))
-                arm.registers.in_int[k] = int(value)
-                arm.registers.written_ns[k] = now
+                arm.registers.in_int[k], arm.registers.written_ns[k] = int(value), now
             elif name.startswith(_DOUBLE):
                 arm.registers.in_double[int(name.removeprefix(_DOUBLE))] = value
         if values.get("speed_slider_mask") and "speed_slider_fraction" in values:

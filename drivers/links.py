@@ -1,22 +1,23 @@
-"""A serial port opened for this program alone; whatever goes wrong is one clear line.
+"""Serial ports and network addresses of instruments; whatever goes wrong is one clear line.
 
-For a driver: `port = open_port("tracker", path, 19200)`, then every read and write inside
-`with line_failures("tracker", path):`. pyserial reports an unplugged adapter as
-SerialException (read, write), OSError (in_waiting) or termios.error (reset_input_buffer), the
-last of which is not an OSError; all of them become DeviceError here.
+Every read and write of a driver is inside `with line_failures(device, path):` or
+`network_failures`. pyserial reports an unplugged adapter as SerialException (read, write), OSError
+(in_waiting) or termios.error (reset_input_buffer), which is no OSError: all become DeviceError.
 """
 
 import contextlib
 import errno
 import os
+import re
 import termios
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 import serial
 
+from hilcal.config.cell import Tracker
 from hilcal.errors import DeviceError, InputError
 
 BY_ID = Path("/dev/serial/by-id")
@@ -24,16 +25,7 @@ BY_ID = Path("/dev/serial/by-id")
 
 
 def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial.Serial:
-    """Open a serial port, 8N1, raw, locked against every other program that asks.
-
-    `device` is its part in the cell, for messages; `baud` the rate, Bd; `timeout` of reads and
-    writes, s.
-
-    Raises:
-        DeviceError: there is no such port, it is in use by another program, may not be used, or
-            is no serial port; the line names the port and what to do.
-        InputError: no port has this rate.
-    """
+    """Open a serial port, 8N1, raw, locked against every other program that asks."""
     try:
         return serial.Serial(
             path, baud, timeout=timeout, write_timeout=max(timeout, 0.5), exclusive=True
@@ -48,11 +40,7 @@ def open_port(device: str, path: str, baud: int, timeout: float = 0.5) -> serial
 
 @contextlib.contextmanager
 def line_failures(device: str, path: str) -> Iterator[None]:
-    """Turn whatever pyserial and termios raise on a broken line into DeviceError.
-
-    Raises:
-        DeviceError: the adapter is gone, or the port failed otherwise.
-    """
+    """Turn whatever pyserial and termios raise on a broken line into DeviceError."""
     try:
         yield
     except serial.SerialTimeoutException:
@@ -79,14 +67,7 @@ def drain(port: serial.Serial, quiet: float, limit: float) -> bool:
     return False
 
 
-class Closable(Protocol):
-    """What can be closed."""
-
-    def close(self) -> None:
-        """Close it."""
-
-
-def close_port(port: Closable) -> None:
+def close_port(port: Any) -> None:
     """Give the port back, whatever state it is in. Never raises, may be called twice."""
     with contextlib.suppress(OSError, termios.error):
         port.close()
@@ -120,3 +101,51 @@ def _ports() -> str:
     """Names of the adapters that are plugged in, for a message."""
     names = sorted(map(str, BY_ID.iterdir())) if BY_ID.is_dir() else []
     return f"plugged in: {', '.join(names[:4])}" if names else f"{BY_ID} lists no adapter"
+
+
+_ADDRESS = re.compile(r"([\w.-]+)(?::(\d{1,5}))?")
+
+
+def address(section: str, driver: str, host: str | None, port: int) -> tuple[str, int]:
+    """Return the host and the port of an instrument: "address" or "address:port"."""
+    if host is None:
+        raise InputError(
+            f'{section} driver = "{driver}" lacks "host": the address of the instrument in the '
+            f'network, e.g. "192.168.0.1" (port {port}) or "192.168.0.1:{port}"'
+        )
+    match = _ADDRESS.fullmatch(host)
+    if match is None or not 0 < int(match[2] or port) < 1 << 16:
+        raise InputError(
+            f'{section} host = "{host}" is no address; valid: e.g. "192.168.0.1" (port {port}) or '
+            f'"192.168.0.1:{port}"'
+        )
+    return match[1], int(match[2] or port)
+
+
+@contextlib.contextmanager
+def network_failures(device: str, where: str) -> Iterator[None]:
+    """Turn what sockets raise into DeviceError."""
+    try:
+        yield
+    except TimeoutError:
+        raise DeviceError(
+            f"{device} at {where}: no answer; is it switched on, in this network, and not busy?"
+        ) from None
+    except ConnectionRefusedError:
+        raise DeviceError(
+            f"{device} at {where}: it refuses the connection; is this its address and its port?"
+        ) from None
+    except OSError as error:
+        said = error.strerror or str(error)
+        raise DeviceError(f"{device} at {where}: the connection failed ({said})") from None
+
+
+def own_axes(tracker: Tracker, driver: str, port: int) -> tuple[str, int]:
+    """Return host and port of a tracker that measures in its own axes."""
+    found = address("[tracker]", driver, tracker.host, port)
+    if tracker.frame != "tracker":
+        raise InputError(
+            f'[tracker] frame = "{tracker.frame}": this instrument measures in its own axes; it '
+            'must be "tracker"'
+        )
+    return found
