@@ -23,7 +23,7 @@ from hilcal.store.plan import load_plan
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
-from tests.unit.design.test_many_poses import fine_error
+from tests.unit.design.test_next import fine_error
 
 Capsys = pytest.CaptureFixture[str]
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"

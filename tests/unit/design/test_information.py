@@ -33,7 +33,7 @@ from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.posterior import Posterior
 from hilcal.measuring.clearance import LineOfSight, clearance_of
 from hilcal.measuring.devices import TrackerSample
-from hilcal.measuring.dry_run import seconds_at_rest
+from hilcal.measuring.route import seconds_at_rest
 from hilcal.measuring.measure import average
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.chain import evaluate

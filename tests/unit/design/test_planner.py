@@ -29,7 +29,7 @@ from hilcal.design.predicted import predicted
 from hilcal.design.summary import remarks, summarise
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.dry_run import dry_run
+from hilcal.measuring.route import dry_run
 from hilcal.readings.covariance import WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, UNLOADED, load_plan, read_plan, with_new_names
