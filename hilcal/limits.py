@@ -124,11 +124,7 @@ class Lines:
         return self
 
     def __next__(self) -> str:
-        """Return the next line; a row in quotes may have several.
-
-        Raises:
-            InputError: the row is too long.
-        """
+        """Return the next line; a row in quotes may have several."""
         line = self._stream.readline(LINE + 1)
         self._taken += len(line)
         if self._taken > LINE:

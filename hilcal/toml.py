@@ -46,11 +46,7 @@ def load_section(path: Path, section: type[S]) -> S:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file as a dictionary.
-
-    Raises:
-        InputError: unreadable file, not UTF-8, or a syntax error (names the line).
-    """
+    """Read a TOML file as a dictionary."""
     try:
         text = limits.read_text(path, limits.SETTINGS)
     except FileNotFoundError:
@@ -80,11 +76,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _check_whole(data: dict[str, Any], where: str) -> None:
-    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones.
-
-    Raises:
-        InputError: one of more than 64 bits.
-    """
+    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones."""
     pending: list[Any] = [data]
     while pending:
         inner = pending.pop()

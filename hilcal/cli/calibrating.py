@@ -322,11 +322,7 @@ class CalibrationOperator:
         self._ready = False
 
     def to_the_end(self) -> None:
-        """Do all steps that are left but the comparison.
-
-        Raises:
-            StoppedError: somebody does not want the arm to move.
-        """
+        """Do all steps that are left but the comparison."""
         while (step := self._p.next()).kind not in ("done", "compare"):
             self._t.show(step_heading(step, self._clock))
             if step.moves:

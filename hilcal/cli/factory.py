@@ -32,14 +32,7 @@ def factory_check(
     output: Path,
     yes: bool,
 ) -> dict[str, object]:
-    """Measure into a campaign, or take one that is there, and say what it tells of the arm.
-
-    Raises:
-        InputError: no kinematics are known, or the campaign is no such one.
-        StoppedError: the person does not want the arm to move.
-        DeviceError: a device failed; what was measured is stored.
-        CannotAnswerError: the readings do not determine the frames.
-    """
+    """Measure into a campaign, or take one that is there, and say what it tells of the arm."""
     factory = told_by(answers) or cell.factory
     if factory is None:
         raise InputError(

@@ -80,11 +80,7 @@ def called(number: int | None) -> str:
 
 
 def mode_of_option(run: Campaign, asked: str | None) -> Mode:
-    """Kind of readings: as asked, else as in the latest revision, else what they allow.
-
-    Raises:
-        InputError: an unknown kind.
-    """
+    """Kind of readings: as asked, else as in the latest revision, else what they allow."""
     if asked is None:
         return run.mode()
     for known in MODES:
@@ -94,11 +90,7 @@ def mode_of_option(run: Campaign, asked: str | None) -> Mode:
 
 
 def scalings(name: str) -> tuple[Scaling, ...]:
-    """Return the scalings that `--scaling` asks for; the one that is kept comes last.
-
-    Raises:
-        InputError: lists the valid ones.
-    """
+    """Return the scalings that `--scaling` asks for; the one that is kept comes last."""
     if name == "all":
         return SCALINGS
     found = tuple(s for s in SCALINGS if s == name)
@@ -108,12 +100,7 @@ def scalings(name: str) -> tuple[Scaling, ...]:
 
 
 def wanted_effects(given: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
-    """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`.
-
-    Raises:
-        InputError: an unknown name (lists the valid ones), one that is there twice, or options
-            that cannot be read.
-    """
+    """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`."""
     if given is None:
         return None
     wanted = read_effects_text(given, "--effects", catalogue)
@@ -132,11 +119,7 @@ def effect_names(asked: str | None, catalogue: Catalogue) -> tuple[str, ...] | N
 
 
 def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
-    """Refuse options of effects before any work is done.
-
-    Raises:
-        InputError: an unknown option, a bad value, or readings that lack what an effect needs.
-    """
+    """Refuse options of effects before any work is done."""
     for name, options in wanted.items():
         o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
 
@@ -160,11 +143,7 @@ def titles(model: Model, readings: Readings) -> tuple[str, ...]:
 
 
 def check_record(path: Path | None) -> None:
-    """Refuse a recording that cannot be written before any work is done.
-
-    Raises:
-        InputError: no such folder.
-    """
+    """Refuse a recording that cannot be written before any work is done."""
     if path is not None:
         check_folder(path, f"--record {path}")
 
@@ -190,12 +169,7 @@ class PriorOptions:
     drift: str | None
 
     def load(self, catalogue: Catalogue) -> CarriedPrior | None:
-        """Return the prior; None where none is asked for.
-
-        Raises:
-            InputError: a file or an option that cannot be.
-            CannotAnswerError: a campaign that taught nothing of its arm.
-        """
+        """Return the prior; None where none is asked for."""
         if self.path is None:
             if self.drift is not None:
                 raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
@@ -210,11 +184,7 @@ class PriorOptions:
 
 
 def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
-    """Return a fit of the same effects and those of a prior, with it; nothing is stored.
-
-    Raises:
-        InputError: a fit that has a prior already, or a prior that is not one of these readings.
-    """
+    """Return a fit of the same effects and those of a prior, with it; nothing is stored."""
     if found.model.prior is not None:
         known = found.model.prior.posterior.source.campaign or "a posterior"
         raise InputError(f"the revision has a prior already, {known}; leave out --prior")

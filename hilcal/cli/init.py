@@ -51,11 +51,7 @@ class Draft:
     data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
 
     def set(self, section: str, **values: object) -> None:
-        """Set keys of a section.
-
-        Raises:
-            InputError: a value that is not valid; nothing is set then.
-        """
+        """Set keys of a section."""
         data = deepcopy(self.data)
         data.setdefault(section, {}).update(values)
         self._take(data)
@@ -135,11 +131,7 @@ def number(words: str, unit: str) -> float:
 
 
 def vector(words: str, unit: str) -> list[float]:
-    """Read three numbers, in `unit`, or each or all with the one behind it or them.
-
-    Raises:
-        InputError: they are not three.
-    """
+    """Read three numbers, in `unit`, or each or all with the one behind it or them."""
     found = _quantities(words, unit)
     if len(found) != 3:
         many = f"{len(found)} number{'s' * (len(found) != 1)}"

@@ -85,11 +85,7 @@ Force = Annotated[bool, option("--force", "Replace an existing file.")]
 
 
 def catalogue_with(paths: list[Path] | None) -> Catalogue:
-    """Return the installed effects and those of files.
-
-    Raises:
-        InputError: a file, or an effect in it, that cannot be used.
-    """
+    """Return the installed effects and those of files."""
     found = installed()
     for path in paths or ():
         found = found.with_file(path)
@@ -123,11 +119,7 @@ def one_by_default(workers: int | None, scheduler: str | None) -> tuple[int | No
 def check_workers(
     workers: int | None, scheduler: str | None, effects_from: list[Path] | None
 ) -> int | None:
-    """Return the number of processes: this one alone with effects of a file.
-
-    Raises:
-        InputError: others are asked for, which do not have its effects.
-    """
+    """Return the number of processes: this one alone with effects of a file."""
     if effects_from and (scheduler is not None or workers not in (None, 1)):
         raise InputError("--effects-from: other processes do not have its effects; --workers 1")
     return 1 if effects_from else workers

@@ -291,11 +291,7 @@ def answer_json(answer: ConnectionResult) -> dict[str, object]:
 
 
 def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
-    """Refuse to run with devices that are not ready.
-
-    Raises:
-        DeviceError: lists all problems.
-    """
+    """Refuse to run with devices that are not ready."""
     if lines := [problem for answer in answers for problem in answer.problems]:
         raise DeviceError("; ".join(lines))
 

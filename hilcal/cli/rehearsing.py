@@ -110,10 +110,6 @@ def on_devices(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
 
     The drivers are the real ones; what they talk to are the simulated devices of one world, each
     a process of its own.
-
-    Raises:
-        InputError: an unknown choice, or a cell without loads.
-        DeviceError: a device failed.
     """
     with ExitStack() as stack:
         with working(t.progress) as say:
@@ -190,9 +186,6 @@ def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int])
 
     A busy computer gives a simulated device no turn for a while, which is the same to the driver
     as a device that fails. `done` tells how many readings there are.
-
-    Raises:
-        DeviceError: it failed `TRIES` times on end without a further reading.
     """
     left, before = TRIES, done()
     while True:

@@ -237,11 +237,6 @@ def measure(
 
     With a goal it is only as much as that needs; nothing where it is met already. The campaign's
     time counts from `epoch`, a time of day in s, where that is given. A live viewer is told all.
-
-    Raises:
-        DeviceError: a device failed; the arm stands, and what was measured is stored.
-        InputError: the plan does not pass.
-        KeyboardInterrupt: somebody stopped it; the same holds.
     """
     log = RunLog(campaign)
     stored = log.readings()

@@ -145,11 +145,7 @@ def show_preview(
     t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
     force: bool,
 ) -> None:  # fmt: skip
-    """Print what a table seems to hold; write the mapping file where one is asked for.
-
-    Raises:
-        InputError: a file that cannot be read, or an output that exists.
-    """
+    """Print what a table seems to hold; write the mapping file where one is asked for."""
     if output is not None and output.suffix != ".toml":
         raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
     if output is not None:

@@ -306,11 +306,7 @@ class Repeatability(Section):
     )
 
     def per_joint(self, n: int) -> Floats:
-        """Return (n,) standard deviations, rad.
-
-        Raises:
-            InputError: the number of values is not the arm's number of joints.
-        """
+        """Return (n,) standard deviations, rad."""
         values = np.asarray(self.joint_std_rad, dtype=np.float64)
         if values.ndim == 1 and len(values) != n:
             raise InputError(

@@ -44,35 +44,22 @@ NOT_SET = "not set"
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key.
-
-    Attributes:
-        unit: of its value; "" for texts, choices and tables.
-        default: as it is written in TOML, `REQUIRED` or `NOT_SET`.
-        valid: what its value must be.
-        example: a line of TOML.
-    """
+    """One key."""
 
     name: str
-    unit: str
-    default: str
-    valid: str
-    example: str
+    unit: str  # of its value; "" for texts, choices and tables
+    default: str  # as it is written in TOML, `REQUIRED` or `NOT_SET`
+    valid: str  # what its value must be
+    example: str  # a line of TOML
 
 
 @dataclass(frozen=True, slots=True)
 class KeyTable:
-    """One section of CELL.toml.
+    """One section of CELL.toml."""
 
-    Attributes:
-        name: e.g. "tracker".
-        header: as it is written, e.g. "[tracker]" or "[[loads]]".
-        about: what it is for, one line.
-    """
-
-    name: str
-    header: str
-    about: str
+    name: str  # e.g. "tracker"
+    header: str  # as it is written, e.g. "[tracker]" or "[[loads]]"
+    about: str  # what it is for, one line
     keys: tuple[Key, ...]
 
 

@@ -65,12 +65,7 @@ class Cluster:
 
 @contextmanager
 def cluster(address: str) -> Iterator[Cluster]:
-    """Yield a connection to a cluster.
-
-    Raises:
-        InputError: an address that is none; certificates that are not there.
-        ClusterError: nothing answers at the address.
-    """
+    """Yield a connection to a cluster."""
     with _quiet():
         from distributed import Client
 

@@ -42,19 +42,7 @@ class Engine:
         seed: int | None = None,
         advance: Advance | None = None,
     ) -> tuple[Result, ...]:
-        """Return function(item) of every item, in order of the items.
-
-        Args:
-            function: of a module, which workers find by its name, or a `partial` of one. It must
-                depend on its arguments alone.
-            items: what it is called with.
-            seed: with a seed the function is called with a generator of its own as well:
-                function(item, generator).
-            advance: told 1 for each item that is done.
-
-        Raises:
-            ClusterError: the cluster is gone, or an item ended every worker that computed it.
-        """
+        """Return function(item) of every item, in order of the items."""
         found: dict[int, Result] = {}
         for k, result in self.results(function, items, seed):
             found[k] = result

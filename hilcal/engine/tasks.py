@@ -62,11 +62,7 @@ class Task:
     versions: Versions  # of the program that asked
 
     def __call__(self, item: Any, seed: np.random.SeedSequence | None = None) -> Any:
-        """Compute one item.
-
-        Raises:
-            InputError: this worker has other versions than the program that asked.
-        """
+        """Compute one item."""
         for (name, there), (_, here) in zip(self.versions, versions(), strict=True):
             if there != here:
                 raise InputError(

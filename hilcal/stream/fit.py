@@ -149,50 +149,31 @@ class StreamFit(WithVarianceFactor):
     """A model fitted to a stream.
 
     Attributes:
-        model: robot and effects.
-        sample: the fit of the sample that it started from.
-        theta: (P,) parameters.
-        covariance: (P, P) of the parameters, widened where the residual is larger than noise.
-        std: (P,) standard uncertainties; infinite where not identifiable.
-        identifiable: (P,) which parameters the data determine.
-        estimated: (P,) which were not held at zero.
-        null: names of the unidentifiable directions.
-        inflated: whether the residual is larger than noise.
-        readings: number of readings of the stream.
-        chi2: whitened sum of squares.
-        dof: degrees of freedom.
-        rank: number of directions that the data determine.
         condition: condition number of the whitened columns, in physical units and scaled.
-        error: error block of the fit.
-        holdout: the same, each tenth of the stream predicted without it.
-        noise_floor: rms position error by the stated noise alone, m.
-        outliers: number of readings set aside as gross errors.
         named: (row in the file, from 1; Mahalanobis distance) of the worst of them.
-        passes: passes over the stream.
-        converged: whether the last step was negligible.
     """
 
-    model: Model
-    sample: Fit
-    theta: Floats
-    covariance: Floats
-    std: Floats
-    identifiable: Bools
-    estimated: Bools
-    null: tuple[str, ...]
-    inflated: bool
-    readings: int
-    chi2: float
-    dof: float
-    rank: int
+    model: Model  # robot and effects
+    sample: Fit  # the fit of the sample that it started from
+    theta: Floats  # (P,) parameters
+    covariance: Floats  # (P, P) of the parameters, widened where the residual is larger than noise
+    std: Floats  # (P,) standard uncertainties; infinite where not identifiable
+    identifiable: Bools  # (P,) which parameters the data determine
+    estimated: Bools  # (P,) which were not held at zero
+    null: tuple[str, ...]  # names of the unidentifiable directions
+    inflated: bool  # whether the residual is larger than noise
+    readings: int  # number of readings of the stream
+    chi2: float  # whitened sum of squares
+    dof: float  # degrees of freedom
+    rank: int  # number of directions that the data determine
     condition: tuple[float, float]
-    error: ErrorBlock
-    holdout: ErrorBlock
-    noise_floor: float
-    outliers: int
+    error: ErrorBlock  # error block of the fit
+    holdout: ErrorBlock  # the same, each tenth of the stream predicted without it
+    noise_floor: float  # rms position error by the stated noise alone, m
+    outliers: int  # number of readings set aside as gross errors
     named: tuple[tuple[int, float], ...]
-    passes: int
-    converged: bool
+    passes: int  # passes over the stream
+    converged: bool  # whether the last step was negligible
 
     @property
     def parameters(self) -> Estimates:

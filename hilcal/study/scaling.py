@@ -39,34 +39,25 @@ class StudyCell:
     """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
 
     Attributes:
-        scaling: "none", "gu" or "gc".
-        correlation: share ρ of each element's variance that is common to the elements.
-        unit: units that the deflections were written in.
-        shared_unloaded: whether the loads of a pose share one unloaded reading.
         error_over_bound: root mean square over runs and parameters of the error of a parameter
             in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
-        error_over_bound_mc: of it.
-        coverage: share of the stated 95 % intervals that hold the true parameter.
-        coverage_mc: of it.
         variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
             no meaning.
-        parameter_error_over_bound: (n,) the same per parameter.
-        parameter_coverage: (n,) the same per parameter.
         unit_shift: largest change of any estimate in any run against the first unit, in
             units of the bound.
     """
 
-    scaling: Scaling
-    correlation: float
-    unit: str
-    shared_unloaded: bool
+    scaling: Scaling  # "none", "gu" or "gc"
+    correlation: float  # share ρ of each element's variance that is common to the elements
+    unit: str  # units that the deflections were written in
+    shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
     error_over_bound: float
-    error_over_bound_mc: float
-    coverage: float
-    coverage_mc: float
+    error_over_bound_mc: float  # of it
+    coverage: float  # share of the stated 95 % intervals that hold the true parameter
+    coverage_mc: float  # of it
     variance_factor: float | None
-    parameter_error_over_bound: tuple[float, ...]
-    parameter_coverage: tuple[float, ...]
+    parameter_error_over_bound: tuple[float, ...]  # (n,) the same per parameter
+    parameter_coverage: tuple[float, ...]  # (n,) the same per parameter
     unit_shift: float
 
 
@@ -75,19 +66,15 @@ class ScalingStudy:
     """The study's cells and what they were made of.
 
     Attributes:
-        arm: name of the arm.
-        runs: Monte-Carlo runs per cell.
-        poses: number of poses.
-        loads: wrenches per pose.
         typical_correlation: the ρ whose mean square correlation is that of the arm and the
             tracker as specified.
         cells: every scaling, correlation, unit and way of sharing the unloaded reading.
     """
 
-    arm: str
-    runs: int
-    poses: int
-    loads: int
+    arm: str  # name of the arm
+    runs: int  # Monte-Carlo runs per cell
+    poses: int  # number of poses
+    loads: int  # wrenches per pose
     typical_correlation: float
     cells: tuple[StudyCell, ...]
 
@@ -237,8 +224,6 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
     """Least squares of the scaled regression for all runs at once.
 
     Args:
-        w: the scaling, D measurements of 6 elements.
-        blocks: (D, 6, n) observation matrix.
         noise: (D, 6, R) errors of the deflections.
     """
     a = w.whiten(blocks).reshape(-1, blocks.shape[-1])

@@ -21,11 +21,7 @@ _G = 9.80665
 
 
 def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm) -> None:
-    """Refuse commanded joints beyond the arm's limits; (N, n), rad.
-
-    Raises:
-        InputError: names row, joint and limits, and remarks angles that look like degrees.
-    """
+    """Refuse commanded joints beyond the arm's limits; (N, n), rad."""
     bad = (q < arm.q_min - _LIMIT_MARGIN) | (q > arm.q_max + _LIMIT_MARGIN)
     if not bad.any():
         return
@@ -45,11 +41,7 @@ def check_joints(table: ColumnTable, names: tuple[str, ...], q: Floats, arm: Arm
 def check_actual_joints(
     table: ColumnTable, names: tuple[str, ...], actual: Floats, q: Floats
 ) -> None:
-    """Refuse encoder readings that are not near the commanded joints; (N, n), rad.
-
-    Raises:
-        InputError: names the cell.
-    """
+    """Refuse encoder readings that are not near the commanded joints; (N, n), rad."""
     bad = np.abs(actual - q) > _TRACKING
     if bad.any():
         i, j = divmod(int(np.argmax(bad)), q.shape[1])
@@ -66,9 +58,6 @@ def check_positions(table: ColumnTable, position: Floats, q: Floats, arm: Arm) -
 
     No reading is further than 100 m from its instrument; all lie within a few reaches of each
     other; and joints that move by more than 0.1 rad move the target.
-
-    Raises:
-        InputError: names the row and the unit that it looks like.
     """
     distance = np.linalg.norm(position, axis=1)
     if np.any(distance > MAX_DISTANCE):
@@ -103,11 +92,7 @@ def _looks_like(position: Floats, distance: float) -> str:
 
 
 def check_rotations(table: ColumnTable, rotation: Floats) -> None:
-    """Refuse rotation vectors (N, 3) of more than a turn.
-
-    Raises:
-        InputError: names the row.
-    """
+    """Refuse rotation vectors (N, 3) of more than a turn."""
     angle = np.linalg.norm(rotation, axis=1)
     if np.any(angle > 2 * np.pi + 1e-6):
         i = int(np.argmax(angle > 2 * np.pi + 1e-6))
@@ -122,10 +107,6 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
 
     A covariance is positive semi-definite; tested on the correlation matrix D V D with
     D = diag(V)^-1/2, so that the answer does not depend on units: eigenvalues >= -1e-9.
-
-    Raises:
-        InputError: zero, a negative variance, not positive semi-definite, or a standard
-            deviation above 3 mm or 0.05 rad; names the row.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     for i in np.flatnonzero(np.any(variance < 0, axis=1))[:1]:
@@ -164,11 +145,7 @@ def check_covariances(table: ColumnTable, covariance: Floats) -> None:
 def check_wrenches(
     table: ColumnTable, wrench: Floats, load: Ints, names: list[str], arm: Arm
 ) -> None:
-    """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm.
-
-    Raises:
-        InputError: names the cell.
-    """
+    """Refuse a wrench (N, 6) on an unloaded reading, or one that would break the arm."""
     unloaded = np.array([name == "none" for name in names])[load]
     loaded = unloaded[:, None] & (wrench != 0)
     limit = 20 * arm.payload * _G * np.repeat([1.0, arm.reach], 3)
@@ -196,11 +173,7 @@ def check_names(table: ColumnTable) -> None:
 
 
 def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats) -> None:
-    """Refuse a pose whose commanded joints (N, n) differ between its rows.
-
-    Raises:
-        InputError: names both rows.
-    """
+    """Refuse a pose whose commanded joints (N, n) differ between its rows."""
     first = np.unique(pose, return_index=True)[1]
     bad = np.abs(q - q[first][pose]) > SAME_POSE
     if bad.any():

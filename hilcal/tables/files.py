@@ -43,17 +43,7 @@ REFUSED = {
 def open_tables(
     path: str | Path, mapping: PointMapping, second: Path | None = None
 ) -> tuple[Grid, int]:
-    """Open the file or the two files that a mapping is for, as one table.
-
-    Args:
-        second: the second file, where the mapping does not name it.
-
-    Returns:
-        The table, and how many rows of the first file found no partner in the second.
-
-    Raises:
-        InputError: a file that cannot be read, or files that do not belong together.
-    """
+    """Open the file or the two files that a mapping is for, as one table."""
     first = open_grid(path, mapping.file)
     if mapping.second_file is None:
         if second is not None:
@@ -97,11 +87,7 @@ def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> 
 
 
 def content_of(path: str | Path) -> bytes:
-    """Read a file.
-
-    Raises:
-        InputError: no such file, or it cannot be read.
-    """
+    """Read a file."""
     try:
         return limits.read_bytes(Path(path), limits.TABLE)
     except FileNotFoundError as e:
@@ -111,11 +97,7 @@ def content_of(path: str | Path) -> bytes:
 
 
 def kind_of(path: str, content: bytes) -> str:
-    """Return the kind of a file by its first bytes: one of `READ`, else "text".
-
-    Raises:
-        InputError: it is empty, or of a kind that is not read.
-    """
+    """Return the kind of a file by its first bytes: one of `READ`, else "text"."""
     if not content.strip(b"\xef\xbb\xbf \t\r\n"):
         raise InputError(f"{path}: the file is empty; expected a table of readings")
     for magic, what in REFUSED.items():
@@ -150,11 +132,7 @@ def _short(error: Exception) -> str:
 
 
 def package(path: str | Path, name: str, what: str) -> Any:
-    """Import a package that a kind of file needs.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Import a package that a kind of file needs."""
     with needed_by(f"{path}: {what}"):
         return import_module(name)
 
@@ -230,11 +208,7 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
 
 
 def sheet_names(path: str, content: bytes) -> list[str]:
-    """Names of the sheets of an XLSX file.
-
-    Raises:
-        InputError: no XLSX file, or openpyxl is not installed.
-    """
+    """Names of the sheets of an XLSX file."""
     with _undamaged(path, "an XLSX file"):
         names = list(_book(path, content).sheetnames)
     if len(names) > limits.SHEETS:
@@ -245,11 +219,7 @@ def sheet_names(path: str, content: bytes) -> list[str]:
 def sheet_rows(
     path: str, content: bytes, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
-    """Rows of a sheet that are neither empty nor comments, with their numbers from 1.
-
-    Raises:
-        InputError: damaged, or more rows or cells than a table may have.
-    """
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
     found: list[tuple[int, list[Cell]]] = []
     cells = 0
     with _undamaged(path, "an XLSX file"):
@@ -392,11 +362,7 @@ BYTE_ORDER_MARKS = {
 
 
 def decoded(path: str, content: bytes, encoding: str | None) -> str:
-    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1.
-
-    Raises:
-        InputError: binary data, or not text in the encoding that is stated.
-    """
+    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1."""
     marks = (name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark))
     wanted = next(marks, encoding)
     try:
@@ -424,11 +390,7 @@ def read_text(path: str, content: bytes, how: FileFormat, check: Check | None = 
 
 
 def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[str]]]:
-    """Rows of cells that are neither blank nor comments, with their numbers from 1.
-
-    Raises:
-        InputError: quotes that are not closed.
-    """
+    """Rows of cells that are neither blank nor comments, with their numbers from 1."""
     separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
     if how.separator == "blanks":
         text = text.replace("\t", " ")
@@ -470,9 +432,6 @@ def grid_of_rows(
     """Make a grid of rows of cells: header (which is checked), units, and rows of one length.
 
     Cells that a row has beyond the header must be empty, as trailing separators leave them.
-
-    Raises:
-        InputError: the header's row is not there, no readings, a row of another length.
     """
     by_row = dict(found)
     if how.header_row and how.header_row not in by_row:

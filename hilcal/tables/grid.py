@@ -36,19 +36,14 @@ class Grid:
     """A table of cells.
 
     Attributes:
-        path: the file's name, for messages.
-        names: of the columns; "1", "2", ... where the file has no header.
-        rows: (N,) row of each record as an editor or a spreadsheet counts, from 1.
-        columns: N cells of each column.
-        formats: how the cells of each column are written.
         units: cells of the row of units by column, where there is one.
     """
 
-    path: str
-    names: tuple[str, ...]
-    rows: Ints
-    columns: tuple[Sequence[Cell], ...]
-    formats: tuple[FileFormat, ...]
+    path: str  # the file's name, for messages
+    names: tuple[str, ...]  # of the columns; "1", "2", ... where the file has no header
+    rows: Ints  # (N,) row of each record as an editor or a spreadsheet counts, from 1
+    columns: tuple[Sequence[Cell], ...]  # N cells of each column
+    formats: tuple[FileFormat, ...]  # how the cells of each column are written
     units: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -61,11 +56,7 @@ class Grid:
         return f"{self.path}: row {self.rows[index]}, column '{self.name(column)}'"
 
     def name(self, column: str | int) -> str:
-        """Return the name of a column that a mapping gives by name or by number, from 1.
-
-        Raises:
-            InputError: no such column; lists those that there are.
-        """
+        """Return the name of a column that a mapping gives by name or by number, from 1."""
         if isinstance(column, int):
             if column > len(self.names):
                 raise InputError(
@@ -83,19 +74,11 @@ class Grid:
         return column
 
     def cells(self, column: str | int) -> Sequence[Cell]:
-        """Return the cells of a column.
-
-        Raises:
-            InputError: no such column.
-        """
+        """Return the cells of a column."""
         return self.columns[self.names.index(self.name(column))]
 
     def text(self, column: str | int) -> list[str]:
-        """Cells as text; whole numbers without a decimal point, nothing for empty cells.
-
-        Raises:
-            InputError: no such column, or a text that no name may be.
-        """
+        """Cells as text; whole numbers without a decimal point, nothing for empty cells."""
         cells = (text_of(c) for c in self.cells(column))
         return [from_csv(check_name(c, self.at(k, column))) for k, c in enumerate(cells)]
 
@@ -137,17 +120,13 @@ class ColumnTable:
     """Columns that were understood, in SI units where they are numbers.
 
     Attributes:
-        path: the file's name, for messages.
-        rows: (N,) row of each record as an editor or a spreadsheet counts.
-        text: text columns by name, N cells each, without blanks around.
-        number: (N,) number columns by name.
         alias: what the file itself calls a column, where it is another name than here.
     """
 
-    path: str
-    rows: Ints
-    text: dict[str, list[str]]
-    number: dict[str, Floats]
+    path: str  # the file's name, for messages
+    rows: Ints  # (N,) row of each record as an editor or a spreadsheet counts
+    text: dict[str, list[str]]  # text columns by name, N cells each, without blanks around
+    number: dict[str, Floats]  # (N,) number columns by name
     alias: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -158,11 +137,7 @@ class ColumnTable:
         number: Sequence[str],
         sparse: Collection[str] = (),
     ) -> "ColumnTable":
-        """Return the columns of these names; each of their cells has a value but for `sparse` ones.
-
-        Raises:
-            InputError: a cell that is no number; names row and column.
-        """
+        """Return the columns of these names; cells have a value but for `sparse` ones."""
         numbers = {name: grid.numbers(name, complete=name not in sparse) for name in number}
         return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
 

@@ -71,23 +71,14 @@ _LISTED = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedTable(Generic[M]):
-    """The rows of a table by their mapping, without what tells noise.
+    """The rows of a table by their mapping, without what tells noise."""
 
-    Attributes:
-        table: columns of the exchange table, SI.
-        grid: the rows as the file has them.
-        mapping: as it is used.
-        raw: (N,) number columns by the file's names, in its units.
-        angles: (N, k) numbers of the orientation, in the file's unit; None without.
-        notes: one sentence for each decision.
-    """
-
-    table: ColumnTable
-    grid: Grid
-    mapping: M
-    raw: dict[str, Floats]
-    angles: Floats | None
-    notes: list[str]
+    table: ColumnTable  # columns of the exchange table, SI
+    grid: Grid  # the rows as the file has them
+    mapping: M  # as it is used
+    raw: dict[str, Floats]  # (N,) number columns by the file's names, in its units
+    angles: Floats | None  # (N, k) numbers of the orientation, in the file's unit; None without
+    notes: list[str]  # one sentence for each decision
 
 
 def mapped_table(
@@ -154,20 +145,8 @@ def import_mapped(
     """Read a table, or two tables, by a mapping.
 
     Args:
-        path: text, XLSX, MAT or Parquet.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where neither table nor mapping state them.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
-        second: the second file, where the mapping does not name it.
-        std: as of `readings_of`.
-
-    Returns:
-        The readings in the table's order, and what was decided on the way. Rows without a value
-        in a column that is used are left out and counted.
-
-    Raises:
-        InputError: anything that cannot be right, by file, row and column.
     """
     of = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
@@ -242,9 +221,6 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
 
     Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
     repeated. Nothing changes where the mapping has no `targets`.
-
-    Raises:
-        InputError: no such column.
     """
     rows = range(len(grid.rows))
     if mapping.position is None or not mapping.position.targets:
@@ -512,11 +488,7 @@ def _poses(grid: Grid, of: PoseName | None, q: Floats | None) -> list[str]:
 
 
 def seconds(grid: Grid, time: Time) -> Floats:
-    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row.
-
-    Raises:
-        InputError: a cell that is no time, or empty.
-    """
+    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row."""
     if time.unit in units.SECONDS:
         values = units.SECONDS[time.unit] * grid.numbers(time.column)
         _refuse_missing(grid, time, values, "a time")

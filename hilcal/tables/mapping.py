@@ -514,15 +514,7 @@ def find_mapping(name: str | Path, kind: type[M]) -> M:
 
 
 def load_mapping(path: Path, kind: type[M]) -> M:
-    """Read a mapping file.
-
-    Args:
-        kind: `Mapping` for readings, `PointMapping` for points.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key (lists the valid
-            ones of its section), missing key or bad value.
-    """
+    """Read a mapping file."""
     mapping = load_section(path, kind)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping

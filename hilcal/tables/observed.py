@@ -24,17 +24,11 @@ KINDS: tuple[ObserverKind, ...] = ("point", "gauge")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observed:
-    """Who observed what.
+    """Who observed what."""
 
-    Attributes:
-        number: (N,) of the observer of each row.
-        names: of the observers; stations come first.
-        scalar: (N,) rows with one number.
-    """
-
-    number: Ints
-    names: tuple[ObserverName, ...]
-    scalar: Bools
+    number: Ints  # (N,) of the observer of each row
+    names: tuple[ObserverName, ...]  # of the observers; stations come first
+    scalar: Bools  # (N,) rows with one number
 
     def put(
         self, table: ColumnTable, value: Floats, cov: Floats, std: Mapping[ObserverName, float]
@@ -89,11 +83,7 @@ class Observed:
 
 
 def observed_of(table: ColumnTable) -> Observed | None:
-    """Return who observed the rows of a table; None where all are positions by one tracker.
-
-    Raises:
-        InputError: a row with no reading, with several, or without the name of its observer.
-    """
+    """Return who observed the rows of a table; None where all are positions by one tracker."""
     count, station = len(table.rows), table.text.get(columns.STATION)
     given = {kind: columns.ONE[kind][0] for kind in KINDS}
     read = {kind: ~np.isnan(table.number[c]) for kind, c in given.items() if c in table.number}

@@ -39,22 +39,17 @@ class ReadingStream:
     """A Parquet file of readings; nothing of it is held.
 
     Attributes:
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        rows: number of rows of each row group.
-        covers: what its covariances cover, `INSTRUMENT` or `WHOLE`.
-        rounding: (3,) variance of the positions' rounding, m².
     """
 
     path: Path
-    arm: Arm
-    noise: TrackerNoise | None
+    arm: Arm  # its number of joints, their limits and its reach are checked
+    noise: TrackerNoise | None  # gives the covariances where the file has none
     station: tuple[float, ...] | None
     columns: tuple[str, ...]
-    rows: tuple[int, ...]
-    covers: str = INSTRUMENT
-    rounding: Floats | None = None
+    rows: tuple[int, ...]  # number of rows of each row group
+    covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
+    rounding: Floats | None = None  # (3,) variance of the positions' rounding, m²
 
     def __len__(self) -> int:
         """Return the number of readings."""

@@ -36,19 +36,16 @@ class ImportResult:
     """Readings, and what was decided on the way.
 
     Attributes:
-        readings: the readings that can be used.
         notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
-        covers: what the covariances cover, see `readings.covariance`.
         noise_stated: whether the table or [tracker] states the noise; where False, the covariances
             are those of the instrument that [tracker] has by default.
-        from_tracker: whether the covariances are those of the noise in [tracker].
     """
 
-    readings: Readings
+    readings: Readings  # the readings that can be used
     notes: tuple[str, ...]
-    covers: str = INSTRUMENT
+    covers: str = INSTRUMENT  # what the covariances cover, see `readings.covariance`
     noise_stated: bool = True
-    from_tracker: bool = False
+    from_tracker: bool = False  # whether the covariances are those of the noise in [tracker]
 
 
 def read_table(
@@ -73,19 +70,7 @@ def import_table(
     """Read an exchange table; every unit is SI, every complaint names row and column.
 
     Args:
-        path: a CSV, Parquet or XLSX file with the columns of `columns.known_columns`.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        targets: names of the cell's targets, see `Cell.target_names`.
-        std: as of `readings_of`.
-
-    Returns:
-        The readings in the table's order, poses and loads numbered as they appear; and notes on
-        where its covariances come from.
-
-    Raises:
-        InputError: anything that cannot be right.
     """
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
@@ -259,11 +244,7 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
 
 
 def check_covers(word: str, where: str) -> None:
-    """Refuse another word than those for what covariances cover.
-
-    Raises:
-        InputError: lists the valid ones.
-    """
+    """Refuse another word than those for what covariances cover."""
     if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
         raise InputError(
             f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
@@ -276,11 +257,7 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
 
     Args:
-        arm: its number of joints, their limits and its reach are checked.
         whole: (N,) rows with a position, others are zero; all of them where None.
-
-    Raises:
-        InputError: a value that cannot be right.
     """
     states = _states(table, arm)
     if whole is not None and not whole.all():

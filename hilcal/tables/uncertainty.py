@@ -50,18 +50,11 @@ def mapped_covariance(
     mapping adds it. Orientations without a figure of their own have the instrument's.
 
     Args:
-        table: the columns in SI units, for messages.
-        grid: the columns as the file holds them.
-        mapping: what they hold.
         position: (N, 3) m.
-        angles: (N, k) the orientation's numbers in the file's unit; None for positions.
         station: (3,) where its beam starts.
 
     Returns:
         (N, m, m) m² and rad², None where the table states none; and one sentence per decision.
-
-    Raises:
-        InputError: a figure that is missing or cannot be right.
     """
     m = 3 if angles is None else 6
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
@@ -221,13 +214,6 @@ def floored(
     Args:
         covariance: (N, m, m), m² and rad².
         instrument: covariances (N, m, m) of the noise in [tracker]; None where it is not known.
-
-    Returns:
-        The covariances, and a note that counts the rows.
-
-    Raises:
-        InputError: the usual standard deviation is below 0.1 µm or 1e-7 rad; or a zero where the
-            instrument's noise is not known.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]
@@ -332,8 +318,6 @@ def check_joint_rounding(
     A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
 
     Args:
-        q: (N, n) in the file's unit.
-        unit: radians in that unit.
         covariance: (N, m, m), m².
     """
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)

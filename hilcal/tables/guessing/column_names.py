@@ -97,21 +97,13 @@ _PREFIXES = STD | ROTATION | FORCE | MOMENT | QUATERNION | MEASURED | NOMINAL | 
 
 @dataclass(frozen=True, slots=True)
 class ColumnName:
-    """A column's name, taken apart.
+    """A column's name, taken apart."""
 
-    Attributes:
-        name: as the file has it.
-        words: in small letters, without axis and number.
-        axis: "x", "y", "z" or "w", where the name ends in one.
-        numbers: the numbers in it.
-        unit: as a mapping calls it, where the name or the row of units says it.
-    """
-
-    name: str
-    words: tuple[str, ...]
-    axis: str | None
-    numbers: tuple[int, ...]
-    unit: str | None
+    name: str  # as the file has it
+    words: tuple[str, ...]  # in small letters, without axis and number
+    axis: str | None  # "x", "y", "z" or "w", where the name ends in one
+    numbers: tuple[int, ...]  # the numbers in it
+    unit: str | None  # as a mapping calls it, where the name or the row of units says it
 
     def has(self, words: set[str]) -> bool:
         """Whether one of its words is among these."""
@@ -119,11 +111,7 @@ class ColumnName:
 
 
 def parse(name: str, unit_cell: str = "") -> ColumnName:
-    """Take a column's name apart.
-
-    Args:
-        unit_cell: what the row of units says about it.
-    """
+    """Take a column's name apart."""
     rest, unit = _unit(name)
     told = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
     for sign, word in CHINESE.items():

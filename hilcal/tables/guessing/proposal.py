@@ -28,18 +28,12 @@ SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class UnderstoodColumn:
-    """One thing that the table holds.
+    """One thing that the table holds."""
 
-    Attributes:
-        what: section of the mapping.
-        meaning: unit and convention.
-        example: the cells of the first reading.
-    """
-
-    what: str
+    what: str  # section of the mapping
     columns: tuple[str, ...]
-    meaning: str
-    example: tuple[str, ...]
+    meaning: str  # unit and convention
+    example: tuple[str, ...]  # the cells of the first reading
 
 
 @dataclass(slots=True, eq=False)
@@ -47,30 +41,23 @@ class Proposal:
     """A mapping in the making.
 
     Attributes:
-        sections: of the mapping, by name.
-        understood: what the table holds.
         unsure: sentences on what should be checked, by section.
         unused: columns without a meaning, with the reason.
         lacking: sentences on what an import needs and was not found.
-        open_convention: whether the orientation's convention is a guess.
         alternatives: columns of the position and of the joints that are as good by their values,
             the chosen ones first; empty lists where names tell.
     """
 
-    sections: dict[str, dict[str, Any]] = field(default_factory=dict)
-    understood: list[UnderstoodColumn] = field(default_factory=list)
+    sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
+    understood: list[UnderstoodColumn] = field(default_factory=list)  # what the table holds
     unsure: list[tuple[str, str]] = field(default_factory=list)
     unused: list[tuple[str, str]] = field(default_factory=list)
     lacking: list[str] = field(default_factory=list)
-    open_convention: bool = False
+    open_convention: bool = False  # whether the orientation's convention is a guess
     alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
 
     def mapping(self, kind: type[M]) -> M:
-        """Return the mapping, `Mapping` for readings, `PointMapping` for points.
-
-        Raises:
-            InputError: it is not complete.
-        """
+        """Return the mapping, `Mapping` for readings, `PointMapping` for points."""
         return check_section(self.sections, kind, "the proposed mapping")
 
     def to_toml(self, source: str) -> str:
@@ -108,11 +95,7 @@ class Guesser:
     """Columns that are not yet used, and the mapping that grows."""
 
     def __init__(self, grid: Grid, joints: int | None) -> None:
-        """Take the table apart.
-
-        Args:
-            joints: of the arm, where the cell is known.
-        """
+        """Take the table apart."""
         self.grid = grid
         self.joints = joints
         self.columns = [parse(name, grid.units.get(name, "")) for name in grid.names]

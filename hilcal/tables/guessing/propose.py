@@ -115,11 +115,7 @@ def _is_key(keys: list[str]) -> bool:
 
 
 def guess(grid: Grid, joints: int | None = None) -> Proposal:
-    """Propose a mapping for a table.
-
-    Args:
-        joints: number of the arm's joints, where it is known.
-    """
+    """Propose a mapping for a table."""
     g = Guesser(grid, joints)
     _joints(g)
     guess_axes(g)

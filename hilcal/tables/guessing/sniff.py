@@ -39,16 +39,11 @@ Rows = Sequence[tuple[int, Sequence[Cell]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sniffed:
-    """A file, opened as it seems to be written.
+    """A file, opened as it seems to be written."""
 
-    Attributes:
-        how: keys of [file] that differ from a plain CSV file.
-        doubts: sentences on what is unsure.
-    """
-
-    how: dict[str, Any]
+    how: dict[str, Any]  # keys of [file] that differ from a plain CSV file
     grid: Grid
-    doubts: tuple[str, ...]
+    doubts: tuple[str, ...]  # sentences on what is unsure
 
 
 def sniff(path: str | Path) -> Sniffed:
