@@ -5,19 +5,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fits import PriorOptions
 from hilcal.cli.options import (
     POSES,
-    CellFile,
-    EffectsFrom,
-    Json,
-    Prior,
-    View,
     catalogue_with,
-    option,
+    command,
 )
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapter_of, rows_of
@@ -71,59 +66,39 @@ LONGEST = "2 h"
 """How long measuring may last; a choice."""
 
 
+@command(
+    f"""
+    output | -o --output RUN.hilcal | The campaign file; RUN.validation.hilcal and
+        RUN.corrected.hilcal go beside it.
+    resume | --resume | Go on with what RUN.hilcal holds, after any stop.
+    goal | --goal LENGTH | The error of the position that is wanted, e.g. "0.1 mm"; of absolute
+        readings: it is measured on until 95 % of points are predicted to be within it after
+        compensation, as far as that can be had.
+    limit | --limit LENGTH | The largest error allowed at the corrected targets, as measured; exit 5
+        where it is not kept.
+    max_time | --max-time TIME | The longest that measuring to fit may take in all, "{LONGEST}"
+        unless given.
+    poses | --poses | Size of the plan, {POSES} unless given.
+    validation | --validation | Poses of the validation campaign, {VALIDATION} unless given.
+    rehearse | --rehearse | In one simulated cell, from the first to the last.
+    yes | --yes -y | Do not ask before the arm moves; for scripts.
+    """
+)
 def calibrate(
-    cell: CellFile,
-    output: Annotated[
-        Path,
-        option(
-            "-o --output RUN.hilcal",
-            "The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
-        ),
-    ],
-    resume: Annotated[
-        bool, option("--resume", "Go on with what RUN.hilcal holds, after any stop.")
-    ] = False,
-    goal: Annotated[
-        str | None,
-        option(
-            "--goal LENGTH",
-            'The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: it '
-            "is measured on until 95 % of points are predicted to be within it after "
-            "compensation, as far as that can be had.",
-        ),
-    ] = None,
-    limit: Annotated[
-        str | None,
-        option(
-            "--limit LENGTH",
-            "The largest error allowed at the corrected targets, as measured; exit 5 where it "
-            "is not kept.",
-        ),
-    ] = None,
-    max_time: Annotated[
-        str | None,
-        option(
-            "--max-time TIME",
-            f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
-        ),
-    ] = None,
-    poses: Annotated[
-        int | None, option("--poses", f"Size of the plan, {POSES} unless given.")
-    ] = None,
-    validation: Annotated[
-        int | None,
-        option("--validation", f"Poses of the validation campaign, {VALIDATION} unless given."),
-    ] = None,
-    prior: Prior = None,
-    rehearse: Annotated[
-        bool, option("--rehearse", "In one simulated cell, from the first to the last.")
-    ] = False,
-    yes: Annotated[
-        bool, option("--yes -y", "Do not ask before the arm moves; for scripts.")
-    ] = False,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    output: Path,
+    resume: bool = False,
+    goal: str | None = None,
+    limit: str | None = None,
+    max_time: str | None = None,
+    poses: int | None = None,
+    validation: int | None = None,
+    prior: Path | None = None,
+    rehearse: bool = False,
+    yes: bool = False,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

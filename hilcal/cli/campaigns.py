@@ -2,11 +2,10 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 from hilcal.campaign.campaign import estimated_noise
 from hilcal.cell import cell_from_config
-from hilcal.cli.options import Json, Record, Run, Scheduler, Workers, argument, option
+from hilcal.cli.options import command
 from hilcal.cli.terminal import terminal
 from hilcal.errors import InputError
 from hilcal.identification.full_covariance import covariance_parts
@@ -25,7 +24,8 @@ from hilcal.store.revision import RevisionRecord
 from hilcal.store.robot_file import ROBOT_FILE
 
 
-def info(run: Run, as_json: Json = False) -> None:
+@command()
+def info(run: Path, as_json: bool = False) -> None:
     """Say what a campaign holds: readings, instruments, drift, events, revisions."""
     t = terminal(as_json)
     with CampaignFile.open(run, read_only=True) as file:
@@ -40,15 +40,14 @@ def info(run: Run, as_json: Json = False) -> None:
     t.document({**to_json(found, str(run), parts), **more})
 
 
+@command(
+    """
+    number | N | The revision; the latest one if left out.
+    release | --release | Accept none: the latest one is used again.
+    """
+)
 def accept(
-    run: Run,
-    number: Annotated[
-        int | None, argument("N", "The revision; the latest one if left out.")
-    ] = None,
-    release: Annotated[
-        bool, option("--release", "Accept none: the latest one is used again.")
-    ] = False,
-    as_json: Json = False,
+    run: Path, number: int | None = None, release: bool = False, as_json: bool = False
 ) -> None:
     """Choose the revision that every command uses from now on, whatever is added later."""
     t = terminal(as_json)
@@ -77,16 +76,12 @@ def accept(
     )
 
 
-def repair(
-    run: Run,
-    robot: Annotated[
-        Path | None,
-        option(
-            "--robot FILE", "URDF or DH table of its robot, for a campaign that does not hold it."
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
+    """
+)
+def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
     done = repaired(run)
@@ -112,14 +107,21 @@ def _named(record: RevisionRecord) -> str:
     return f"revision {record.number} ({model_name(record.effects)})"
 
 
+@command(
+    """
+    directory | DIR | With campaign files, in folders below as well.
+    out | -o PRIOR.json | What to expect of another arm.
+    report | --report F.html | Write it as one HTML page.
+    """
+)
 def fleet(
-    directory: Annotated[Path, argument("DIR", "With campaign files, in folders below as well.")],
-    out: Annotated[Path, option("-o PRIOR.json", "What to expect of another arm.")],
-    report: Annotated[Path | None, option("--report F.html", "Write it as one HTML page.")] = None,
-    record: Record = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
+    directory: Path,
+    out: Path,
+    report: Path | None = None,
+    record: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: bool = False,
 ) -> None:
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # loads all that is fitted and shown

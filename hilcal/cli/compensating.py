@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -24,13 +23,9 @@ from hilcal.calibration.urscript import (
 )
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    Revision,
-    argument,
     catalogue_with,
     check_new,
-    option,
+    command,
 )
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue
@@ -69,63 +64,42 @@ class _Task:
     """A program of another maker than UR, in place of the two."""
 
 
+@command(
+    """
+    model | RUN.hilcal | A campaign with a revision, or a calibration (JSON).
+    points | POINTS | Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB
+        .mod, FANUC .ls, Yaskawa .jbi.
+    output | -o --output F | Write CSV, JSON or a program; repeatable.
+    load | --load NAME | The load at every point, of [[loads]].
+    wrench | --wrench "FX FY FZ MX MY MZ" | Force and moment at the load point, base axes, N and
+        N·m.
+    tool | --tool "X Y Z RX RY RZ" | The tool on the flange, m and rad; the tracked target unless
+        given.
+    near | --near "Q1 Q2 .. QN" | Joint values near the first pose, degrees; m of slides.
+    frames | --frames F | The controller's tools and bases, for programs of other makers than UR:
+        TOML, $config.dat or a RAPID module.
+    outside | --allow-outside | Also points outside of what was measured.
+    leave | --leave | Keep waypoints of a program that cannot be corrected as they are.
+    kind | --format FORMAT | table, or a mapping, as for import.
+    force | --force | Replace existing files.
+    """
+)
 def compensate(
-    model: Annotated[
-        Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
-    ],
-    points: Annotated[
-        Path,
-        argument(
-            "POINTS",
-            "Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB .mod, "
-            "FANUC .ls, Yaskawa .jbi.",
-        ),
-    ],
-    output: Annotated[
-        list[Path] | None, option("-o --output F", "Write CSV, JSON or a program; repeatable.")
-    ] = None,
-    load: Annotated[
-        str | None, option("--load NAME", "The load at every point, of [[loads]].")
-    ] = None,
-    wrench: Annotated[
-        str | None,
-        option(
-            '--wrench "FX FY FZ MX MY MZ"',
-            "Force and moment at the load point, base axes, N and N·m.",
-        ),
-    ] = None,
-    tool: Annotated[
-        str | None,
-        option(
-            '--tool "X Y Z RX RY RZ"',
-            "The tool on the flange, m and rad; the tracked target unless given.",
-        ),
-    ] = None,
-    near: Annotated[
-        str | None,
-        option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees; m of slides."),
-    ] = None,
-    frames: Annotated[
-        Path | None,
-        option(
-            "--frames F",
-            "The controller's tools and bases, for programs of other makers than UR: TOML, "
-            "$config.dat or a RAPID module.",
-        ),
-    ] = None,
-    outside: Annotated[
-        bool, option("--allow-outside", "Also points outside of what was measured.")
-    ] = False,
-    leave: Annotated[
-        bool, option("--leave", "Keep waypoints of a program that cannot be corrected as they are.")
-    ] = False,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    kind: Annotated[
-        str, option("--format FORMAT", "table, or a mapping, as for import.")
-    ] = "table",
-    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
-    as_json: Json = False,
+    model: Path,
+    points: Path,
+    output: list[Path] | None = None,
+    load: str | None = None,
+    wrench: str | None = None,
+    tool: str | None = None,
+    near: str | None = None,
+    frames: Path | None = None,
+    outside: bool = False,
+    leave: bool = False,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    kind: str = "table",
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Find the joint values that put the tool where it was asked to be, under a load."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
 from hilcal.cli.fits import check_record, finish, record_story
-from hilcal.cli.options import EffectsFrom, Json, Record, catalogue_with, check_seed, option
+from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import chapter_of, revisions_json, rows_of
 from hilcal.cli.rehearsing import (
@@ -212,35 +211,29 @@ VALIDATION = 10
 """Poses of the validation campaign; a choice for the same reason."""
 
 
+@command(
+    """
+    hide | --hide EFFECT | An effect, random, nothing, or invented: a law that the catalogue lacks.
+    seed | --seed | Of everything random.
+    output | -o --output RUN.hilcal | The campaign file to make.
+    poses | --poses | See hilcal plan.
+    validation | --validation | Poses at which the corrected arm is measured.
+    without_devices | --without-devices | Draw the readings at once, through no wire.
+    ambiguous | --ambiguous | Measure little at first, so that the effect is in doubt; then what
+        settles it.
+    """
+)
 def demo(
-    hide: Annotated[
-        str | None,
-        option(
-            "--hide EFFECT",
-            "An effect, random, nothing, or invented: a law that the catalogue lacks.",
-        ),
-    ] = None,
-    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
-    output: Annotated[Path, option("-o --output RUN.hilcal", "The campaign file to make.")] = Path(
-        "demo.hilcal"
-    ),
-    poses: Annotated[int, option("--poses", "See hilcal plan.")] = POSES,
-    validation: Annotated[
-        int, option("--validation", "Poses at which the corrected arm is measured.")
-    ] = VALIDATION,
-    without_devices: Annotated[
-        bool, option("--without-devices", "Draw the readings at once, through no wire.")
-    ] = False,
-    ambiguous: Annotated[
-        bool,
-        option(
-            "--ambiguous",
-            "Measure little at first, so that the effect is in doubt; then what settles it.",
-        ),
-    ] = False,
-    record: Record = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    hide: str | None = None,
+    seed: int | None = None,
+    output: Path = Path("demo.hilcal"),
+    poses: int = POSES,
+    validation: int = VALIDATION,
+    without_devices: bool = False,
+    ambiguous: bool = False,
+    record: Path | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -1,19 +1,14 @@
 """`discover`: laws in readable form for what the catalogue does not explain."""
 
 from pathlib import Path
-from typing import Annotated
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fits import check_options, fit_of, wanted_effects
 from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    Revision,
-    Run,
     catalogue_with,
     check_folder,
-    option,
+    command,
 )
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
@@ -33,28 +28,23 @@ from hilcal.present.progress import working
 from hilcal.whole_file import replace_file
 
 
+@command(
+    """
+    output | -o --output F.py | The effect, to be edited.
+    against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
+        baseline; or the file of an exported calibration, whose effects are fitted to this run.
+    alternatives | --alternatives | Also write laws that these readings do not tell from it:
+        F_or_1.py; hilcal next plans what separates them.
+    """
+)
 def discover(
-    run: Run,
-    output: Annotated[Path, option("-o --output F.py", "The effect, to be edited.")],
-    against: Annotated[
-        str | None,
-        option(
-            "--against MODEL",
-            "Beside this model instead of the revision in use: effects A,B; baseline; or the "
-            "file of an exported calibration, whose effects are fitted to this run.",
-        ),
-    ] = None,
-    alternatives: Annotated[
-        bool,
-        option(
-            "--alternatives",
-            "Also write laws that these readings do not tell from it: F_or_1.py; hilcal next "
-            "plans what separates them.",
-        ),
-    ] = False,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    output: Path,
+    against: str | None = None,
+    alternatives: bool = False,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Search a law for what no effect explains, and write it as an effect."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -2,11 +2,10 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import hilcal
 from hilcal.cell import cell_from_config
-from hilcal.cli.options import Json, argument, option
+from hilcal.cli.options import command
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.doctor.computer import Finding, computer, program
@@ -20,13 +19,13 @@ SIMULATED = "simulated"
 """The port of a device that only the demo's own simulation has."""
 
 
-def doctor(
-    cell: Annotated[
-        Path | None, argument("CELL.toml", "Also look at this cell's ports and addresses.")
-    ] = None,
-    folder: Annotated[Path, option("--folder DIR", "Where campaigns are stored.")] = Path("."),
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    cell | CELL.toml | Also look at this cell's ports and addresses.
+    folder | --folder DIR | Where campaigns are stored.
+    """
+)
+def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""
     t = terminal(as_json)
     findings: list[Finding] = []

@@ -5,7 +5,6 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import tomli_w
@@ -15,7 +14,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.handover import Corrected, corrected
 from hilcal.calibration.own_files.correct import KINDS, correct_file
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import EffectsFrom, Json, Revision, Run, catalogue_with, check_new, option
+from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import InputError
 from hilcal.identification import parameters_document
@@ -32,70 +31,54 @@ MANY = 10.0
 """m; a distance along a joint's axis beyond which it is said that it cancels with others."""
 
 
+@command(
+    """
+    readings | --readings F.csv|F.parquet | The readings as stored, to be imported again.
+    table | --table F.csv|F.parquet | The same with the arm's scatter in their covariance.
+    cell | --cell CELL.toml | The cell's configuration, for --readings.
+    residuals | --residuals F.csv|F.parquet | Residuals of the fit and on poses left out, one row a
+        reading.
+    revisions | --revisions F.csv|F.parquet | All revisions: model, errors, verdict.
+    parameters | --parameters F.json|F.csv | Parameters of the model; in JSON with their covariance.
+    calibration | --calibration F.json | The identified arm, ready for compensate on any machine.
+    urdf | --urdf F.urdf | The arm with its corrected geometry.
+    dh | --dh F.toml|F.csv | The same as a DH table.
+    modified | --dh-modified | Rows of --dh as Craig writes them.
+    ur_kinematics | --ur-kinematics F.yaml | The same for UR's ROS driver: kinematics_params_file.
+    ur_hash | --ur-hash calib_N | The connected arm's hash, so that the driver takes the file for
+        its own.
+    frames | --frames F.json | Tool and base as fitted, and as a controller takes them.
+    matlab | --matlab F.m | A MATLAB function that builds it as a rigidBodyTree.
+    into | --into F | A description of yours whose numbers are replaced: URDF, xacro, MJCF, SDF,
+        UR's calibration.conf; needs --force, repeatable.
+    base_link | --base-link NAME | Link or body of --into that the arm begins at.
+    tip_link | --tip-link NAME | Link, body or site of --into that is its flange.
+    force | --force | Replace existing files.
+    """
+)
 def export(
-    run: Run,
-    readings: Annotated[
-        Path | None, option("F.csv|F.parquet", "The readings as stored, to be imported again.")
-    ] = None,
-    table: Annotated[
-        Path | None,
-        option("F.csv|F.parquet", "The same with the arm's scatter in their covariance."),
-    ] = None,
-    cell: Annotated[
-        Path | None, option("CELL.toml", "The cell's configuration, for --readings.")
-    ] = None,
-    residuals: Annotated[
-        Path | None,
-        option("F.csv|F.parquet", "Residuals of the fit and on poses left out, one row a reading."),
-    ] = None,
-    revisions: Annotated[
-        Path | None, option("F.csv|F.parquet", "All revisions: model, errors, verdict.")
-    ] = None,
-    parameters: Annotated[
-        Path | None,
-        option("F.json|F.csv", "Parameters of the model; in JSON with their covariance."),
-    ] = None,
-    calibration: Annotated[
-        Path | None, option("F.json", "The identified arm, ready for compensate on any machine.")
-    ] = None,
-    urdf: Annotated[Path | None, option("F.urdf", "The arm with its corrected geometry.")] = None,
-    dh: Annotated[Path | None, option("F.toml|F.csv", "The same as a DH table.")] = None,
-    modified: Annotated[
-        bool, option("--dh-modified", "Rows of --dh as Craig writes them.")
-    ] = False,
-    ur_kinematics: Annotated[
-        Path | None, option("F.yaml", "The same for UR's ROS driver: kinematics_params_file.")
-    ] = None,
-    ur_hash: Annotated[
-        str | None,
-        option(
-            "calib_N", "The connected arm's hash, so that the driver takes the file for its own."
-        ),
-    ] = None,
-    frames: Annotated[
-        Path | None, option("F.json", "Tool and base as fitted, and as a controller takes them.")
-    ] = None,
-    matlab: Annotated[
-        Path | None, option("F.m", "A MATLAB function that builds it as a rigidBodyTree.")
-    ] = None,
-    into: Annotated[
-        list[Path] | None,
-        option(
-            "F",
-            "A description of yours whose numbers are replaced: URDF, xacro, MJCF, SDF, UR's "
-            "calibration.conf; needs --force, repeatable.",
-        ),
-    ] = None,
-    base_link: Annotated[
-        str | None, option("NAME", "Link or body of --into that the arm begins at.")
-    ] = None,
-    tip_link: Annotated[
-        str | None, option("NAME", "Link, body or site of --into that is its flange.")
-    ] = None,
-    revision: Revision = None,
-    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    readings: Path | None = None,
+    table: Path | None = None,
+    cell: Path | None = None,
+    residuals: Path | None = None,
+    revisions: Path | None = None,
+    parameters: Path | None = None,
+    calibration: Path | None = None,
+    urdf: Path | None = None,
+    dh: Path | None = None,
+    modified: bool = False,
+    ur_kinematics: Path | None = None,
+    ur_hash: str | None = None,
+    frames: Path | None = None,
+    matlab: Path | None = None,
+    into: list[Path] | None = None,
+    base_link: str | None = None,
+    tip_link: str | None = None,
+    revision: int | None = None,
+    force: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
     t = terminal(as_json)

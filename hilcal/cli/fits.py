@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import check_folder
+from hilcal.cli.options import check_folder, command
 from hilcal.cli.terminal import Terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
@@ -20,7 +20,6 @@ from hilcal.model.model import Model
 from hilcal.present.fit import model_name
 from hilcal.present.progress import Say, working
 from hilcal.present.story import Chapter, build_story
-from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.revision import RevisionRecord
 
@@ -129,14 +128,16 @@ def chosen(found: Fit) -> dict[str, dict[str, object]]:
     return chosen_of(found.model, found.readings)
 
 
-def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
+@command()
+def chosen_of(model: Model, readings: str | None) -> None:
     """Options of the effects of a model that are not the usual ones for its readings, by name."""
     named = (e for e in model.effects if e.name not in model.background)
     options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
     return {name: given for name, given in options.items() if given}
 
 
-def titles(model: Model, readings: Readings) -> tuple[str, ...]:
+@command()
+def titles(model: Model, readings: str | None) -> None:
     """Names of a model's effects, with the options that are not the usual ones."""
     given = chosen_of(model, readings)
     return tuple(write_effect(name, given.get(name, {})) for name in model.named)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 from hilcal import numbers
 from hilcal.calibration.streamed import calibration_of_stream
@@ -21,20 +20,9 @@ from hilcal.cli.fits import (
     wanted_effects,
 )
 from hilcal.cli.options import (
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Prior,
-    PriorOf,
-    Readings,
-    Revision,
-    Run,
-    Scheduler,
-    Workers,
     catalogue_with,
     check_workers,
-    option,
+    command,
 )
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
@@ -65,36 +53,33 @@ from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
 
 
+@command(
+    """
+    effects | --effects A,B | Effects to fit, besides unknown frames; with options:
+        creep(joints=each).
+    scaling | --scaling S | none, gu, gc or all, side by side.
+    fit_validation | --fit-validation | Release a validation campaign for fitting; its file says so
+        for good.
+    cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
+    out | -o F.json | Of a stream: write its calibration.
+    """
+)
 def identify(
-    run: Run,
-    effects: Annotated[
-        str | None,
-        option(
-            "--effects A,B",
-            "Effects to fit, besides unknown frames; with options: creep(joints=each).",
-        ),
-    ] = None,
-    scaling: Annotated[str, option("--scaling S", "none, gu, gc or all, side by side.")] = "gc",
-    readings: Readings = None,
-    fit_validation: Annotated[
-        bool,
-        option(
-            "--fit-validation",
-            "Release a validation campaign for fitting; its file says so for good.",
-        ),
-    ] = False,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    effects_from: EffectsFrom = None,
-    cell: Annotated[
-        Path | None, option("--cell CELL.toml", "The cell of a stream, READINGS.parquet as RUN.")
-    ] = None,
-    out: Annotated[Path | None, option("-o F.json", "Of a stream: write its calibration.")] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    details: Details = False,
-    as_json: Json = False,
+    run: Path,
+    effects: str | None = None,
+    scaling: str = "gc",
+    readings: str | None = None,
+    fit_validation: bool = False,
+    prior: Path | None = None,
+    prior_of: str = "arm",
+    drift: str | None = None,
+    effects_from: list[Path] | None = None,
+    cell: Path | None = None,
+    out: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    details: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision.
 
@@ -207,15 +192,21 @@ def identify_stream(
     t.document(document)
 
 
+@command(
+    """
+    draws | --draws N | Campaigns drawn.
+    seed | --seed | Of the draws.
+    """
+)
 def bootstrap(
-    run: Run,
-    revision: Revision = None,
-    draws: Annotated[int, option("--draws N", "Campaigns drawn.")] = DRAWS,
-    seed: Annotated[int, option("--seed", "Of the draws.")] = 0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    revision: int | None = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

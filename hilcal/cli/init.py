@@ -7,10 +7,10 @@ from copy import deepcopy
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from hilcal.cell import cell_from_config
-from hilcal.cli.options import Force, Json, argument, check_folder, check_new, option
+from hilcal.cli.options import check_folder, check_new, command
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
 from hilcal.config.planning import GEOMETRY, LOADED
@@ -305,49 +305,48 @@ def items() -> tuple[Item, ...]:
     )
 
 
+@command(
+    f"""
+    cell | CELL.toml | The file to write.
+    robot | --robot | The arm, e.g. ur10e, or a .urdf.
+    host | --host | Address of its controller.
+    repeatability | --repeatability LENGTH | As the maker states it (ISO 9283), e.g. "0.05 mm".
+    tracker | --tracker | The tracker's driver.
+    tracker_port | --tracker-port | Its serial port, or its address in the network.
+    tracker_accuracy | --tracker-accuracy LENGTH | Standard deviation of a point, e.g. "8 um + 3
+        um/m".
+    force_sensor | --force-sensor | The force sensor's driver.
+    force_port | --force-port | Its serial port, or its address in the network.
+    target | --target X,Y,Z | The target in flange axes, m.
+    load_point | --load-point X,Y,Z | Where loads act, flange axes, m.
+    tool_mass | --tool-mass KG | Of the tool.
+    tool_com | --tool-com X,Y,Z | The tool's centre of mass, m.
+    load | --load LOAD | A load, {LOADS}; repeatable.
+    readings | --readings KIND | absolute (unless given) or deflection: what is fitted.
+    floor | --floor Z | Height that the arm stays above, m.
+    tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
+    """
+)
 def init(
-    cell: Annotated[Path, argument("CELL.toml", "The file to write.")] = Path("CELL.toml"),
-    robot: Annotated[str | None, option("--robot", "The arm, e.g. ur10e, or a .urdf.")] = None,
-    host: Annotated[str | None, option("--host", "Address of its controller.")] = None,
-    repeatability: Annotated[
-        str | None,
-        option("--repeatability LENGTH", 'As the maker states it (ISO 9283), e.g. "0.05 mm".'),
-    ] = None,
-    tracker: Annotated[str | None, option("--tracker", "The tracker's driver.")] = None,
-    tracker_port: Annotated[
-        str | None, option("--tracker-port", "Its serial port, or its address in the network.")
-    ] = None,
-    tracker_accuracy: Annotated[
-        str | None,
-        option("--tracker-accuracy LENGTH", 'Standard deviation of a point, e.g. "8 um + 3 um/m".'),
-    ] = None,
-    force_sensor: Annotated[
-        str | None, option("--force-sensor", "The force sensor's driver.")
-    ] = None,
-    force_port: Annotated[
-        str | None, option("--force-port", "Its serial port, or its address in the network.")
-    ] = None,
-    target: Annotated[str | None, option("--target X,Y,Z", "The target in flange axes, m.")] = None,
-    load_point: Annotated[
-        str | None, option("--load-point X,Y,Z", "Where loads act, flange axes, m.")
-    ] = None,
-    tool_mass: Annotated[str | None, option("--tool-mass KG", "Of the tool.")] = None,
-    tool_com: Annotated[
-        str | None, option("--tool-com X,Y,Z", "The tool's centre of mass, m.")
-    ] = None,
-    load: Annotated[
-        list[str] | None, option("--load LOAD", f"A load, {LOADS}; repeatable.")
-    ] = None,
-    readings: Annotated[
-        str | None,
-        option("--readings KIND", "absolute (unless given) or deflection: what is fitted."),
-    ] = None,
-    floor: Annotated[str | None, option("--floor Z", "Height that the arm stays above, m.")] = None,
-    tracker_place: Annotated[
-        str | None, option("--tracker-place X,Y,Z", "Of the tracker in base axes, m.")
-    ] = None,
-    force: Force = False,
-    as_json: Json = False,
+    cell: Path = Path("CELL.toml"),
+    robot: str | None = None,
+    host: str | None = None,
+    repeatability: str | None = None,
+    tracker: str | None = None,
+    tracker_port: str | None = None,
+    tracker_accuracy: str | None = None,
+    force_sensor: str | None = None,
+    force_port: str | None = None,
+    target: str | None = None,
+    load_point: str | None = None,
+    tool_mass: str | None = None,
+    tool_com: str | None = None,
+    load: list[str] | None = None,
+    readings: str | None = None,
+    floor: str | None = None,
+    tracker_place: str | None = None,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)

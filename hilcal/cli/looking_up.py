@@ -4,21 +4,15 @@ import keyword
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
 
 from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    OneWorker,
-    Scheduler,
-    argument,
     catalogue_with,
     check_seed,
+    command,
     one_by_default,
-    option,
 )
 from hilcal.cli.terminal import terminal
 from hilcal.config import reference
@@ -53,10 +47,9 @@ OPTIONS_NOTE = (
 )
 
 
+@command()
 def effects(
-    ctx: typer.Context,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    ctx: typer.Context, effects_from: list[Path] | None = None, as_json: bool = False
 ) -> None:
     """List the effects that a model can have; `new` begins one of your own."""
     if ctx.invoked_subcommand is not None:
@@ -139,13 +132,13 @@ def _source(kind: type[Effect], catalogue: Catalogue) -> str:
     return "built in" if kind in BUILT_IN else "installed"
 
 
-def new(
-    name: Annotated[str, argument("NAME", "Lower case, digits and _.")],
-    output: Annotated[
-        Path | None, option("-o --output FILE.py", "The file; NAME.py by default.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    name | NAME | Lower case, digits and _.
+    output | -o --output FILE.py | The file; NAME.py by default.
+    """
+)
+def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
     t = terminal(as_json)
     path = Path(f"{name}.py") if output is None else output
@@ -191,10 +184,12 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 """Keys of the drivers that come with the program, by section."""
 
 
-def config(
-    section: Annotated[str | None, argument("SECTION", "One of them, e.g. tracker.")] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    section | SECTION | One of them, e.g. tracker.
+    """
+)
+def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
     if section is None:
@@ -211,12 +206,19 @@ def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
 
 
+@command(
+    """
+    runs | --runs | Monte-Carlo runs.
+    seed | --seed | Of the random numbers.
+    workers | --workers N | Processes of this machine; 1 by default.
+    """
+)
 def scaling(
-    runs: Annotated[int, option("--runs", "Monte-Carlo runs.")] = 2000,
-    seed: Annotated[int, option("--seed", "Of the random numbers.")] = 1,
-    workers: OneWorker = None,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
+    runs: int = 2000,
+    seed: int = 1,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: bool = False,
 ) -> None:
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine.engine import open_engine

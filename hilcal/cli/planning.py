@@ -2,7 +2,7 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -12,25 +12,9 @@ from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fits import PriorOptions, check_record, effect_names, fit_of, fitted_with
 from hilcal.cli.options import (
     POSES,
-    CellFile,
-    Csv,
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Output,
-    PlanFile,
-    Poses,
-    Prior,
-    PriorOf,
-    Quick,
-    Record,
-    Revision,
-    Run,
-    Seed,
     catalogue_with,
     check_seed,
-    option,
+    command,
 )
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
@@ -83,42 +67,35 @@ def write(
             record_plan(cell, config, made.plan, made.summary, record, powers)
 
 
+@command(
+    f"""
+    readings | --readings | Or so many readings, repeats not counted, at as many poses and under
+        those loads that tell most.
+    criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
+    after | --after RUN.hilcal | Plan on from what it knows already.
+    unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a
+        drift costs more.
+    """
+)
 def plan(
-    cell: CellFile,
-    output: Output,
-    poses: Poses = POSES,
-    readings: Annotated[
-        int | None,
-        option(
-            "--readings",
-            "Or so many readings, repeats not counted, at as many poses and under those loads "
-            "that tell most.",
-        ),
-    ] = None,
-    criterion: Annotated[
-        str | None, option(f"--criterion {'|'.join(CRITERIA)}", "The optimality criterion.")
-    ] = None,
-    after: Annotated[
-        Path | None, option("--after RUN.hilcal", "Plan on from what it knows already.")
-    ] = None,
-    revision: Revision = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    seed: Seed = 0,
-    unloaded_first: Annotated[
-        bool,
-        option(
-            "--unloaded-first",
-            "All unloaded readings before the loads: for run --until; a drift costs more.",
-        ),
-    ] = False,
-    quick: Quick = False,
-    csv: Csv = None,
-    record: Record = None,
-    details: Details = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    output: Path,
+    poses: int = POSES,
+    readings: int | None = None,
+    criterion: str | None = None,
+    after: Path | None = None,
+    revision: int | None = None,
+    prior: Path | None = None,
+    prior_of: str = "arm",
+    drift: str | None = None,
+    seed: int = 0,
+    unloaded_first: bool = False,
+    quick: bool = False,
+    csv: Path | None = None,
+    record: Path | None = None,
+    details: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -152,29 +129,23 @@ def plan(
     t.document({**made.to_dict(), "plan": str(output)})
 
 
+@command(
+    """
+    save_calibration | --save-calibration F.toml | Write the kinematics that the arm's controller
+        holds, for [robot] calibration.
+    factory | --factory F.hilcal | Is the arm still what its factory measured? Measures a few
+        readings without a load into a new campaign, or takes those of one that is there.
+    yes | --yes -y | With --factory: do not ask before the arm moves.
+    """
+)
 def check(
-    cell: CellFile,
-    plan: PlanFile = None,
-    save_calibration: Annotated[
-        Path | None,
-        option(
-            "--save-calibration F.toml",
-            "Write the kinematics that the arm's controller holds, for [robot] calibration.",
-        ),
-    ] = None,
-    factory: Annotated[
-        Path | None,
-        option(
-            "--factory F.hilcal",
-            "Is the arm still what its factory measured? Measures a few readings without a load "
-            "into a new campaign, or takes those of one that is there.",
-        ),
-    ] = None,
-    yes: Annotated[
-        bool, option("--yes -y", "With --factory: do not ask before the arm moves.")
-    ] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    plan: Path | None = None,
+    save_calibration: Path | None = None,
+    factory: Path | None = None,
+    yes: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -296,34 +267,31 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
         raise DeviceError("; ".join(lines))
 
 
+@command(
+    """
+    poses | --poses | As many readings as so many poses take under every load, 20 unless given; new
+        poses, where a misfit depends on the pose alone.
+    suspects | --suspects A,B | Separate these, whatever is diagnosed.
+    cell | --cell CELL.toml | The cell, where it has other loads now.
+    """
+)
 def next_(
-    run: Run,
-    output: Output,
-    poses: Annotated[
-        int | None,
-        option(
-            "--poses",
-            "As many readings as so many poses take under every load, 20 unless given; new "
-            "poses, where a misfit depends on the pose alone.",
-        ),
-    ] = None,
-    suspects: Annotated[
-        str | None, option("--suspects A,B", "Separate these, whatever is diagnosed.")
-    ] = None,
-    cell: Annotated[
-        Path | None, option("--cell CELL.toml", "The cell, where it has other loads now.")
-    ] = None,
-    seed: Seed = 0,
-    quick: Quick = False,
-    csv: Csv = None,
-    revision: Revision = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    record: Record = None,
-    effects_from: EffectsFrom = None,
-    details: Details = False,
-    as_json: Json = False,
+    run: Path,
+    output: Path,
+    poses: int | None = None,
+    suspects: str | None = None,
+    cell: Path | None = None,
+    seed: int = 0,
+    quick: bool = False,
+    csv: Path | None = None,
+    revision: int | None = None,
+    prior: Path | None = None,
+    prior_of: str = "arm",
+    drift: str | None = None,
+    record: Path | None = None,
+    effects_from: list[Path] | None = None,
+    details: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -4,7 +4,6 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from hilcal import numbers
 from hilcal.campaign.campaign import Campaign
@@ -22,20 +21,8 @@ from hilcal.cli.fits import (
 )
 from hilcal.cli.fitting import options_json, options_line
 from hilcal.cli.options import (
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Prior,
-    PriorOf,
-    Readings,
-    Record,
-    Revision,
-    Run,
-    View,
-    argument,
     catalogue_with,
-    option,
+    command,
 )
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
@@ -102,11 +89,12 @@ def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[Rev
     ]
 
 
+@command()
 def diagnose(
-    run: Run,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -121,16 +109,19 @@ def diagnose(
     t.document({"revision": number, **to_json(d)})
 
 
+@command(
+    """
+    effect | EFFECT | See hilcal effects; with options: "creep(joints=each)".
+    """
+)
 def add(
-    run: Run,
-    effect: Annotated[
-        str, argument("EFFECT", 'See hilcal effects; with options: "creep(joints=each)".')
-    ],
-    revision: Revision = None,
-    record: Record = None,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effect: str,
+    revision: int | None = None,
+    record: Path | None = None,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
@@ -141,14 +132,19 @@ def add(
     _change(run, revision, name, record, view, as_json, catalogue, options)
 
 
+@command(
+    """
+    effect | EFFECT | One of the model.
+    """
+)
 def remove(
-    run: Run,
-    effect: Annotated[str, argument("EFFECT", "One of the model.")],
-    revision: Revision = None,
-    record: Record = None,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effect: str,
+    revision: int | None = None,
+    record: Path | None = None,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
@@ -208,40 +204,33 @@ def _change(
     )
 
 
+@command(
+    """
+    effects | --effects A,B | Effects to start from, as for identify.
+    from_latest | --from-latest | Start from the latest revision.
+    revision | --revision N | Start from this revision.
+    discover | --discover | Where no effect explains the misfit, search a law and add it; its effect
+        is written beside the campaign: found.py.
+    background | --background/--no-background | Where named effects leave more than noise, also fit
+        all others of the catalogue, as a background that predicts.
+    """
+)
 def refine(
-    run: Run,
-    effects: Annotated[
-        str | None, option("--effects A,B", "Effects to start from, as for identify.")
-    ] = None,
-    readings: Readings = None,
-    from_latest: Annotated[
-        bool, option("--from-latest", "Start from the latest revision.")
-    ] = False,
-    revision: Annotated[int | None, option("--revision N", "Start from this revision.")] = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    discover: Annotated[
-        bool,
-        option(
-            "--discover",
-            "Where no effect explains the misfit, search a law and add it; its effect is "
-            "written beside the campaign: found.py.",
-        ),
-    ] = False,
-    background: Annotated[
-        bool,
-        option(
-            "--background/--no-background",
-            "Where named effects leave more than noise, also fit all others of the catalogue, "
-            "as a background that predicts.",
-        ),
-    ] = True,
-    record: Record = None,
-    view: View = False,
-    details: Details = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effects: str | None = None,
+    readings: str | None = None,
+    from_latest: bool = False,
+    revision: int | None = None,
+    prior: Path | None = None,
+    prior_of: str = "arm",
+    drift: str | None = None,
+    discover: bool = False,
+    background: bool = True,
+    record: Path | None = None,
+    view: bool = False,
+    details: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

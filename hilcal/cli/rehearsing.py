@@ -8,19 +8,15 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import (
     POSES,
-    CellFile,
-    EffectsFrom,
-    PlanFile,
     catalogue_with,
     check_seed,
-    option,
+    command,
 )
 from hilcal.cli.planning import make_plan, read_cell
 from hilcal.cli.running import measure
@@ -47,7 +43,6 @@ from hilcal.present.progress import Say, counting, working
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
@@ -175,7 +170,8 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-def last_time(readings: Readings) -> float:
+@command()
+def last_time(readings: str | None) -> None:
     """Return when the last reading was taken, s; 0 where that is not known."""
     time = readings.states.time
     return 0.0 if time is None else float(time.max())
@@ -202,7 +198,8 @@ def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int])
             return
 
 
-def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
+@command()
+def _write(t: Terminal, campaign: CampaignFile, readings: str | None) -> None:
     """Append readings in their order, pose after pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
@@ -240,26 +237,24 @@ FASTEST = 200.0
 """Clock of a simulated world, as `[simulation] clock` allows."""
 
 
+@command(
+    """
+    output | -o --output DIR | Where the devices meet; gets a cell.toml.
+    hide | --hide EFFECT | An effect, random or nothing.
+    seed | --seed | Of everything random.
+    person | --person | `run` asks you for each load, as in a real cell; without it nobody is asked.
+    clock | --clock N | The simulated world goes so many times faster than real time, e.g. 20.
+    """
+)
 def simulate(
-    cell: CellFile,
-    output: Annotated[Path, option("-o --output DIR", "Where the devices meet; gets a cell.toml.")],
-    plan: PlanFile = None,
-    hide: Annotated[str | None, option("--hide EFFECT", "An effect, random or nothing.")] = None,
-    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
-    person: Annotated[
-        bool,
-        option(
-            "--person",
-            "`run` asks you for each load, as in a real cell; without it nobody is asked.",
-        ),
-    ] = False,
-    clock: Annotated[
-        float | None,
-        option(
-            "--clock N", "The simulated world goes so many times faster than real time, e.g. 20."
-        ),
-    ] = None,
-    effects_from: EffectsFrom = None,
+    cell: Path,
+    output: Path,
+    plan: Path | None = None,
+    hide: str | None = None,
+    seed: int | None = None,
+    person: bool = False,
+    clock: float | None = None,
+    effects_from: list[Path] | None = None,
 ) -> None:
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
     t, catalogue = terminal(False), catalogue_with(effects_from)

@@ -8,18 +8,12 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
 
 from hilcal.cell import Cell
 from hilcal.cli.options import (
     POSES,
-    CellFile,
-    EffectsFrom,
-    Json,
-    PlanFile,
-    View,
     catalogue_with,
-    option,
+    command,
 )
 from hilcal.cli.planning import answer_json, dry_checked, make_checked, read_cell, refuse_unready
 from hilcal.cli.showing import followed
@@ -53,34 +47,30 @@ from hilcal.store.plan import Plan, load_plan
 from hilcal.store.run_log import RunLog, check_same_cell, create_run
 
 
+@command(
+    """
+    output | -o --output RUN.hilcal | The campaign file.
+    resume | --resume | Go on with what is missing in RUN.hilcal.
+    append | --append | Measure a further plan into RUN.hilcal, see hilcal next.
+    rehearse | --rehearse | On simulated devices, started for this run.
+    until | --until GOAL | End as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std <
+        20 um": the arm goes home, and the load is taken off. Exit 4 where all readings do not do;
+        they are kept.
+    yes | --yes -y | Without --plan: do not ask whether to measure what was planned.
+    """
+)
 def run(
-    cell: CellFile,
-    output: Annotated[Path, option("-o --output RUN.hilcal", "The campaign file.")],
-    plan: PlanFile = None,
-    resume: Annotated[
-        bool, option("--resume", "Go on with what is missing in RUN.hilcal.")
-    ] = False,
-    append: Annotated[
-        bool, option("--append", "Measure a further plan into RUN.hilcal, see hilcal next.")
-    ] = False,
-    rehearse: Annotated[
-        bool, option("--rehearse", "On simulated devices, started for this run.")
-    ] = False,
-    until: Annotated[
-        str | None,
-        option(
-            "--until GOAL",
-            'End as soon as a goal is met, e.g. "joint std < 2 %" or "deflection std < 20 um": '
-            "the arm goes home, and the load is taken off. Exit 4 where all readings do not do; "
-            "they are kept.",
-        ),
-    ] = None,
-    yes: Annotated[
-        bool, option("--yes -y", "Without --plan: do not ask whether to measure what was planned.")
-    ] = False,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    output: Path,
+    plan: Path | None = None,
+    resume: bool = False,
+    append: bool = False,
+    rehearse: bool = False,
+    until: str | None = None,
+    yes: bool = False,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -2,16 +2,15 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
 
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.cli.options import Force, Json, argument, check_new, option
+from hilcal.cli.options import check_new, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine, other_arm
-from hilcal.identification.registration import Registration, register
+from hilcal.identification.registration import register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
@@ -26,37 +25,30 @@ from hilcal.present.registration import (
     registration_lines,
     torque_lines,
 )
-from hilcal.readings.readings import Readings
 from hilcal.tables.guessing.proposal import Proposal
 from hilcal.whole_file import replace_file
 
 
+@command(
+    """
+    table | TABLE | What was measured.
+    config | --config CELL.toml | The cell it was measured in.
+    output | -o --output RUN.hilcal | The campaign file to make; with --preview, the mapping file.
+    kind | --format FORMAT | table, ipa-ur10, a mapping that comes with the program, or a mapping
+        file.
+    second | --second TABLE | The second file, e.g. of the joints.
+    preview | --preview | Show how the table could be read; make no campaign.
+    """
+)
 def import_(
-    table: Annotated[Path, argument("TABLE", "What was measured.")],
-    config: Annotated[
-        Path | None, option("--config CELL.toml", "The cell it was measured in.")
-    ] = None,
-    output: Annotated[
-        Path | None,
-        option(
-            "-o --output RUN.hilcal", "The campaign file to make; with --preview, the mapping file."
-        ),
-    ] = None,
-    kind: Annotated[
-        str,
-        option(
-            "--format FORMAT",
-            "table, ipa-ur10, a mapping that comes with the program, or a mapping file.",
-        ),
-    ] = "table",
-    second: Annotated[
-        Path | None, option("--second TABLE", "The second file, e.g. of the joints.")
-    ] = None,
-    preview: Annotated[
-        bool, option("--preview", "Show how the table could be read; make no campaign.")
-    ] = False,
-    force: Force = False,
-    as_json: Json = False,
+    table: Path,
+    config: Path | None = None,
+    output: Path | None = None,
+    kind: str = "table",
+    second: Path | None = None,
+    preview: bool = False,
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Make a campaign file from a table of readings."""
     t = terminal(as_json)
@@ -115,13 +107,15 @@ def import_(
     )
 
 
-def _kind(readings: Readings) -> str:
+@command()
+def _kind(readings: str | None) -> None:
     if readings.observers:
         return observed_words(readings)
     return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
 
 
-def _registered(cell: Cell, readings: Readings) -> Registration | None:
+@command()
+def _registered(cell: Cell, readings: str | None) -> None:
     """Return the registration; None where the readings do not determine it."""
     try:
         return register(cell, readings)
@@ -129,7 +123,8 @@ def _registered(cell: Cell, readings: Readings) -> Registration | None:
         return None
 
 
-def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
+@command()
+def _targets(cell: Cell, readings: str | None) -> None:
     """Name, number of readings and whether the offset is known, of several targets."""
     if readings.states.target is None:
         return []
