@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.config.rig import PORT
-from hilcal.config.rig import ForceSensor as Section
+from hilcal.config.sections import PORT
+from hilcal.config.sections import ForceSensor as Section
 from hilcal.drivers.frame_losses import LossCounter
 from hilcal.drivers.frames import Deframer, FrameFormat
 from hilcal.drivers.serial_line import close_port, drain, line_failures, open_port

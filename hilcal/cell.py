@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName
 from hilcal.robot.arm import Arm

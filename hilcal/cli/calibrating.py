@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fits import PriorOptions
+from hilcal.cli.fitting import PriorOptions
 from hilcal.cli.options import (
     POSES,
     catalogue_with,
@@ -16,8 +16,7 @@ from hilcal.cli.options import (
 )
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapter_of, rows_of
-from hilcal.cli.rehearsing import lasting_cell, to_the_end
-from hilcal.cli.running import measure
+from hilcal.cli.running import lasting_cell, measure, to_the_end
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig

@@ -4,7 +4,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.fits import called, finish, fit_of, record_of, titles
+from hilcal.cli.fitting import called, finish, fit_of, record_of, titles
 from hilcal.cli.options import catalogue_with, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown

@@ -13,11 +13,11 @@ from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
-from hilcal.cli.fits import check_record, finish, record_story
+from hilcal.cli.fitting import check_record, finish, record_story
 from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import chapter_of, revisions_json, rows_of
-from hilcal.cli.rehearsing import (
+from hilcal.cli.running import (
     RehearsalSettings,
     RehearsedCampaign,
     first_plan,

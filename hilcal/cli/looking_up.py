@@ -222,8 +222,7 @@ def scaling(
 ) -> None:
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine.engine import open_engine
-    from hilcal.study.scaling import check, experiments, scaling_study
-    from hilcal.study.scaling_table import table
+    from hilcal.study.scaling import check, experiments, scaling_study, table
 
     t = terminal(as_json)
     check(runs)

@@ -9,7 +9,7 @@ import numpy as np
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fits import PriorOptions, check_record, effect_names, fit_of, fitted_with
+from hilcal.cli.fitting import PriorOptions, check_record, effect_names, fit_of, fitted_with
 from hilcal.cli.options import (
     POSES,
     catalogue_with,
@@ -177,7 +177,7 @@ def check(
     failed: HilcalError | None = None
     judged = None
     if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
-        from hilcal.cli.factory import factory_check  # which needs this file
+        from hilcal.cli.running import factory_check  # which needs this file
 
         judged = factory_check(t, config, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):

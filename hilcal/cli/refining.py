@@ -1,4 +1,4 @@
-"""`diagnose`, `add` and `refine`: which effect is missing, and what adding it does."""
+"""`diagnose`, `add`, `remove`, `refine`, `discover`: which effect is missing."""
 
 import itertools
 from collections.abc import Sequence
@@ -6,42 +6,51 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hilcal import numbers
+from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.fits import (
+from hilcal.cli.fitting import (
     PriorOptions,
     check_options,
     check_record,
     finish,
     fit_of,
     mode_of_option,
+    options_json,
+    options_line,
     record_story,
     stored_fit,
     wanted_effects,
 )
-from hilcal.cli.fitting import options_json, options_line
 from hilcal.cli.options import (
     catalogue_with,
+    check_folder,
     command,
 )
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.document import suspect_json, to_json
+from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
-from hilcal.discovery.document import laws_json
+from hilcal.discovery.discovery import discover as search
+from hilcal.discovery.discovery import rival_sources
+from hilcal.discovery.document import discovery_json, laws_json
 from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.background import background_of
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.torques import check_torques
+from hilcal.names import quoted
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
@@ -52,8 +61,8 @@ from hilcal.present.diagnosis import (
     rose,
     verdict_line,
 )
-from hilcal.present.discovery import refined_laws
-from hilcal.present.fit import follows, prior_lines, set_aside
+from hilcal.present.discovery import discovery_report, refined_laws, silence
+from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
 from hilcal.present.story import Chapter
@@ -62,6 +71,7 @@ from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import change
+from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -355,3 +365,86 @@ def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
         }
         for r in rows
     ]
+
+
+@command(
+    """
+    output | -o --output F.py | The effect, to be edited.
+    against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
+        baseline; or the file of an exported calibration, whose effects are fitted to this run.
+    alternatives | --alternatives | Also write laws that these readings do not tell from it:
+        F_or_1.py; hilcal next plans what separates them.
+    """
+)
+def discover(
+    run: Path,
+    output: Path,
+    against: str | None = None,
+    alternatives: bool = False,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
+) -> None:
+    """Search a law for what no effect explains, and write it as an effect."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    wanted = _effects_against(against, catalogue)
+    name = output.stem
+    if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
+        raise InputError(
+            f"-o {output}: the effect is called after its file; valid: lower-case letters, digits "
+            "and _, a letter first, .py at the end, and no name of the catalogue"
+        )
+    if wanted is not None and revision is not None:
+        raise InputError("--against and --revision: give one of them")
+    check_folder(output, f"-o {output}")
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number: int | None = None
+        if wanted is None:
+            number, found = fit_of(t, o, say, revision)
+        else:
+            check_options(o, wanted)
+            model = (
+                with_effects(o.cell, o.readings, o.mode(), wanted, wanted, catalogue)
+                if wanted
+                else baseline(o.cell, o.readings, o.mode(), catalogue)
+            )
+            say(f"fitting {model_name(model.named)}")
+            found = with_serial_noise(fit(model, o.readings, o.mode()))
+        d = search(found, say, name)
+    document = {"revision": number, **discovery_json(d), "written": None}
+    t.show(discovery_report(d))
+    if not d.laws:
+        t.document(document, CannotAnswerError(silence(d)))
+    rivals = rival_sources(d) if alternatives else {}
+    written = {name: d.source, **rivals}
+    places = {own: output.with_name(f"{own}.py") for own in written}
+    for own, source in written.items():
+        replace_file(places[own], source)
+    t.show(
+        f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
+    )
+    t.command(f"hilcal add {quoted(run)} {name} --effects-from {quoted(output)}")
+    t.command(f"hilcal diagnose {quoted(run)} --effects-from {quoted(output)}")
+    if alternatives and not rivals:
+        t.show("No other law explains these readings as well.")
+    if rivals:
+        t.show("Plan the measurements that separate it from what explains these readings as well:")
+        files = " ".join(f"--effects-from {quoted(places[own])}" for own in written)
+        t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {','.join(written)} {files}")
+    others = [{"name": own, "written": str(places[own])} for own in rivals]
+    t.document({**document, "written": str(output), "alternatives": others})
+
+
+def _effects_against(
+    model: str | None, catalogue: Catalogue
+) -> dict[str, dict[str, object]] | None:
+    """Read `--against`: options of effects by name; none of them for the baseline."""
+    if model == "baseline":
+        return {}
+    if model is None or not model.endswith(".json"):
+        return wanted_effects(model, catalogue)
+    return {
+        e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
+        for e in Calibration.load(model, catalogue).model.effects
+        if e.role not in FRAME_ROLES
+    }

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.fits import check_record, record_story
+from hilcal.cli.fitting import check_record, record_story
 from hilcal.cli.options import (
     catalogue_with,
     command,

@@ -6,20 +6,24 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
-from hilcal.config.joints import Conventions
-from hilcal.config.loads import CellLoad, Limits
-from hilcal.config.observers import Gauge, Point
-from hilcal.config.planning import Obstacle, Planning, Sight
-from hilcal.config.rig import (
+from hilcal.config.sections import (
     HOST,
     OPTIONS,
     PORT,
     ROTVEC,
     VECTOR_M,
     Acquire,
+    CellLoad,
+    Conventions,
     ForceSensor,
+    Gauge,
+    Limits,
     Motion,
+    Obstacle,
     Operator,
+    Planning,
+    Point,
+    Sight,
     Whole,
 )
 from hilcal.errors import InputError

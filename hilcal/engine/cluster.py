@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hilcal.engine.tasks import ClusterError, Task, deadly
+from hilcal.engine.processes import ClusterError, Task, deadly
 from hilcal.errors import InputError
 from hilcal.optional import needed_by
 

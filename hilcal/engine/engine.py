@@ -20,8 +20,7 @@ from typing import TypeVar
 import numpy as np
 
 from hilcal.engine.cluster import Cluster, cluster
-from hilcal.engine.processes import Processes, processes
-from hilcal.engine.tasks import Task, compute, versions
+from hilcal.engine.processes import Processes, Task, compute, processes, versions
 from hilcal.errors import InputError
 
 Item = TypeVar("Item")

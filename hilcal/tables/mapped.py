@@ -31,9 +31,9 @@ from hilcal.tables.mapping import (
     Std,
     Time,
 )
-from hilcal.tables.orientation import defect, rotations
 from hilcal.tables.table import ImportResult, readings_of
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
+from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
 
 MOST_LOST = 0.5

@@ -12,8 +12,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import ObserverKind
 from hilcal.robot.catalogue import configs_dir
-from hilcal.tables.orientation import CONVENTIONS, NUMBERS
-from hilcal.tables.units import SECONDS, Angle, Length, Temperature
+from hilcal.tables.units import CONVENTIONS, NUMBERS, SECONDS, Angle, Length, Temperature
 from hilcal.toml import NonNegative, Positive, Section, load_section, suggest
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge=1)]

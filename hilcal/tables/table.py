@@ -12,11 +12,11 @@ from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.tables import checks, columns
+from hilcal.tables.checks import observed_of, observer_columns
 from hilcal.tables.columns import following_columns, with_following
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapping import FileFormat
-from hilcal.tables.observed import observed_of, observer_columns
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
 from hilcal.toml import suggest

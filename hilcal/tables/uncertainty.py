@@ -12,7 +12,7 @@ from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables import units
 from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
-from hilcal.tables.orientation import angle_axes
+from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
 FAR = 5.0

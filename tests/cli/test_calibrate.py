@@ -26,7 +26,7 @@ def cell(tmp_path: Path) -> Path:
 def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     """A calibration that is complete, of the cell in `cell.toml` beside it."""
     path = tmp_path_factory.mktemp("run")
-    from hilcal.config.template import to_toml
+    from hilcal.config.reference import to_toml
 
     config = small(1)
     (path / "cell.toml").write_text(to_toml(config), encoding="utf-8")

@@ -341,7 +341,7 @@ def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     def started(*_: object) -> None:
         raise InputError("no devices here")
 
-    monkeypatch.setattr("hilcal.cli.rehearsing.simulated_cell", started)
+    monkeypatch.setattr("hilcal.cli.running.simulated_cell", started)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
     told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilcal.cli.rehearsing import RehearsalSettings, first_plan
+from hilcal.cli.running import RehearsalSettings, first_plan
 from hilcal.config import CellConfig, load_config
 from hilcal.drivers.simulated.rehearsal import (
     INVENTED,

@@ -9,7 +9,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor
 from hilcal.discovery.discovery import Discovery
@@ -95,7 +95,7 @@ def test_a_law_is_written_as_an_effect_and_told(
         ]
         return replace(d, structures=tuple(likely[: listed[0]]))
 
-    monkeypatch.setattr("hilcal.cli.discovering.search", search)
+    monkeypatch.setattr("hilcal.cli.refining.search", search)
     out = tmp_path / "bent.py"
     asked = ("-o", out, "--against", "joint_compliance", "--json")
     found = ok(capsys, "discover", campaign, *asked, "--alternatives")

@@ -9,8 +9,7 @@ import tomli_w
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.reference import tables
-from hilcal.config.template import SHOWN
+from hilcal.config.reference import SHOWN, tables
 from tests.support.cli_cases import ok, refused, run
 from tests.support.screen import AtTerminal
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.cli import demo
-from hilcal.cli.rehearsing import RehearsalSettings
+from hilcal.cli.running import RehearsalSettings
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.doubt import in_doubt

@@ -272,21 +272,23 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
         "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words",
     },
-    "cli/discovering": {
+    "cli/refining": {
         "hilcal add": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal diagnose": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal next": f"{DISCOVER}a_law_is_written_as_an_effect_and_told",
     },
-    "cli/doctor": {"hilcal config explains": f"{HERE}files_that_are_not_there_yet"},
     "cli/exporting": {
         "hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
         "run hilcal identify first": f"{HERE}without_a_revision",
     },
-    "cli/fits": {"hilcal identify keeps it": f"{HERE}without_a_revision"},
     "cli/fitting": {
-        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"
+        "hilcal identify keeps it": f"{HERE}without_a_revision",
+        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign",
     },
-    "cli/init": {"hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
+    "cli/preparing": {
+        "hilcal config explains": f"{HERE}files_that_are_not_there_yet",
+        "hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names",
+    },
     "cli/looking_up": {"hilcal diagnose RUN.hilcal": f"{HERE}an_effect_of_ones_own"},
     "cli/planning": {
         "hilcal run {}": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
@@ -299,7 +301,7 @@ TAKEN: dict[str, dict[str, str]] = {
     "config/cell": {
         "check CELL.toml --save-calibration": KINEMATICS,
     },
-    "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
+    "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
     "identification/earlier_fit": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
@@ -396,7 +398,7 @@ NO_STEP = {
     "present/viewer/plan",
     "procedure/procedure",
     "store/run_log",
-    "tables/guessing/proposal",
+    "tables/proposal",
     "workbench/server",
 }
 """Modules that name commands as where something comes from, or as a title."""
@@ -409,7 +411,7 @@ def sentences(path: Path) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             left_out.update(id(part) for part in node.values)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "argument"):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("command", "_declared"):
             left_out.update(id(given) for given in node.args)
     for node in ast.walk(tree):
         parts = node.values if isinstance(node, ast.JoinedStr) else [node]

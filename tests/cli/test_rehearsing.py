@@ -2,7 +2,7 @@
 
 import pytest
 
-from hilcal.cli.rehearsing import TRIES, to_the_end
+from hilcal.cli.running import TRIES, to_the_end
 from hilcal.cli.terminal import terminal
 from hilcal.errors import DeviceError, InputError
 

@@ -11,7 +11,7 @@ import pytest
 import hilcal.cli.running as running
 from hilcal.cli.terminal import terminal
 from hilcal.config import CellConfig, Repeatability
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.design import goal_rule
 from hilcal.design.goal_rule import GoalRule
 from hilcal.design.nominal_model import nominal_states

@@ -25,7 +25,7 @@ from playwright.sync_api import Browser, Locator, Page, expect
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.import_campaign import import_campaign
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file

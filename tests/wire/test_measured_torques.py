@@ -8,7 +8,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.drivers.simulated.ur.rtde import outputs_since
 from hilcal.drivers.ur import open_arm

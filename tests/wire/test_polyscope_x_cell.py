@@ -7,7 +7,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import CellConfig
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.factory import flange_difference, of_dict, read_factory, with_factory

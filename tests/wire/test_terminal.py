@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.cli.rehearsing import with_person
-from hilcal.config.template import to_toml
+from hilcal.cli.running import with_person
+from hilcal.config.reference import to_toml
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
 from tests.support.campaign_site import Site

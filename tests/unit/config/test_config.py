@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import STANDARD_GRAVITY, cell_from_config
 from hilcal.config import CellConfig, CellLoad, load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.catalogue import configs_dir

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
-from hilcal.tables.guessing.propose import propose
-from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping
+from hilcal.tables.propose import propose
+from hilcal.tables.sniff import sniff
 from hilcal.tables.table import ImportResult
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm

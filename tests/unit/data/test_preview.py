@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import Mapping, load_mapping
+from hilcal.tables.propose import propose
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign, lines, write
 

@@ -21,9 +21,9 @@ from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.tables.files import open_grid
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.propose import propose
 from hilcal.tables.table import import_table
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilcal.config import load_config
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.design.information import problem
 from hilcal.design.nominal_model import nominal_model
 from hilcal.errors import InputError

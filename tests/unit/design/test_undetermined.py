@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.loads import CellLoad
+from hilcal.config.sections import CellLoad
 from hilcal.design.information import DesignProblem, problem
 from hilcal.design.nominal_model import nominal_model, planned_effects
 from hilcal.design.planner import Request, make

@@ -17,7 +17,7 @@ import pytest
 
 from hilcal.engine.cluster import Cluster
 from hilcal.engine.engine import open_engine
-from hilcal.engine.tasks import ClusterError
+from hilcal.engine.processes import ClusterError
 from hilcal.errors import InputError
 from tests.support.cluster import (
     HERE,

@@ -31,8 +31,8 @@ from hilcal.store.plan import Plan, Step, load_plan, read_plan
 from hilcal.tables import parquet_stream
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import Grid, unique
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import FileFormat
+from hilcal.tables.propose import propose
 from hilcal.tables.table import write_table
 from hilcal.toml import parse_json, read_toml, suggest
 from hilcal.transfer.members import LIST, entries

@@ -14,9 +14,16 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, experiments, scaling_study
+from hilcal.study.scaling import (
+    CORRELATIONS,
+    CURVES,
+    UNITS,
+    ScalingStudy,
+    experiments,
+    scaling_study,
+    table,
+)
 from hilcal.study.scaling_design import TARGET, WRENCHES, StudyDesign, bound, make_design
-from hilcal.study.scaling_table import CURVES, table
 from hilcal.types import Floats
 
 SEED = 7

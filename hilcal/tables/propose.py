@@ -11,29 +11,30 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.readings import SAME_POSE
+from hilcal.tables import proposal as words
 from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
-from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.guess_values import (
+from hilcal.tables.guess_values import (
     guess_axes,
     guess_by_values,
     is_quaternion,
     time_unit,
 )
-from hilcal.tables.guessing.proposal import (
+from hilcal.tables.mapping import UNLOADED
+from hilcal.tables.proposal import (
     FEWEST_JOINTS,
     GUESSED,
     MOST_JOINTS,
     REPORTED,
     SHOWN,
+    ColumnName,
     Guesser,
     Proposal,
     angle_unit,
     length_unit,
+    parse,
 )
-from hilcal.tables.guessing.sniff import sniff
-from hilcal.tables.mapping import UNLOADED
+from hilcal.tables.sniff import sniff
 from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
 

@@ -5,19 +5,20 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.tables import proposal as words
 from hilcal.tables.grid import Grid
-from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.proposal import (
+from hilcal.tables.mapped import nines
+from hilcal.tables.proposal import (
     FAR,
     SHOWN,
     SIDE_BY_SIDE,
     TURN,
+    ColumnName,
     Guesser,
     angle_unit,
     length_unit,
+    parse,
 )
-from hilcal.tables.mapped import nines
 from hilcal.types import Floats
 
 NORM = 3e-3

@@ -1,27 +1,32 @@
-"""`init`: a CELL.toml to begin with, from questions or from options."""
+"""`init`: a CELL.toml to begin with; `doctor`: what an operator needs to know of this computer."""
 
 import re
 import sys
-from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import hilcal
 from hilcal.cell import cell_from_config
 from hilcal.cli.options import check_folder, check_new, command
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
-from hilcal.config import CellConfig
-from hilcal.config.planning import GEOMETRY, LOADED
-from hilcal.config.template import cell_text
+from hilcal.config import CellConfig, load_config
+from hilcal.config.reference import cell_text
+from hilcal.config.sections import GEOMETRY, LOADED
 from hilcal.design.nominal_model import check_effects
+from hilcal.doctor.computer import Finding, computer, program
+from hilcal.doctor.ports import adapters, reachable, serial_ports
+from hilcal.drivers.ur_link.services import services
 from hilcal.effects.catalogue import installed
-from hilcal.errors import InputError, StoppedError
+from hilcal.errors import DeviceError, HilcalError, InputError, StoppedError
 from hilcal.measuring import devices
 from hilcal.measuring.connect import driver
 from hilcal.names import quoted
 from hilcal.present.document import heading
+from hilcal.present.preparing import doctor_report, doctor_summary
+from hilcal.present.progress import working
 from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
 from hilcal.tables.units import METRIC
 from hilcal.toml import check_section
@@ -51,13 +56,63 @@ class Draft:
     data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
 
     def set(self, section: str, **values: object) -> None:
-        """Set keys of a section."""
+        """Set keys of a section; nothing is set where a value is not valid."""
         data = deepcopy(self.data)
         data.setdefault(section, {}).update(values)
         self._take(data)
 
-    def add_load(self, words: str) -> None:
-        """Add a load from words, see `LOADS`; raises as `set` does."""
+    def _take(self, data: dict[str, Any]) -> None:
+        check_section(data, CellConfig, "the answer")
+        self.data = data
+
+    def answer(self, asked: str, words: str) -> None:
+        """Put the answer to a question, by the parameter of its option, into the cell."""
+        match asked:
+            case "robot":
+                load_arm(words, self.base_dir)
+                self.set("robot", model=words)
+            case "host":
+                if not re.fullmatch(r"[\w.:-]+", words):
+                    raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
+                names = drivers(devices.ARMS)
+                self.set("robot", driver="ur" if "ur" in names else names[0], host=words)
+            case "repeatability":
+                self.set("robot", repeatability_m=number(words, "m"))
+            case "tracker":
+                driver(devices.TRACKERS, words, "[tracker] driver")
+                self.set("tracker", driver=words)
+            case "force_sensor":
+                driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
+                self.set("force_sensor", driver=words, port=SIMULATED)
+            case "tracker_port" | "force_port":  # a serial port, which is a path, or an address
+                section = {"tracker_port": "tracker", "force_port": "force_sensor"}[asked]
+                self.data[section].pop("port", None)
+                self.set(section, **{"port" if "/" in words else "host": words})
+            case "tracker_accuracy":
+                fixed, _, growing = words.partition("+")
+                std, per_m = number(fixed, "m"), number(growing, "m/m") if growing else 0.0
+                keys = ("range_std", "transverse_std")
+                values = {f"{k}_m": std for k in keys} | {f"{k}_per_m": per_m for k in keys}
+                self.set("tracker", **values)
+            case "target" | "load_point" | "tool_com":
+                key = {"target": "target_m", "load_point": "load_point_m", "tool_com": "com_m"}
+                self.set("tool", **{key[asked]: vector(words, "m")})
+            case "tool_mass":
+                self.set("tool", mass_kg=number(words, "kg"))
+            case "load":
+                self._add_load(words)
+            case "readings":
+                if words == "deflection" and not self.data.get("loads"):
+                    raise InputError('"deflection" needs a load; valid without one: absolute')
+                self.set("planning", readings=words)
+            case "floor":
+                reach = load_arm(self.data["robot"]["model"], self.base_dir).reach
+                side = round(2.0 * reach, 1)
+                self.set("limits", workspace_min_m=[-side, -side, number(words, "m")])
+            case "tracker_place":
+                self.set("sight", tracker_m=vector(words, "m"))
+
+    def _add_load(self, words: str) -> None:
         match = _LOAD.fullmatch(words)
         if match is None:
             raise InputError(f"{words!r} is no load; valid: {LOADS}")
@@ -66,56 +121,7 @@ class Draft:
             one["mass_kg"] = number(match["values"], "kg")
         else:
             one["force_N"] = vector(match["values"], "N")
-        data = deepcopy(self.data)
-        data.setdefault("loads", []).append(one)
-        self._take(data)
-
-    def _take(self, data: dict[str, Any]) -> None:
-        check_section(data, CellConfig, "the answer")
-        self.data = data
-
-    def robot(self, words: str) -> None:
-        """Set the arm."""
-        load_arm(words, self.base_dir)
-        self.set("robot", model=words)
-
-    def host(self, words: str) -> None:
-        """Set the address of the arm's controller, and its driver."""
-        if not re.fullmatch(r"[\w.:-]+", words):
-            raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
-        names = drivers(devices.ARMS)
-        self.set("robot", driver="ur" if "ur" in names else names[0], host=words)
-
-    def tracker(self, words: str) -> None:
-        """Set the tracker's driver."""
-        driver(devices.TRACKERS, words, "[tracker] driver")
-        self.set("tracker", driver=words)
-
-    def accuracy(self, words: str) -> None:
-        """Set the standard deviation of a point that the tracker measures."""
-        fixed, _, growing = words.partition("+")
-        std = number(fixed, "m")
-        per_m = number(growing, "m/m") if growing else 0.0
-        keys = ("range_std", "transverse_std")
-        self.set("tracker", **{f"{k}_m": std for k in keys}, **{f"{k}_per_m": per_m for k in keys})
-
-    def readings(self, words: str) -> None:
-        """Set what will be fitted."""
-        if words == "deflection" and not self.data.get("loads"):
-            raise InputError('"deflection" needs a load; valid without one: absolute')
-        self.set("planning", readings=words)
-
-    def force_sensor(self, words: str) -> None:
-        """Set the force sensor's driver."""
-        driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
-        self.set("force_sensor", driver=words, port=SIMULATED)
-
-    def floor(self, words: str) -> None:
-        """Set the height that the arm stays above."""
-        height = number(words, "m")
-        reach = load_arm(self.data["robot"]["model"], self.base_dir).reach
-        side = round(2.0 * reach, 1)
-        self.set("limits", workspace_min_m=[-side, -side, height])
+        self._take({**self.data, "loads": [*self.data.get("loads", ()), one]})
 
 
 def number(words: str, unit: str) -> float:
@@ -173,136 +179,52 @@ def ports() -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class Question:
     """One thing that is asked for."""
 
-    option: str  # that gives it without a question
-    question: str  # in words
-    take: Callable[[Draft, str], None]  # puts the answer into a draft
-    needs: str = ""  # section that must be there for it to be asked
-    again: bool = False  # whether there may be several
-    without: str = ""  # what an empty answer means
+    asked: str  # parameter of the option that gives it without a question
+    words: str
+    without: str = ""  # what an empty answer means; empty where there has to be one
+
+    @property
+    def option(self) -> str:
+        """The option that gives it without a question."""
+        return "--" + self.asked.replace("_", "-")
+
+    @property
+    def needs(self) -> str:
+        """The section that must be there for it to be asked."""
+        needed = {"tracker_port": "tracker", "force_port": "force_sensor", "tool_com": "tool"}
+        return needed.get(self.asked, "")
 
 
-def _set(section: str, key: str, read: Callable[[str], object]) -> Callable[[Draft, str], None]:
-    return lambda draft, words: draft.set(section, **{key: read(words)})
-
-
-def _connection(section: str) -> Callable[[Draft, str], None]:
-    """Take a serial port, which is a path, or an address."""
-
-    def take(draft: Draft, words: str) -> None:
-        draft.data[section].pop("port", None)
-        draft.set(section, **{"port" if "/" in words else "host": words})
-
-    return take
-
-
-def _metres(words: str) -> list[float]:
-    return vector(words, "m")
-
-
-def items() -> tuple[Item, ...]:
+def questions() -> list[Question]:
     """Return all that is asked for, in order."""
     trackers, sensors = drivers(devices.TRACKERS), drivers(devices.FORCE_SENSORS)
-    return (
-        Item(
-            "--robot",
-            f"Which arm? One of {', '.join(robot_names())}, or {OTHER_ARMS}",
-            Draft.robot,
-        ),
-        Item("--host", "Address of its controller", Draft.host, without="not connected yet"),
-        Item(
-            "--repeatability",
-            "What pose repeatability does its maker state (ISO 9283)? E.g. 0.05 mm",
-            _set("robot", "repeatability_m", lambda words: number(words, "m")),
-            without="that of the arm's file, if any",
-        ),
-        Item(
-            "--tracker",
-            f"Which tracker? {' or '.join(trackers)}",
-            Draft.tracker,
-            without="not connected yet",
-        ),
-        Item(
-            "--tracker-port",
-            "Its serial port, or its address in the network",
-            _connection("tracker"),
-            needs="tracker",
-            without="not connected yet",
-        ),
-        Item(
-            "--tracker-accuracy",
-            "How accurate is the tracker? Standard deviation of a point, half of its maximum "
-            "permissible error, e.g. 8 um + 3 um/m",
-            Draft.accuracy,
-            without="as a Leica AT500",
-        ),
-        Item(
-            "--force-sensor",
-            f"Which force sensor between flange and tool? {' or '.join(sensors)}",
-            Draft.force_sensor,
-            without="none",
-        ),
-        Item(
-            "--force-port",
-            "Its serial port, or its address in the network",
-            _connection("force_sensor"),
-            needs="force_sensor",
-            without="the simulated one, for a rehearsal",
-        ),
-        Item(
-            "--target",
-            "Where does the target sit? x, y, z in m, flange axes",
-            _set("tool", "target_m", _metres),
-            without="not known: it is estimated",
-        ),
-        Item(
-            "--load-point",
-            "Where do loads act? x, y, z in m, flange axes",
-            _set("tool", "load_point_m", _metres),
-            without="the flange's centre",
-        ),
-        Item(
-            "--tool-mass",
-            "Mass of the tool in kg",
-            _set("tool", "mass_kg", lambda words: number(words, "kg")),
-            without="0",
-        ),
-        Item(
-            "--tool-com",
-            "Its centre of mass, x, y, z in m, flange axes",
-            _set("tool", "com_m", _metres),
-            needs="tool",
-            without="the flange's centre",
-        ),
-        Item(
-            "--load",
-            f"Which loads are at hand? One at a time, {LOADS}",
-            Draft.add_load,
-            again=True,
-            without="no more",
-        ),
-        Item(
-            "--readings",
-            "What is to be calibrated? absolute: where the tool is, geometry and loads; "
-            "deflection: what loads do, and no geometry",
-            Draft.readings,
-            without="absolute",
-        ),
-        Item(
-            "--floor",
-            "What height must arm and load stay above? In m, base axes",
-            Draft.floor,
-            without="no limit",
-        ),
-        Item(
-            "--tracker-place",
-            "Where does the tracker stand, roughly? x, y, z in m, base axes",
-            _set("sight", "tracker_m", _metres),
-            without="not known: sight is not checked",
-        ),
-    )
+    written = f"""
+robot | Which arm? One of {", ".join(robot_names())}, or {OTHER_ARMS} |
+host | Address of its controller | not connected yet
+repeatability | What pose repeatability does its maker state (ISO 9283)? E.g. 0.05 mm |
+    that of the arm's file, if any
+tracker | Which tracker? {" or ".join(trackers)} | not connected yet
+tracker_port | Its serial port, or its address in the network | not connected yet
+tracker_accuracy | How accurate is the tracker? Standard deviation of a point, half of its maximum
+    permissible error, e.g. 8 um + 3 um/m | as a Leica AT500
+force_sensor | Which force sensor between flange and tool? {" or ".join(sensors)} | none
+force_port | Its serial port, or its address in the network | the simulated one, for a rehearsal
+target | Where does the target sit? x, y, z in m, flange axes | not known: it is estimated
+load_point | Where do loads act? x, y, z in m, flange axes | the flange's centre
+tool_mass | Mass of the tool in kg | 0
+tool_com | Its centre of mass, x, y, z in m, flange axes | the flange's centre
+load | Which loads are at hand? One at a time, {LOADS} | no more
+readings | What is to be calibrated? absolute: where the tool is, geometry and loads; deflection:
+    what loads do, and no geometry | absolute
+floor | What height must arm and load stay above? In m, base axes | no limit
+tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
+    not known: sight is not checked
+"""
+    lines = written.replace("\n    ", " ").strip().splitlines()
+    return [Question(*(part.strip() for part in line.split(" |"))) for line in lines]
 
 
 @command(
@@ -357,14 +279,14 @@ def init(
     draft = Draft(cell.absolute().parent)
     if there:
         t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
-    for item in items():
-        given = options[item.option]
+    for question in questions():
+        given = options[question.option]
         if given is not None:
             for words in given if isinstance(given, list) else [given]:
-                _from_option(draft, item, words)
+                _from_option(draft, question, words)
         elif there:
-            _ask(t, draft, item)
-        elif item.option == "--robot":
+            _ask(t, draft, question)
+        elif question.asked == "robot":
             raise InputError(
                 f"--robot is missing, and nobody can be asked; valid: {', '.join(robot_names())}, "
                 f"or {OTHER_ARMS}"
@@ -390,41 +312,41 @@ def _lacking(draft: Draft) -> str:
     return f", once it has {' and '.join(wanted)}" if wanted else ""
 
 
-def _from_option(draft: Draft, item: Item, words: str) -> None:
-    if item.needs and item.needs not in draft.data:
-        raise InputError(f"{item.option} without --{item.needs.replace('_', '-')}; give both")
+def _from_option(draft: Draft, question: Question, words: str) -> None:
+    if question.needs and question.needs not in draft.data:
+        raise InputError(
+            f"{question.option} without --{question.needs.replace('_', '-')}; give both"
+        )
     try:
-        item.take(draft, words.strip())
+        draft.answer(question.asked, words.strip())
     except InputError as error:
-        raise InputError(f'{item.option} "{words}": {_shortly(error)}') from None
+        raise InputError(f'{question.option} "{words}": {_shortly(error)}') from None
 
 
-def _ask(t: Terminal, draft: Draft, item: Item) -> None:
+def _ask(t: Terminal, draft: Draft, question: Question) -> None:
     """Ask until the answer is valid, or empty where that means something."""
-    if item.needs and item.needs not in draft.data:
+    if question.needs and question.needs not in draft.data:
         return
-    if item.option.endswith("-port"):
-        found = ports()
-        t.notice("Serial ports here: " + (", ".join(found) if found else "none") + ".")
-    hint = f" (Enter: {item.without})" if item.without else ""
-    question = f"{item.question}{hint}:"
+    if question.asked.endswith("_port"):
+        t.notice(f"Serial ports here: {', '.join(ports()) or 'none'}.")
+    words = question.words + (f" (Enter: {question.without}):" if question.without else ":")
     while True:
-        t.progress.print(question, markup=False, highlight=False, style="bold")
+        t.progress.print(words, markup=False, highlight=False, style="bold")
         t.progress.print("> ", end="", markup=False, highlight=False)
         answer = sys.stdin.readline()
         if not answer:
             raise StoppedError("nothing is written: the input ended")
         answer = answer.strip()
-        if not answer and item.without:
+        if not answer and question.without:
             return
         try:
-            item.take(draft, answer)
+            draft.answer(question.asked, answer)
         except InputError as error:
             t.notice(f"  Not so: {_shortly(error)}")
             continue
-        if not item.again:
+        if question.asked != "load":
             return
-        question = "Another one (Enter: no more):"
+        words = "Another one (Enter: no more):"
 
 
 def _shortly(error: InputError) -> str:
@@ -439,3 +361,58 @@ def _complete(draft: Draft) -> None:
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")
     check_effects(cell_from_config(config, draft.base_dir), config, installed())
+
+
+SIMULATED = "simulated"
+"""The port of a device that only the demo's own simulation has."""
+
+
+@command(
+    """
+    cell | CELL.toml | Also look at this cell's ports and addresses.
+    folder | --folder DIR | Where campaigns are stored.
+    """
+)
+def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
+    """Look at packages, ports, permissions, network, clock and disk of this computer."""
+    t = terminal(as_json)
+    findings: list[Finding] = []
+    with working(t.progress) as say:
+        say("looking at what is installed")
+        findings += program(hilcal.__version__)
+        say("looking at clock and disk")
+        findings += computer(folder.absolute())
+        config, of_cell = _cell(cell)
+        findings += of_cell
+        say("looking at serial ports")
+        findings += serial_ports(_ports(config), adapters())
+        if config is not None and config.robot.driver == "ur" and config.robot.host:
+            say(f"connecting to {config.robot.host}")
+            findings += reachable(config.robot.host, services(config))
+    t.show(doctor_report(findings))
+    failed: HilcalError | None = None
+    if any(f.state == "problem" for f in findings):
+        failed = DeviceError(doctor_summary(findings))
+    t.document({"ok": failed is None, "findings": [asdict(f) for f in findings]}, failed)
+
+
+def _cell(path: Path | None) -> tuple[CellConfig | None, list[Finding]]:
+    if path is None:
+        return None, []
+    try:
+        config = load_config(path)
+        cell_from_config(config, path.absolute().parent)  # its robot's file, too
+    except InputError as error:
+        mend = "mend the file; hilcal config explains every key"
+        return None, [Finding("cell", str(path), "problem", str(error), mend)]
+    return config, [Finding("cell", str(path), "ok", "can be read")]
+
+
+def _ports(config: CellConfig | None) -> dict[str, str]:
+    """Return the serial ports of a cell by device."""
+    if config is None:
+        return {}
+    ports = {"tracker": config.tracker.port}
+    if config.force_sensor is not None:
+        ports["force sensor"] = config.force_sensor.port
+    return {what: port for what, port in ports.items() if port and port != SIMULATED}
