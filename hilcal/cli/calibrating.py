@@ -59,10 +59,8 @@ from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
-FITTED_LATER = ("plan", "measure", "refine", "decide")
-"""Steps that a fit may follow."""
-LONGEST = "2 h"
-"""How long measuring may last; a choice."""
+FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
+LONGEST = "2 h"  # How long measuring may last; a choice
 
 
 @command(

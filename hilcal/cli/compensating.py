@@ -48,8 +48,7 @@ from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
 WRITTEN = (".csv", ".json", *PROGRAMS)
-NAMED = 5
-"""Refused points that an error names."""
+NAMED = 5  # Refused points that an error names
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -82,18 +82,12 @@ from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.records import content_hash
 
-STRENGTH = 4.0
-"""Of what is hidden, in units of the noise: clearly there in so few readings."""
-FIRST = 6
-"""Poses of the first campaign."""
-CANDIDATES = 60
-"""Poses that it is chosen from. A choice: planning takes a second."""
-ARMS = 4
-"""Arms that are drawn for one plan. A choice."""
-TRIES = 200
-"""Arms that are drawn at most. Of 10 seeds it took 1 to 32 and once 105, and 2 to 34 s."""
-DRAWS = 5
-"""Draws of the noise for which a rival has to be as good. A choice."""
+STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
+FIRST = 6  # Poses of the first campaign
+CANDIDATES = 60  # Poses that it is chosen from. A choice: planning takes a second
+ARMS = 4  # Arms that are drawn for one plan. A choice
+TRIES = 200  # Arms that are drawn at most. Of 10 seeds it took 1 to 32 and once 105, and 2 to 34 s
+DRAWS = 5  # Draws of the noise for which a rival has to be as good. A choice
 CAMPAIGNS = 3
 """First campaigns that are measured at most until one leaves a doubt. Without devices the first
 always does; of other draws of the noise four in five do (38 of 48)."""
@@ -207,8 +201,7 @@ def doubted(
 CELL = "demo_ur10e.toml"
 POSES = 20
 """Of the plan; a choice: with validation and corrected run it takes three and a half minutes."""
-VALIDATION = 10
-"""Poses of the validation campaign; a choice for the same reason."""
+VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
 @command(

@@ -32,10 +32,8 @@ from hilcal.tables.units import METRIC
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 
-SIMULATED = "simulated"
-"""Port of a force sensor that exists in the rehearsal only."""
-CLOCK = 20.0
-"""How much faster than real time a rehearsal goes, as in the demo's cell."""
+SIMULATED = "simulated"  # Port of a force sensor that exists in the rehearsal only
+CLOCK = 20.0  # How much faster than real time a rehearsal goes, as in the demo's cell
 UNITS: dict[str, dict[str, float]] = {
     "m": {**METRIC, "cm": 1e-2},
     "m/m": {"m/m": 1.0, "mm/m": 1e-3, "um/m": 1e-6, "µm/m": 1e-6, "μm/m": 1e-6},
@@ -363,8 +361,7 @@ def _complete(draft: Draft) -> None:
     check_effects(cell_from_config(config, draft.base_dir), config, installed())
 
 
-SIMULATED = "simulated"
-"""The port of a device that only the demo's own simulation has."""
+SIMULATED = "simulated"  # The port of a device that only the demo's own simulation has
 
 
 @command(

@@ -342,8 +342,7 @@ def _ends_as_interrupt(t: Terminal) -> Iterator[None]:
 
 
 TRIES = 4
-BREAK = 600.0
-"""Between two plans of a campaign that is drawn by lots, s."""
+BREAK = 600.0  # Between two plans of a campaign that is drawn by lots, s
 
 
 @dataclass(frozen=True, slots=True)
@@ -525,8 +524,7 @@ def lasting_cell(p: Procedure) -> Iterator[CellConfig]:
         yield there.config
 
 
-FASTEST = 200.0
-"""Clock of a simulated world, as `[simulation] clock` allows."""
+FASTEST = 200.0  # Clock of a simulated world, as `[simulation] clock` allows
 
 
 @command(

@@ -84,8 +84,7 @@ def report(
     )
 
 
-ENDING = 5.0
-"""How long a server of a page or a story may delay the end, s."""
+ENDING = 5.0  # How long a server of a page or a story may delay the end, s
 
 
 @command(

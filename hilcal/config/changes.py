@@ -13,8 +13,7 @@ from hilcal.config.cell import CellConfig
 from hilcal.errors import InputError
 from hilcal.toml import check_section, section_of, suggest
 
-Changes = Mapping[str, Mapping[str, Any]]
-"""Values by key, by section."""
+Changes = Mapping[str, Mapping[str, Any]]  # Values by key, by section
 
 INSTRUMENT_NOISE = (
     "range_std_m",

@@ -168,8 +168,7 @@ class Conventions(Section):
         return self
 
 
-HANG_M = 0.3
-"""Length of what hangs from the load point where a load with a mass does not say, m."""
+HANG_M = 0.3  # Length of what hangs from the load point where a load with a mass does not say, m
 
 
 class CellLoad(Section):

@@ -20,10 +20,8 @@ from hilcal.optional import needed_by
 if TYPE_CHECKING:  # takes half a second to import
     from distributed import Client
 
-ANSWER_S = 10.0
-"""How long a cluster's scheduler may take to answer; a choice."""
-WORKERS_S = 10.0
-"""How long a cluster may have no worker at the start; a choice."""
+ANSWER_S = 10.0  # How long a cluster's scheduler may take to answer; a choice
+WORKERS_S = 10.0  # How long a cluster may have no worker at the start; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)

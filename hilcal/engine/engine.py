@@ -65,8 +65,7 @@ class Engine:
         yield from self.workers.results(Task(function, versions()), items, seeds)
 
 
-ALONE = Engine(None)
-"""Computes in this process; BLAS has as many threads as it had."""
+ALONE = Engine(None)  # Computes in this process; BLAS has as many threads as it had
 
 
 @contextmanager

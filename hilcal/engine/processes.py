@@ -33,8 +33,7 @@ from hilcal.errors import HilcalError, InputError
 
 Versions = tuple[tuple[str, str], ...]
 
-DEATHS = 3
-"""Workers that one item may take with it before it is given up; Dask's own, a choice."""
+DEATHS = 3  # Workers that one item may take with it before it is given up; Dask's own, a choice
 
 
 class ClusterError(HilcalError):

@@ -197,12 +197,9 @@ Result = TypeVar("Result")
 SAMPLE = 2000
 """Readings that registration, starting model and starting values are taken from; a choice: enough
 for every effect of the catalogue, and a fit of a second."""
-NAMED = 10
-"""Gross errors that are named; a choice."""
-OUTLIER_ROUNDS = 2
-"""Searches for gross errors, each followed by a new fit; a choice."""
-MAX_OUTLIER_SHARE = 0.05
-"""Most readings that are set aside, as a share; a choice: more is a misfit."""
+NAMED = 10  # Gross errors that are named; a choice
+OUTLIER_ROUNDS = 2  # Searches for gross errors, each followed by a new fit; a choice
+MAX_OUTLIER_SHARE = 0.05  # Most readings that are set aside, as a share; a choice: more is a misfit
 
 Counting = Callable[[str, int], AbstractContextManager[Advance]]
 

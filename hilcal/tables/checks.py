@@ -193,8 +193,7 @@ def check_same_pose(table: ColumnTable, pose: Ints, names: list[str], q: Floats)
         )
 
 
-MAIN = ObserverName("station", "tracker")
-"""The station of positions that name none."""
+MAIN = ObserverName("station", "tracker")  # The station of positions that name none
 KINDS: tuple[ObserverKind, ...] = ("point", "gauge")
 
 

@@ -351,8 +351,7 @@ def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
         )
 
 
-SEPARATORS = {"tab": "\t", "blanks": " "}
-"""Separators that have a name in a mapping file."""
+SEPARATORS = {"tab": "\t", "blanks": " "}  # Separators that have a name in a mapping file
 
 BYTE_ORDER_MARKS = {
     b"\xef\xbb\xbf": "utf-8-sig",

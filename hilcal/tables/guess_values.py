@@ -21,8 +21,7 @@ from hilcal.tables.proposal import (
 )
 from hilcal.types import Floats
 
-NORM = 3e-3
-"""How far the length of a quaternion may be from 1: three digits."""
+NORM = 3e-3  # How far the length of a quaternion may be from 1: three digits
 FORMATS = (
     "%d.%m.%Y %H:%M:%S",
     "%d.%m.%Y %H:%M:%S.%f",
@@ -36,8 +35,7 @@ FORMATS = (
     "%H:%M:%S.%f",
 )
 """Forms of dates that are tried, in this order."""
-RIVAL = 0.5
-"""Difference of the score within which another choice of columns is as good; a choice."""
+RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
 BY_VALUES = "found by their values: check the columns"
 RIVALS = "as good by their values:"
 _EXCEL = (30000.0, 60000.0)
@@ -205,8 +203,7 @@ Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
-LARGE = 1e-6
-"""m²; a larger variance, of more than 1 mm, is in mm²."""
+LARGE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
 def guess_axes(g: Guesser) -> None:

@@ -19,8 +19,7 @@ from hilcal.tables.uncertainty import rounding_variance
 from hilcal.toml import suggest
 from hilcal.types import Bools
 
-TABLE = "table"
-"""The exchange table: the format that is read without a mapping."""
+TABLE = "table"  # The exchange table: the format that is read without a mapping
 
 
 def import_readings(

@@ -41,25 +41,17 @@ MOST_LOST = 0.5
 UNIT_LENGTH = 0.01
 """How far a quaternion's length may be from 1, and a matrix from orthogonal; rounding to three
 digits stays below."""
-MOST_TURN = 2 * np.pi + 1e-3
-"""rad; a larger angle of an orientation is in another unit."""
-MOVED = 0.01
-"""rad; a joint commanded by more is sent to another pose; a choice."""
-STILL = 1e-4
-"""rad; a joint commanded by less did not move far enough to arrive from another side."""
-SIGMAS = 4.0
-"""Standard deviations within which two readings are the same; a choice."""
-REPEATED = 2e-4
-"""rad; rows whose joints differ by less repeat a pose; a choice."""
+MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
+MOVED = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
+STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
+SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
+REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4
 """m; ten times what an arm repeats to: positions of one pose that differ by more are not all right.
 A choice."""
-TOOL = 0.5
-"""m; the longest tool, beside the arm's reach a lever of its joints; a choice."""
-GRAVITY = (0.0, 0.0, -9.80665)
-"""m/s², base axes, of an arm that stands upright."""
-EPOCH = 1e8
-"""s; times beyond three years are counted from an epoch, not from the campaign's start."""
+TOOL = 0.5  # m; the longest tool, beside the arm's reach a lever of its joints; a choice
+GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
+EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 TARGET = "target of [position]"
 _DAY = 86400.0
 _EXPECTED = {

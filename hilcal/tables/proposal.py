@@ -167,10 +167,8 @@ def _unit(name: str) -> tuple[str, str | None]:
     return plain, None
 
 
-TURN = 2 * np.pi + 0.1
-"""rad; a larger angle is in degrees."""
-FAR = 50.0
-"""A position beyond this number is in millimetres: no arm is measured from 50 m."""
+TURN = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
+FAR = 50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
 GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
 SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
 REPORTED = 5e-3

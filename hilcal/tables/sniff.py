@@ -25,8 +25,7 @@ from hilcal.tables.files import (
 from hilcal.tables.grid import Cell, Grid, number
 from hilcal.tables.mapping import FileFormat
 
-HEAD = 400
-"""Lines that the dialect is guessed from."""
+HEAD = 400  # Lines that the dialect is guessed from
 COMMENTS = ("//", "#", "%", "!")
 _UNIT = re.compile(
     r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"

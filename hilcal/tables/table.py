@@ -26,8 +26,7 @@ FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
-LARGEST_NM = 1e5
-"""No joint of an arm carries as much, N·m."""
+LARGEST_NM = 1e5  # No joint of an arm carries as much, N·m
 FORM = FileFormat(encoding="utf-8")
 
 

@@ -15,10 +15,8 @@ from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
 from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
-FAR = 5.0
-"""Ratio of stated and instrument's standard deviation that is worth a word; a choice."""
-NEAR = 3.0
-"""Ratio within which another reading of the figures fits the instrument; a choice."""
+FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a word; a choice
+NEAR = 3.0  # Ratio within which another reading of the figures fits the instrument; a choice
 LEAST = (1e-7, 1e-7)
 """m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
 the resolution of the best."""
