@@ -3,6 +3,7 @@
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from hilcal.cli.terminal import Terminal, terminal
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.full_covariance import covariance_parts
 from hilcal.identification.misdescription import examine, other_arm
-from hilcal.identification.registration import register
+from hilcal.identification.registration import Registration, register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
@@ -31,6 +32,7 @@ from hilcal.present.registration import (
     torque_lines,
 )
 from hilcal.readings.covariance import COVERS
+from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
@@ -119,15 +121,13 @@ def import_(
     )
 
 
-@command()
-def _kind(readings: str | None) -> None:
+def _kind(readings: Readings) -> str:
     if readings.observers:
         return observed_words(readings)
     return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
 
 
-@command()
-def _registered(cell: Cell, readings: str | None) -> None:
+def _registered(cell: Cell, readings: Readings) -> Registration | None:
     """Return the registration; None where the readings do not determine it."""
     try:
         return register(cell, readings)
@@ -135,8 +135,7 @@ def _registered(cell: Cell, readings: str | None) -> None:
         return None
 
 
-@command()
-def _targets(cell: Cell, readings: str | None) -> None:
+def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
     """Name, number of readings and whether the offset is known, of several targets."""
     if readings.states.target is None:
         return []

@@ -38,6 +38,7 @@ from hilcal.present.registration import covariance_words, other_arm_line, torque
 from hilcal.present.story import Chapter, build_story
 from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
+from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
 from hilcal.store.revision import RevisionRecord
@@ -151,16 +152,14 @@ def chosen(found: Fit) -> dict[str, dict[str, object]]:
     return chosen_of(found.model, found.readings)
 
 
-@command()
-def chosen_of(model: Model, readings: str | None) -> None:
+def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
     """Options of the effects of a model that are not the usual ones for its readings, by name."""
     named = (e for e in model.effects if e.name not in model.background)
     options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
     return {name: given for name, given in options.items() if given}
 
 
-@command()
-def titles(model: Model, readings: str | None) -> None:
+def titles(model: Model, readings: Readings) -> tuple[str, ...]:
     """Names of a model's effects, with the options that are not the usual ones."""
     given = chosen_of(model, readings)
     return tuple(write_effect(name, given.get(name, {})) for name in model.named)

@@ -3,8 +3,10 @@
 import inspect
 import re
 from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, TypeVar, cast
 
 import typer
 
@@ -80,15 +82,35 @@ Scheduler = Annotated[str | None, SHARED["scheduler"]]
 
 
 def command(text: str = "") -> Callable[[F], F]:
-    """Declare the parameters of a command by entries of a text, else as `SHARED` has them."""
-    known, annotated = SHARED | _declared(text), Annotated
+    """Declare the parameters of a command by entries of a text, else as `SHARED` has them.
+
+    A parameter that is a dataclass stands for its fields: they are options of the command.
+    """
+    known, annotated = SHARED | _declared(text), cast(Any, Annotated)
 
     def declare(function: F) -> F:
-        made: Any = annotated
-        kinds = function.__annotations__
-        shown = {name: made[kind, known[name]] for name, kind in kinds.items() if name in known}
-        function.__annotations__ = kinds | shown
-        return function
+        given = inspect.signature(function).parameters.values()
+        joint = {p.name: p.annotation for p in given if is_dataclass(p.annotation)}
+        shown = []
+        for p in given:
+            parts = (
+                inspect.signature(joint[p.name]).parameters.values() if p.name in joint else (p,)
+            )
+            for part in parts:
+                info = known.get(part.name)
+                kind = annotated[part.annotation, info] if info else part.annotation
+                shown.append(part.replace(annotation=kind))
+
+        @wraps(function)
+        def whole(**options: Any) -> None:
+            for name, kind in joint.items():
+                options[name] = kind(**{f.name: options.pop(f.name) for f in fields(kind)})
+            function(**options)
+
+        declared: Any = whole
+        declared.__signature__ = inspect.Signature(shown)
+        declared.__annotations__ = {p.name: p.annotation for p in shown}
+        return cast(F, whole)
 
     return declare
 

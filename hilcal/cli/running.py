@@ -72,6 +72,7 @@ from hilcal.present.running import factory_words, full_words, missed_words, watc
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import WORLD
 from hilcal.readings.covariance import COVERS, WHOLE
+from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan, with_new_names
 from hilcal.store.procedure_log import ProcedureLog
@@ -461,8 +462,7 @@ def in_process(t: Terminal, told: RehearsalSettings, plan: Plan) -> Iterator[Reh
         yield RehearsedCampaign(measured(plan, 1, 0.0), further, missing)
 
 
-@command()
-def last_time(readings: str | None) -> None:
+def last_time(readings: Readings) -> float:
     """Return when the last reading was taken, s; 0 where that is not known."""
     time = readings.states.time
     return 0.0 if time is None else float(time.max())
@@ -489,8 +489,7 @@ def to_the_end(t: Terminal, work: Callable[[], object], done: Callable[[], int])
             return
 
 
-@command()
-def _write(t: Terminal, campaign: CampaignFile, readings: str | None) -> None:
+def _write(t: Terminal, campaign: CampaignFile, readings: Readings) -> None:
     """Append readings in their order, pose after pose."""
     starts = [0, *(np.flatnonzero(np.diff(readings.pose)) + 1).tolist(), len(readings)]
     with counting(t.progress, "measuring poses", len(starts) - 1) as advance:
