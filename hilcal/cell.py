@@ -214,11 +214,7 @@ def cell_from_config(
     """
     robot, tool, tracker = config.robot, config.tool, config.tracker
     arm = load_arm(
-        robot.model,
-        base_dir,
-        base_link=robot.base_link,
-        tip_link=robot.tip_link,
-        text=robot_file,
+        robot.model, base_dir, base_link=robot.base_link, tip_link=robot.tip_link, text=robot_file
     )
     factory = None
     if robot.calibration is not None:

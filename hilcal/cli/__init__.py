@@ -125,8 +125,7 @@ def _version(asked: bool) -> None:
 
 def _top(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Calibrate a robot arm: fit, see where the model fails, name and add what is missing."""

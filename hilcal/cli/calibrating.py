@@ -9,11 +9,7 @@ from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.cli.fitting import PriorOptions
-from hilcal.cli.options import (
-    POSES,
-    catalogue_with,
-    command,
-)
+from hilcal.cli.options import POSES, catalogue_with, command
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapter_of, rows_of
 from hilcal.cli.running import lasting_cell, measure, to_the_end
@@ -120,7 +116,7 @@ def calibrate(
             f"names it; give it yourself: --prior {quoted(kept)}"
         )
     if p.settings.prior is not None and p.next().kind in FITTED_LATER:
-        known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)
+        known = PriorOptions(Path(p.settings.prior)).load(catalogue)
         p = replace(p, known=known)
     if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
         raise InputError(

@@ -25,12 +25,7 @@ from hilcal.present.fit import (
     worst_table,
 )
 from hilcal.present.progress import working
-from hilcal.present.validation import (
-    opening,
-    shares_report,
-    validation_failure,
-    validation_report,
-)
+from hilcal.present.validation import opening, shares_report, validation_failure, validation_report
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.validation import validate as validate_campaign

@@ -14,30 +14,15 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
-from hilcal.calibration.urscript import (
-    JOINTS,
-    Waypoint,
-    movej_program,
-    program_points,
-    with_joints,
-)
+from hilcal.calibration.urscript import JOINTS, Waypoint, movej_program, program_points, with_joints
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import (
-    catalogue_with,
-    check_new,
-    command,
-)
+from hilcal.cli.options import catalogue_with, check_new, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
-from hilcal.present.calibration import (
-    compensation_report,
-    fates,
-    refusals,
-    waypoints_table,
-)
+from hilcal.present.calibration import compensation_report, fates, refusals, waypoints_table
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -299,11 +284,7 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
 
 
 def _write(
-    path: Path,
-    task: _Task,
-    found: Compensation,
-    document: dict[str, object],
-    units: Sequence[str],
+    path: Path, task: _Task, found: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
     """Write the joint values as the file's name asks; returns the files."""
     names, n = task.points.names, found.q.shape[1]

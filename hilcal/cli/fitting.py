@@ -9,12 +9,7 @@ from hilcal import numbers
 from hilcal.calibration.streamed import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.cli.options import (
-    catalogue_with,
-    check_folder,
-    check_workers,
-    command,
-)
+from hilcal.cli.options import catalogue_with, check_folder, check_workers, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
@@ -185,25 +180,28 @@ def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> Non
 
 @dataclass(frozen=True, slots=True)
 class PriorOptions:
-    """The options as they were given."""
+    """The options of a prior as they were given."""
 
-    path: Path | None
-    relation: str
-    drift: str | None
+    prior: Path | None = None
+    prior_of: str = "arm"
+    drift: str | None = None
 
     def load(self, catalogue: Catalogue) -> CarriedPrior | None:
         """Return the prior; None where none is asked for."""
-        if self.path is None:
+        if self.prior is None:
             if self.drift is not None:
                 raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
             return None
         from hilcal.library import load_posterior  # imports all that a script can do
 
-        posterior = load_posterior(self.path, catalogue)
+        posterior = load_posterior(self.prior, catalogue)
         try:
-            return carried_prior(posterior, self.relation, _drifts(self.drift), catalogue)
+            return carried_prior(posterior, self.prior_of, _drifts(self.drift), catalogue)
         except InputError as error:
-            raise InputError(f"--prior {self.path}: {error}") from None
+            raise InputError(f"--prior {self.prior}: {error}") from None
+
+
+NO_PRIOR = PriorOptions()
 
 
 def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
@@ -249,9 +247,7 @@ def identify(
     scaling: str = "gc",
     readings: str | None = None,
     fit_validation: bool = False,
-    prior: Path | None = None,
-    prior_of: str = "arm",
-    drift: str | None = None,
+    prior: PriorOptions = NO_PRIOR,
     effects_from: list[Path] | None = None,
     cell: Path | None = None,
     out: Path | None = None,
@@ -266,7 +262,7 @@ def identify(
     """
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
-    known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    known = prior.load(catalogue)
     if run.suffix == ".parquet" or is_parquet(run):
         if scaling != "gc" or readings not in (None, "absolute") or fit_validation:
             raise InputError(

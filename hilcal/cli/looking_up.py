@@ -8,12 +8,7 @@ from pathlib import Path
 import numpy as np
 import typer
 
-from hilcal.cli.options import (
-    catalogue_with,
-    check_seed,
-    command,
-    one_by_default,
-)
+from hilcal.cli.options import catalogue_with, check_seed, command, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.config import reference
 from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
@@ -32,11 +27,7 @@ from hilcal.identification.fit_document import plain
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.document import Table, note, table
-from hilcal.present.preparing import (
-    reference_page,
-    section_report,
-    sections_overview,
-)
+from hilcal.present.preparing import reference_page, section_report, sections_overview
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file

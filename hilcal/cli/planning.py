@@ -9,13 +9,15 @@ import numpy as np
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fitting import PriorOptions, check_record, effect_names, fit_of, fitted_with
-from hilcal.cli.options import (
-    POSES,
-    catalogue_with,
-    check_seed,
-    command,
+from hilcal.cli.fitting import (
+    NO_PRIOR,
+    PriorOptions,
+    check_record,
+    effect_names,
+    fit_of,
+    fitted_with,
 )
+from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.checked_plan import CheckedPlan, checked, refusal
@@ -85,9 +87,7 @@ def plan(
     criterion: str | None = None,
     after: Path | None = None,
     revision: int | None = None,
-    prior: Path | None = None,
-    prior_of: str = "arm",
-    drift: str | None = None,
+    prior: PriorOptions = NO_PRIOR,
     seed: int = 0,
     unloaded_first: bool = False,
     quick: bool = False,
@@ -102,9 +102,9 @@ def plan(
     check_record(record)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
-    if prior is not None and after is not None:
+    if prior.prior is not None and after is not None:
         raise InputError("--after has the prior of its revision; leave out --prior")
-    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
+    carried = prior.load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and canonical(criterion) not in CRITERIA:
@@ -285,9 +285,7 @@ def next_(
     quick: bool = False,
     csv: Path | None = None,
     revision: int | None = None,
-    prior: Path | None = None,
-    prior_of: str = "arm",
-    drift: str | None = None,
+    prior: PriorOptions = NO_PRIOR,
     record: Path | None = None,
     effects_from: list[Path] | None = None,
     details: bool = False,
@@ -296,7 +294,7 @@ def next_(
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
+    carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
@@ -318,12 +316,7 @@ def next_(
         f"--plan {quoted(output)}"
     )
     t.document(
-        {
-            **made.to_dict(),
-            "plan": str(output),
-            "suspects": list(effects),
-            **separates(found),
-        }
+        {**made.to_dict(), "plan": str(output), "suspects": list(effects), **separates(found)}
     )
 
 

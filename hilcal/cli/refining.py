@@ -10,6 +10,7 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
 from hilcal.cli.fitting import (
+    NO_PRIOR,
     PriorOptions,
     check_options,
     check_record,
@@ -22,11 +23,7 @@ from hilcal.cli.fitting import (
     stored_fit,
     wanted_effects,
 )
-from hilcal.cli.options import (
-    catalogue_with,
-    check_folder,
-    command,
-)
+from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.document import suspect_json, to_json
@@ -231,9 +228,7 @@ def refine(
     readings: str | None = None,
     from_latest: bool = False,
     revision: int | None = None,
-    prior: Path | None = None,
-    prior_of: str = "arm",
-    drift: str | None = None,
+    prior: PriorOptions = NO_PRIOR,
     discover: bool = False,
     background: bool = True,
     record: Path | None = None,
@@ -247,10 +242,10 @@ def refine(
     named = wanted_effects(effects, catalogue)
     check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
-    given = named is not None or readings is not None or prior is not None
+    given = named is not None or readings is not None or prior.prior is not None
     if start and (given or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
-    known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    known = prior.load(catalogue)
     laws = LawSearch(run.absolute().parent) if discover else None
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         refuse_fitting(o.file)

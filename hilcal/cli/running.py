@@ -15,12 +15,7 @@ import numpy as np
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.options import (
-    POSES,
-    catalogue_with,
-    check_seed,
-    command,
-)
+from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.planning import (
     answer_json,
     dry_checked,

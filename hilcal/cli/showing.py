@@ -12,10 +12,7 @@ from pathlib import Path
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.cli.fitting import check_record, record_story
-from hilcal.cli.options import (
-    catalogue_with,
-    command,
-)
+from hilcal.cli.options import catalogue_with, command
 from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.errors import InputError
 from hilcal.names import quoted
@@ -116,10 +113,7 @@ def view(
         story = build_story(chapters)
     guard = _end_of_process()  # a viewer that does not answer may delay it; the campaign is closed
     try:
-        with (
-            told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
-            serve(story, port=port) as served,
-        ):
+        with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as served:
             t.show("Open the viewer with:")
             t.command(f"{viewer_command()} {served.url}")
             t.document({"url": served.url, "revisions": [c.number for c in chapters]})

@@ -27,15 +27,7 @@ from hilcal.config.sections import (
     Whole,
 )
 from hilcal.errors import InputError
-from hilcal.toml import (
-    NonNegative,
-    Positive,
-    Section,
-    Vector3,
-    check_json,
-    load_section,
-    suggest,
-)
+from hilcal.toml import NonNegative, Positive, Section, Vector3, check_json, load_section, suggest
 from hilcal.types import Floats
 
 STANDARD_GRAVITY_M_S2 = 9.80665

@@ -26,10 +26,7 @@ INSTRUMENT_NOISE = (
 CHANGEABLE: Mapping[str, tuple[str, ...]] = {
     "tracker": (*INSTRUMENT_NOISE, "base_xyz_m", "base_rotvec_rad", "station_m"),
     "repeatability": ("joint_std_rad",),
-    "tool": (
-        *("target_m", "target_rotvec_rad", "targets", "load_point_m"),
-        *("mass_kg", "com_m"),
-    ),
+    "tool": (*("target_m", "target_rotvec_rad", "targets", "load_point_m"), *("mass_kg", "com_m")),
 }
 """Keys that can be changed, by section."""
 _WHERE = "the cell"

@@ -50,10 +50,7 @@ class Engine:
         return tuple(found[k] for k in range(len(items)))
 
     def results(
-        self,
-        function: Callable[..., Result],
-        items: Sequence[Item],
-        seed: int | None = None,
+        self, function: Callable[..., Result], items: Sequence[Item], seed: int | None = None
     ) -> Iterator[tuple[int, Result]]:
         """Yield (number of the item, result) as they are done, in no order; see `map`."""
         count = len(items)

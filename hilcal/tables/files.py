@@ -353,11 +353,7 @@ def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
 
 SEPARATORS = {"tab": "\t", "blanks": " "}  # Separators that have a name in a mapping file
 
-BYTE_ORDER_MARKS = {
-    b"\xef\xbb\xbf": "utf-8-sig",
-    b"\xff\xfe": "utf-16",
-    b"\xfe\xff": "utf-16",
-}
+BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 
 def decoded(path: str, content: bytes, encoding: str | None) -> str:

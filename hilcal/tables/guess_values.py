@@ -299,11 +299,7 @@ def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
     if stem in angles:
         _by_axes(g, [angles[stem][axis] for axis in "xyz"])
         return
-    for letters, convention in (
-        ("wpr", "fanuc"),
-        ("abc", "kuka"),
-        ("oat", "kawasaki"),
-    ):
+    for letters, convention in (("wpr", "fanuc"), ("abc", "kuka"), ("oat", "kawasaki")):
         by_letter = {c.name.strip().lower(): c.name for c in g.columns if c.name in g.free}
         plain = {key.split("[")[0].split("(")[0].strip(): name for key, name in by_letter.items()}
         if all(letter in plain and g.number(plain[letter]) for letter in letters):

@@ -23,11 +23,7 @@ TABLE = "table"  # The exchange table: the format that is read without a mapping
 
 
 def import_readings(
-    path: Path,
-    form: str | Path | Mapping,
-    config: CellConfig,
-    arm: Arm,
-    second: Path | None = None,
+    path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
 ) -> ImportResult:
     """Read a table into a cell.
 

@@ -21,12 +21,7 @@ from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
 from hilcal.tables.files import is_plain, package
 from hilcal.tables.grid import ColumnTable
-from hilcal.tables.table import (
-    check_covers,
-    instrument_covariance,
-    measured_of,
-    stated_covariance,
-)
+from hilcal.tables.table import check_covers, instrument_covariance, measured_of, stated_covariance
 from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
 from hilcal.types import Floats
 

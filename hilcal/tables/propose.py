@@ -14,12 +14,7 @@ from hilcal.readings.readings import SAME_POSE
 from hilcal.tables import proposal as words
 from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
-from hilcal.tables.guess_values import (
-    guess_axes,
-    guess_by_values,
-    is_quaternion,
-    time_unit,
-)
+from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
 from hilcal.tables.mapping import UNLOADED
 from hilcal.tables.proposal import (
     FEWEST_JOINTS,
@@ -134,10 +129,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
         g.unsure("orientation", GUESSED)
     for what, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
-        (
-            "joints",
-            "no joint angles: where they are in a file of their own, give it with --second",
-        ),
+        ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
     ):
         if what not in g.proposal.sections and not (what == "position" and read):
             g.proposal.lacking.append(sentence)

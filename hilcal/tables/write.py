@@ -141,9 +141,7 @@ def _number(value: Any) -> float | None:
 
 
 def plan_csv(
-    plan: Plan,
-    wrenches: Mapping[str, Floats] | None = None,
-    units: Sequence[str] | None = None,
+    plan: Plan, wrenches: Mapping[str, Floats] | None = None, units: Sequence[str] | None = None
 ) -> str:
     """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
 

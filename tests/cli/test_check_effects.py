@@ -17,10 +17,7 @@ Capsys = pytest.CaptureFixture[str]
             "[planning] model: unknown effect 'joint_complianse' (did you mean "
             '"joint_compliance"?); valid: ',
         ),
-        (
-            '[planning]\nmodel = ["joint_compliance(joints=2-9)"]',
-            "[planning] model: ",
-        ),
+        ('[planning]\nmodel = ["joint_compliance(joints=2-9)"]', "[planning] model: "),
         (
             '[planning]\nagainst = ["creap"]',
             "[planning] against: unknown effect 'creap' (did you mean \"creep\"?); valid: ",
@@ -29,10 +26,7 @@ Capsys = pytest.CaptureFixture[str]
             "[plausible]\nlink_geometri = 4.0",
             "[plausible]: unknown effect 'link_geometri' (did you mean \"link_geometry\"?)",
         ),
-        (
-            "[ordinary]\ncrep = 0.1",
-            "[ordinary]: unknown effect 'crep' (did you mean \"creep\"?)",
-        ),
+        ("[ordinary]\ncrep = 0.1", "[ordinary]: unknown effect 'crep' (did you mean \"creep\"?)"),
     ],
 )
 def test_an_unknown_effect_is_one_line(

@@ -13,11 +13,7 @@ CELL = configs_dir() / "cells" / "ipa_ur10.toml"
 @pytest.mark.slow
 @pytest.mark.parametrize(("series", "limit_m"), [("Series_B", 0.110e-3), ("Series_C", 0.100e-3)])
 def test_refine_finds_what_the_arm_lacks(
-    series: str,
-    limit_m: float,
-    ipa_ur10: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    series: str, limit_m: float, ipa_ur10: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (measured,) = (ipa_ur10 / series).glob("measurements_*.csv")
     run = tmp_path / "ur10.hilcal"

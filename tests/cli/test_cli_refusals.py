@@ -331,10 +331,7 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("hidden", "said"),
-    [("transmission_error", True), ("backlash", False)],
-)
+@pytest.mark.parametrize(("hidden", "said"), [("transmission_error", True), ("backlash", False)])
 def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
     hidden: str, said: bool, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -67,9 +67,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
 
 @pytest.mark.long
 def test_the_guide_leads_from_a_table_to_corrected_krl_points(
-    lab: tuple[Path, Arm, Arm],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    lab: tuple[Path, Arm, Arm], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, nominal, true = lab
     monkeypatch.chdir(folder)

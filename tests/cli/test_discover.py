@@ -69,16 +69,7 @@ def test_a_law_is_written_as_an_effect_and_told(
 ) -> None:
     form = Form((LawPart(sites(6)[1], Amplitude(()), 0),))
     law = FoundLaw(
-        "bent",
-        form,
-        (Coefficient("a", 1e-4, 1e-6, "rad"),),
-        1e-9,
-        30.0,
-        0.8,
-        1.1,
-        0.7,
-        (),
-        (),
+        "bent", form, (Coefficient("a", 1e-4, 1e-6, "rad"),), 1e-9, 30.0, 0.8, 1.1, 0.7, (), ()
     )
     one, listed = np.ones(1), [3]
     hardly = Form((LawPart(sites(6)[3], Amplitude(()), 0),))

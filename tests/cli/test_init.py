@@ -96,8 +96,7 @@ def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, caps
 
 
 @pytest.mark.parametrize(
-    "words",
-    ["60 mm, 20 mm, 120 mm", "60mm 20mm 120mm", "60, 20, 120 mm", "6 cm, 20 mm, 0.12 m"],
+    "words", ["60 mm, 20 mm, 120 mm", "60mm 20mm 120mm", "60, 20, 120 mm", "6 cm, 20 mm, 0.12 m"]
 )
 def test_units_are_read_as_people_write_them(words: str, tmp_path: Path, capsys: Capsys) -> None:
     path = tmp_path / "CELL.toml"

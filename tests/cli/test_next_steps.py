@@ -298,9 +298,7 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until",
     },
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
-    "config/cell": {
-        "check CELL.toml --save-calibration": KINEMATICS,
-    },
+    "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
     "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
     "identification/earlier_fit": {
@@ -375,9 +373,7 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal identify {} --readings": f"{RARE}deflections_are_compared_after_a_fit_of_absolute_"
         "readings"
     },
-    "workbench/cards": {
-        "hilcal compensate": f"{PAGE}a_table_becomes_a_calibration_at_one_page",
-    },
+    "workbench/cards": {"hilcal compensate": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
     "workbench/guard": {
         "hilcal workbench printed": f"{PAGE}only_the_browser_with_the_address_is_let_in",
         "start hilcal workbench again": f"{PAGE}the_token_is_good_for_one_exchange",

@@ -56,10 +56,7 @@ def correlated() -> tuple[CellConfig, Readings]:
 
 CASES = {
     "missing": ("deflection", lambda: study("deflection", "creep", n_poses=12)),
-    "ambiguous": (
-        "absolute",
-        lambda: (SMALL, doubtful("base_compliance", 2).rehearsal.readings),
-    ),
+    "ambiguous": ("absolute", lambda: (SMALL, doubtful("base_compliance", 2).rehearsal.readings)),
     "unknown": ("absolute", lambda: study("absolute", "swaying bench")),
     "unknown although tried": (
         "deflection",

@@ -10,12 +10,7 @@ from hilcal.cli.commands import COMMANDS, Command, load
 from tests.support.paths import ROOT
 
 HEAVY = ("numpy", "scipy", "pydantic", "pinocchio", "rerun", "sklearn", "rich.console", "dask")
-SLOW = (
-    "asyncio",
-    "plotly",
-    "rerun",
-    "sklearn",
-)
+SLOW = ("asyncio", "plotly", "rerun", "sklearn")
 """Libraries that few commands need, each a tenth of a second or more to load."""
 
 

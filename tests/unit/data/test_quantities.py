@@ -9,8 +9,7 @@ from hilcal.tables.units import parse_duration, parse_length
 
 
 @pytest.mark.parametrize(
-    ("text", "metres"),
-    [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)],
+    ("text", "metres"), [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)]
 )
 def test_a_length(text: str, metres: float) -> None:
     assert math.isclose(parse_length(text, "--limit"), metres)

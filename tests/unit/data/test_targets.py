@@ -134,11 +134,7 @@ NOISE = TrackerNoise(5e-6, 0.0, 7e-6, 0.0)
     ("targets", "rows", "message"),
     [
         ((), ("A", "B"), r"column 'target' names 'A', 'B', but the cell has one target"),
-        (
-            NAMES,
-            ("R1", "r2"),
-            r"row 3, column 'target': target 'r2' is .* valid: R1, R2, R3",
-        ),
+        (NAMES, ("R1", "r2"), r"row 3, column 'target': target 'r2' is .* valid: R1, R2, R3"),
         (NAMES, ("R1", ""), r"row 3, column 'target': the cell is empty; name the target"),
     ],
 )
@@ -162,11 +158,7 @@ def test_a_table_without_the_column(tmp_path: Path) -> None:
     ("old", "new", "message"),
     [
         ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
-        (
-            "[[tool.targets]]",
-            "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]",
-            "target_m together",
-        ),
+        ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
         ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
         ('name = "R2"', 'nam = "R2"', r'has no key "nam"'),
     ],

@@ -6,15 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import (
-    MANY,
-    MODES,
-    Mode,
-    Scaling,
-    inverse_root,
-    measured,
-    whitening,
-)
+from hilcal.readings.whitening import MANY, MODES, Mode, Scaling, inverse_root, measured, whitening
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 

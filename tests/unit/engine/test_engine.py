@@ -188,10 +188,7 @@ def test_what_is_no_cluster_is_said_in_one_line() -> None:
         pass
     with pytest.raises(InputError, match="from 1"), open_engine(0):
         pass
-    with (
-        pytest.raises(InputError, match="own workers"),
-        open_engine(2, "tcp://127.0.0.1:1"),
-    ):
+    with pytest.raises(InputError, match="own workers"), open_engine(2, "tcp://127.0.0.1:1"):
         pass
 
 

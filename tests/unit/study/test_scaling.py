@@ -98,11 +98,9 @@ def test_monte_carlo_agrees_with_the_exact_law(
     for c in cells:
         _, length, angle = next(u for u in UNITS if u[0] == c.unit)
         unit = np.tile([length] * 3 + [angle] * 3, len(v) // 6)
-        weight = {
-            "none": np.diag(unit**2),
-            "gu": np.diag(1 / np.diag(v)),
-            "gc": np.linalg.inv(v),
-        }[c.scaling]
+        weight = {"none": np.diag(unit**2), "gu": np.diag(1 / np.diag(v)), "gc": np.linalg.inv(v)}[
+            c.scaling
+        ]
         k, stated = linear_estimator(a, weight)
         actual = np.diag(k @ v @ k.T)
         exact = np.sqrt(np.mean(actual / np.diag(limit)))
