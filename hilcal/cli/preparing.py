@@ -32,7 +32,7 @@ from hilcal.tables.units import METRIC
 from hilcal.toml import check_section
 from hilcal.whole_file import replace_file
 
-SIMULATED = "simulated"  # Port of a force sensor that exists in the rehearsal only
+SIMULATED = "simulated"  # Port of a device that exists in a rehearsal only
 CLOCK = 20.0  # How much faster than real time a rehearsal goes, as in the demo's cell
 UNITS: dict[str, dict[str, float]] = {
     "m": {**METRIC, "cm": 1e-2},
@@ -359,9 +359,6 @@ def _complete(draft: Draft) -> None:
     draft.set("simulation", clock=CLOCK)
     config = check_section(draft.data, CellConfig, "the cell")
     check_effects(cell_from_config(config, draft.base_dir), config, installed())
-
-
-SIMULATED = "simulated"  # The port of a device that only the demo's own simulation has
 
 
 @command(

@@ -13,33 +13,11 @@ from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.toml import Section, section_of, suggest
 
-_UNITS = (
-    ("_m_s2", "m/s²"),
-    ("_rad_s2", "rad/s²"),
-    ("_rad_s", "rad/s"),
-    ("_std_per_m", "m/m"),
-    ("_std_m", "m"),
-    ("_m", "m"),
-    ("_rad", "rad"),
-    ("_deg", "deg"),
-    ("_kg", "kg"),
-    ("_Nm", "N·m"),
-    ("_N", "N"),
-    ("_s", "s"),
-    ("_hz", "Hz"),
-    ("_sigma", "σ"),
-    ("_share", "1"),
-    ("baud", "Bd"),
-    ("samples", "readings"),
-    ("frames", "frames"),
-    ("web_port", "TCP"),
-    ("candidates", "poses"),
-    ("clock", "times real time"),
-    ("singularity", "1"),
-    ("factor", "1"),
-    ("direction", "1"),
-)
-"""Units by the end of a key's name."""
+_UNITS = dict(
+    pair.split("=")
+    for pair in ["_m_s2=m/s²", "_rad_s2=rad/s²", "_rad_s=rad/s", "_std_per_m=m/m", "_std_m=m", "_m=m", "_rad=rad", "_deg=deg", "_kg=kg", "_Nm=N·m", "_N=N", "_s=s", "_hz=Hz", "_sigma=σ", "_share=1", "baud=Bd", "samples=readings", "frames=frames", "web_port=TCP", "candidates=poses", "singularity=1", "factor=1", "direction=1"]
+) | {"clock": "times real time"}
+"""Units by the end of a key's name; the first that fits."""
 REQUIRED = "required"
 NOT_SET = "not set"
 
@@ -127,7 +105,7 @@ def _by_name(name: str, field: FieldInfo) -> KeyTable:
 
 
 def _key(name: str, field: FieldInfo) -> Key:
-    unit = next((unit for end, unit in _UNITS if name.endswith(end)), "")
+    unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
     default, value = _default(field), example(field)
     return Key(name, unit, default, field.description or "", f"{name} = {inline(value)}")
 
@@ -162,20 +140,21 @@ def _is_list(field: FieldInfo) -> bool:
     return getattr(field.annotation, "__origin__", None) is tuple
 
 
-SHOWN: dict[str, tuple[str, ...]] = {
-    "robot": ("model", "repeatability_m", "driver", "host"),
-    "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
-    "tracker": (
-        *("driver", "port", "frame", "range_std_m", "range_std_per_m"),
-        *("transverse_std_m", "transverse_std_per_m"),
-    ),
-    "force_sensor": ("driver", "port", "origin_m"),
-    "repeatability": ("joint_std_rad",),
-    "loads": ("name", "mass_kg", "force_N", "moment_Nm"),
-    "limits": ("workspace_min_m", "workspace_max_m"),
-    "sight": ("tracker_m", "target_normal"),
-    "planning": ("model", "readings", "criterion", "work_min_m", "work_max_m", "candidates"),
-    "simulation": ("hide", "clock"),
+SHOWN = {
+    section: tuple(keys.split())
+    for section, keys in {
+        "robot": "model repeatability_m driver host",
+        "tool": "target_m load_point_m mass_kg com_m",
+        "tracker": "driver port frame range_std_m range_std_per_m transverse_std_m "
+        "transverse_std_per_m",
+        "force_sensor": "driver port origin_m",
+        "repeatability": "joint_std_rad",
+        "loads": "name mass_kg force_N moment_Nm",
+        "limits": "workspace_min_m workspace_max_m",
+        "sight": "tracker_m target_normal",
+        "planning": "model readings criterion work_min_m work_max_m candidates",
+        "simulation": "hide clock",
+    }.items()
 }
 """Keys that are in the file, as values or as examples; `hilcal config` explains all."""
 _HEAD = """\
@@ -183,15 +162,10 @@ _HEAD = """\
 # Written by hilcal init; SI units. A line that begins with # and a key is an example: take the #
 # away to use it. hilcal config SECTION explains every key of a section.
 """
-_WIDTH = 98
 
 
 def cell_text(data: Mapping[str, Any], title: str) -> str:
-    """Return a CELL.toml.
-
-    Args:
-        data: the sections and keys that have values, as TOML has them.
-    """
+    """Return a CELL.toml with the sections and keys that have values, as TOML has them."""
     lines, known = [_HEAD.format(title=escaped(title))], tables()
     for name, keys in SHOWN.items():
         lines += [*_section(table(name, known), keys, data.get(name)), ""]
@@ -200,32 +174,25 @@ def cell_text(data: Mapping[str, Any], title: str) -> str:
 
 def _section(t: KeyTable, keys: Sequence[str], given: Any) -> Iterator[str]:
     yield from _comment(t.about)
-    several = t.header.startswith("[[")
-    required = any(k.default == "required" for k in t.keys)
-    if several or (required and not given):
+    if t.header.startswith("[[") or (not given and REQUIRED in [k.default for k in t.keys]):
         if not given:
             yield f"#{t.header}"
             yield from (f"#{k.example}" for k in t.keys if k.name in keys)
-            return
-        for one in given:
+        for one in given or ():
             yield t.header
             yield from (f"{key} = {inline(value)}" for key, value in one.items())
         return
-    values = dict(given or {})
+    values, by_name = dict(given or {}), {k.name: k for k in t.keys}
     yield t.header
-    by_name = {k.name: k for k in t.keys}
-    for key in (*keys, *(k for k in values if k not in keys)):
-        yield from _key(by_name[key], values)
-
-
-def _key(key: Key, values: Mapping[str, Any]) -> Iterator[str]:
-    default = "" if key.default in ("required", "not set") else f"; {key.default} if left out"
-    yield from _comment(f"{key.valid}{default}")
-    yield f"{key.name} = {inline(values[key.name])}" if key.name in values else f"#{key.example}"
+    for name in dict.fromkeys((*keys, *values)):
+        key = by_name[name]
+        default = "" if key.default in (REQUIRED, NOT_SET) else f"; {key.default} if left out"
+        yield from _comment(f"{key.valid}{default}")
+        yield f"{name} = {inline(values[name])}" if name in values else f"#{key.example}"
 
 
 def _comment(words: str) -> list[str]:
-    return [f"# {line}" for line in textwrap.wrap(words, _WIDTH)]
+    return [f"# {line}" for line in textwrap.wrap(words, 98)]
 
 
 def to_toml(config: CellConfig) -> str:
