@@ -1,5 +1,6 @@
 """Every key of CELL.toml with unit, default and example; a commented CELL.toml to begin with."""
 
+import re
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,9 +15,14 @@ from hilcal.names import escaped
 from hilcal.toml import Section, section_of, suggest
 
 _UNITS = dict(
-    pair.split("=")
-    for pair in ["_m_s2=m/s²", "_rad_s2=rad/s²", "_rad_s=rad/s", "_std_per_m=m/m", "_std_m=m", "_m=m", "_rad=rad", "_deg=deg", "_kg=kg", "_Nm=N·m", "_N=N", "_s=s", "_hz=Hz", "_sigma=σ", "_share=1", "baud=Bd", "samples=readings", "frames=frames", "web_port=TCP", "candidates=poses", "singularity=1", "factor=1", "direction=1"]
-) | {"clock": "times real time"}
+    re.findall(
+        r"(\S+)=(.+?)(?:; |$)",
+        "_m_s2=m/s²; _rad_s2=rad/s²; _rad_s=rad/s; _std_per_m=m/m; _std_m=m; _m=m; _rad=rad; "
+        "_deg=deg; _kg=kg; _Nm=N·m; _N=N; _s=s; _hz=Hz; _sigma=σ; _share=1; baud=Bd; "
+        "samples=readings; frames=frames; web_port=TCP; candidates=poses; clock=times real time; "
+        "singularity=1; factor=1; direction=1",
+    )
+)
 """Units by the end of a key's name; the first that fits."""
 REQUIRED = "required"
 NOT_SET = "not set"
@@ -141,20 +147,19 @@ def _is_list(field: FieldInfo) -> bool:
 
 
 SHOWN = {
-    section: tuple(keys.split())
-    for section, keys in {
-        "robot": "model repeatability_m driver host",
-        "tool": "target_m load_point_m mass_kg com_m",
-        "tracker": "driver port frame range_std_m range_std_per_m transverse_std_m "
-        "transverse_std_per_m",
-        "force_sensor": "driver port origin_m",
-        "repeatability": "joint_std_rad",
-        "loads": "name mass_kg force_N moment_Nm",
-        "limits": "workspace_min_m workspace_max_m",
-        "sight": "tracker_m target_normal",
-        "planning": "model readings criterion work_min_m work_max_m candidates",
-        "simulation": "hide clock",
-    }.items()
+    "robot": ("model", "repeatability_m", "driver", "host"),
+    "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
+    "tracker": (
+        *("driver", "port", "frame", "range_std_m", "range_std_per_m"),
+        *("transverse_std_m", "transverse_std_per_m"),
+    ),
+    "force_sensor": ("driver", "port", "origin_m"),
+    "repeatability": ("joint_std_rad",),
+    "loads": ("name", "mass_kg", "force_N", "moment_Nm"),
+    "limits": ("workspace_min_m", "workspace_max_m"),
+    "sight": ("tracker_m", "target_normal"),
+    "planning": ("model", "readings", "criterion", "work_min_m", "work_max_m", "candidates"),
+    "simulation": ("hide", "clock"),
 }
 """Keys that are in the file, as values or as examples; `hilcal config` explains all."""
 _HEAD = """\

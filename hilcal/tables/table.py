@@ -99,7 +99,7 @@ def readings_of(
     observed = observed_of(table)
     whole = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, whole)
-    states = replace(states, target=target, observer=observed and observed.number)
+    states = replace(states, target=target, observer=None if observed is None else observed.number)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
@@ -135,6 +135,7 @@ def _covariance(
 ) -> tuple[Floats, tuple[str, ...], str]:
     """Covariances (N, m, m) of positions or poses, notes on them, and what they cover."""
     stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
+    notes: tuple[str, ...]
     if stated is None:
         cov = instrument_covariance(table, value, noise, station)
         notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
@@ -420,7 +421,7 @@ def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
     return [names[k] for k in index.tolist()]
 
 
-def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str, Floats | Ints]:
+def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str, Column]:
     """(N,) number columns that the readings have, by name."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
