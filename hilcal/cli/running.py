@@ -51,6 +51,7 @@ from hilcal.errors import (
     StoppedError,
 )
 from hilcal.identification.full_covariance import full_readings
+from hilcal.identification.noise_estimate import NOISE, measured_noise
 from hilcal.measuring.connect import ConnectionResult, Rig, connect
 from hilcal.measuring.devices import Clock
 from hilcal.measuring.dry_run import dry_run
@@ -59,10 +60,12 @@ from hilcal.measuring.progress import Watcher
 from hilcal.measuring.run import HOW_ON
 from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
+from hilcal.numbers import sentence
 from hilcal.present.diagnosis import NEWCOMER
 from hilcal.present.live_viewer import LiveViewer, Several
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import Say, counting, working
+from hilcal.present.registration import covariance_words
 from hilcal.present.running import factory_words, full_words, missed_words, watching
 from hilcal.procedure.procedure import Measure, Procedure
 from hilcal.procedure.state import WORLD
@@ -106,23 +109,23 @@ def run(
     config, numbers = read_cell(cell)
     goal = None if until is None else GoalRule(until, numbers, config, catalogue)
     base_dir = cell.absolute().parent
-    if rehearse:
-        from hilcal.drivers.simulated.rehearsal import NOTHING, as_told
-
-        # Refuses what cannot be hidden before anything is planned.
+    if rehearse:  # what cannot be hidden is refused before anything is planned
         as_told(config, config.simulation.hide or NOTHING, catalogue)
     with ExitStack() as stack:
-        if resume:
-            if append:
+        further: Plan | None = None
+        if resume or append:
+            if resume and append:
                 raise InputError("--append begins a further plan, --resume goes on; give one")
-            if plan is not None:
+            if resume and plan is not None:
                 raise InputError("--plan with --resume: the plan is in the campaign; leave it out")
+            if append and plan is None:
+                raise InputError("--append needs the further plan: give it with --plan PLAN")
             campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
             check_same_cell(campaign, config, base_dir)
             made = RunLog(campaign).plans[0]
-        elif append:
-            campaign, further = _append(t, stack, output, plan, config, numbers, base_dir)
-            made = RunLog(campaign).plans[0]
+            if plan is not None:
+                further = RunLog(campaign).with_new_names(load_plan(plan))
+                refuse(dry_checked(t, numbers, config, further), str(plan))
         else:
             if output.exists():
                 raise InputError(
@@ -134,22 +137,17 @@ def run(
         if rehearse:
             with working(t.progress) as say:
                 say("starting the simulated devices")
-                from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
-
-                choice = config.simulation.hide or NOTHING
-                seed = config.simulation.seed
+                choice, seed = config.simulation.hide or NOTHING, config.simulation.seed
                 secret = case_of_plan(config, made, choice, seed, catalogue, base_dir)
-                simulated = simulated_cell(secret, seed, base_dir)
-                config = stack.enter_context(simulated).config
-        if append:
+                config = stack.enter_context(simulated_cell(secret, seed, base_dir)).config
+        if further is not None:
             RunLog(campaign).append(further)
         elif not resume:
             campaign = stack.enter_context(create_run(output, config, base_dir, made))
         planned = len(RunLog(campaign).plan.steps) * len(numbers.all_targets)
-        more = (*_given("--rehearse", rehearse), *_given("--until", until))
-        more = (*more, *_given("--view", view))
-        for path in effects_from or ():
-            more = (*more, "--effects-from", str(path))
+        more = ["--rehearse"] * rehearse + ["--view"] * view
+        more += [] if until is None else ["--until", until]
+        more += [word for path in effects_from or () for word in ("--effects-from", str(path))]
         on = shlex.join(("hilcal", "run", str(cell), "-o", str(output), "--resume", *more))
         live = stack.enter_context(followed(t, view, output))
         with _says_how_to_resume(campaign, planned, on):
@@ -193,13 +191,6 @@ def _own_plan(
     return made.plan
 
 
-def _given(option: str, value: str | bool | None) -> tuple[str, ...]:
-    """Return an option as it stands in a command line, nothing where it was not given."""
-    if value is None or isinstance(value, bool):
-        return (option,) if value else ()
-    return option, value
-
-
 @contextmanager
 def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterator[None]:
     """Let whatever ends a run early say what is safe, and the line that goes on."""
@@ -222,25 +213,6 @@ def _says_how_to_resume(campaign: CampaignFile, planned: int, on: str) -> Iterat
         if not words.endswith(HOW_ON):
             raise
         raise type(error)(words.removesuffix(HOW_ON) + safe()) from error
-
-
-def _append(
-    t: Terminal,
-    stack: ExitStack,
-    output: Path,
-    plan: Path | None,
-    config: CellConfig,
-    cell: Cell,
-    base_dir: Path,
-) -> tuple[CampaignFile, Plan]:
-    """Open a campaign, and return it with a further plan that has been checked."""
-    if plan is None:
-        raise InputError("--append needs the further plan: give it with --plan PLAN")
-    campaign = stack.enter_context(CampaignFile.open(output, check_revisions=False))
-    check_same_cell(campaign, config, base_dir)
-    further = RunLog(campaign).with_new_names(load_plan(plan))
-    refuse(dry_checked(t, cell, config, further), str(plan))
-    return campaign, further
 
 
 def measure(
@@ -285,10 +257,6 @@ def measure(
 
 def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: CampaignFile) -> None:
     """Estimate, store and say the noise of measured readings that nothing states."""
-    from hilcal.identification.noise_estimate import NOISE, measured_noise
-    from hilcal.numbers import sentence
-    from hilcal.present.registration import covariance_words
-
     log = RunLog(campaign)
     found = measured_noise(campaign.readings(), cell, config)
     if found is not None:

@@ -317,9 +317,8 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     def planned(*_: object) -> None:
         raise AssertionError("it plans first")
 
-    for module in ("rehearsing", "running"):
-        name = "make_plan" if module == "rehearsing" else "_own_plan"
-        monkeypatch.setattr(f"hilcal.cli.{module}.{name}", planned)
+    for name in ("make_plan", "make_checked"):
+        monkeypatch.setattr(f"hilcal.cli.running.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")
     more = ("--rehearse",) if command == "run" else ()
