@@ -90,9 +90,7 @@ def command(text: str = "") -> Callable[[F], F]:
 
     def declare(function: F) -> F:
         given = inspect.signature(function).parameters.values()
-        joint: dict[str, Any] = {
-            p.name: p.annotation for p in given if is_dataclass(p.annotation)
-        }
+        joint: dict[str, Any] = {p.name: p.annotation for p in given if is_dataclass(p.annotation)}
         shown = []
         for p in given:
             parts = (

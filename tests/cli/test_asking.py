@@ -1,7 +1,5 @@
 """What `run` does without a plan: it shows the one that it made, and asks before anything moves."""
 
-from pathlib import Path
-
 import pytest
 
 from hilcal.store.campaign_file import CampaignFile
@@ -37,7 +35,7 @@ seed = 4
 
 
 @pytest.fixture
-def toml(tmp_path: Path) -> Path:
+def toml(tmp_path):
     """A cell that is planned fast, and whose devices are not there."""
     path = tmp_path / "cell.toml"
     path.write_text(TOML, encoding="utf-8")
@@ -51,7 +49,7 @@ def toml(tmp_path: Path) -> Path:
         *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120)),
     ],
 )
-def test_a_person_is_shown_the_plan_and_asked(columns: int, toml: Path) -> None:
+def test_a_person_is_shown_the_plan_and_asked(columns, toml):
     home = toml.parent
     with AtTerminal("run", "cell.toml", "-o", "run.hilcal", columns=columns, home=home) as person:
         person.keeps("The arm will move. y = yes, n = no:")
@@ -68,7 +66,7 @@ def test_a_person_is_shown_the_plan_and_asked(columns: int, toml: Path) -> None:
 
 
 @pytest.mark.slow
-def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml: Path) -> None:
+def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml):
     for keys, words in (("\x03", "error: interrupted"), ("\x04", "nothing has moved")):
         with AtTerminal("run", "cell.toml", "-o", "run.hilcal", home=toml.parent) as person:
             person.keeps("n = no:")
@@ -78,9 +76,7 @@ def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml: Path) -> N
     assert not (toml.parent / "run.hilcal").exists()
 
 
-def test_a_script_is_shown_the_plan_and_goes_on(
-    toml: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_script_is_shown_the_plan_and_goes_on(toml, capsys):
     path = toml.parent / "run.hilcal"
     result = run(capsys, "run", toml, "-o", path, "--json")
     assert result.code == 3  # it has gone on, as far as to the devices that are not there

@@ -1,21 +1,17 @@
 """`bootstrap` on the command line."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.cli_cases import run as command
 
-Capsys = pytest.CaptureFixture[str]
-
 
 @pytest.fixture(scope="module")
-def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def csv(tmp_path_factory):
     return table(tmp_path_factory.mktemp("bootstrap") / "t.csv", "nothing", poses=12)
 
 
-def test_words_and_document_and_nothing_is_written(csv: Path, capsys: Capsys) -> None:
+def test_words_and_document_and_nothing_is_written(csv, capsys):
     run = csv.with_name("run.hilcal")
     ok(capsys, "import", csv, "--config", CELL, "-o", run)
     before = run.read_bytes()
@@ -32,7 +28,7 @@ def test_words_and_document_and_nothing_is_written(csv: Path, capsys: Capsys) ->
     assert run.read_bytes() == before
 
 
-def test_what_it_refuses(csv: Path, capsys: Capsys) -> None:
+def test_what_it_refuses(csv, capsys):
     few = csv.with_name("few.hilcal")
     lines = csv.read_text().splitlines(keepends=True)
     csv.with_name("few.csv").write_text("".join(lines[: 1 + 5 * (len(lines) - 1) // 12]))

@@ -1,7 +1,6 @@
 """`calibrate`: refusals, and what is said of a calibration that is there."""
 
 import os
-from pathlib import Path
 
 import pytest
 
@@ -10,20 +9,18 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import CELL
 from tests.support.cli_cases import ok, refused, run
-from tests.support.procedure_cases import Drawn, drawn, small
-
-Capsys = pytest.CaptureFixture[str]
+from tests.support.procedure_cases import drawn, small
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Path:
+def cell(tmp_path):
     path = tmp_path / "cell.toml"
     path.write_text(CELL, encoding="utf-8")
     return path
 
 
 @pytest.fixture(scope="module")
-def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+def there(tmp_path_factory):
     """A calibration that is complete, of the cell in `cell.toml` beside it."""
     path = tmp_path_factory.mktemp("run")
     from hilcal.config.reference import to_toml
@@ -35,7 +32,7 @@ def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     return d
 
 
-def test_nothing_moves_where_nobody_can_be_asked(cell: Path, capsys: Capsys) -> None:
+def test_nothing_moves_where_nobody_can_be_asked(cell, capsys):
     out = cell.with_name("run.hilcal")
     line = refused(capsys, 2, "calibrate", cell, "-o", out)
     assert "give --yes" in line
@@ -52,7 +49,7 @@ def test_nothing_moves_where_nobody_can_be_asked(cell: Path, capsys: Capsys) -> 
         ("--validation", "0", "valid: a whole number from 1"),
     ],
 )
-def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: str) -> None:
+def test_bad_options(cell, capsys, option, value, said):
     line = refused(
         capsys, 2, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--yes", option, value
     )
@@ -60,7 +57,7 @@ def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: 
 
 
 @pytest.mark.long
-def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Capsys) -> None:
+def test_a_goal_needs_readings_that_show_it(there, cell, capsys):
     """Deflections know nothing of the unloaded arm, however well the model predicts them."""
     p = there.procedure
     for command in (
@@ -75,14 +72,14 @@ def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Ca
     assert "geometry is not calibrated" in told
 
 
-def test_the_plain_command_says_what_is_there(there: Drawn, capsys: Capsys) -> None:
+def test_the_plain_command_says_what_is_there(there, capsys):
     path = there.procedure.run
     line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")
     assert "a calibration is there already, it is complete; go on with: hilcal calibrate" in line
     assert line.endswith("--resume --yes")
 
 
-def test_a_complete_one_is_told_again(there: Drawn, capsys: Capsys) -> None:
+def test_a_complete_one_is_told_again(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
     told = ok(capsys, *command)
@@ -96,7 +93,7 @@ def test_a_complete_one_is_told_again(there: Drawn, capsys: Capsys) -> None:
     assert (d["verdict"], d["plans"], d["rehearsed"]) == ("adequate", 1, False)
 
 
-def test_a_limit_is_judged_by_what_was_measured(there: Drawn, capsys: Capsys) -> None:
+def test_a_limit_is_judged_by_what_was_measured(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
     assert "PASSED" in ok(capsys, *command, "--limit", "1 mm").out
@@ -111,7 +108,7 @@ def test_a_limit_is_judged_by_what_was_measured(there: Drawn, capsys: Capsys) ->
         assert "are over the limit of" in found.err
 
 
-def test_what_fits_refuses_a_validation_campaign(there: Drawn, capsys: Capsys) -> None:
+def test_what_fits_refuses_a_validation_campaign(there, capsys):
     path = there.procedure.files.validation
     for command in ("identify", "refine", "diagnose"):
         line = refused(capsys, 2, command, path)
@@ -127,7 +124,7 @@ def test_what_fits_refuses_a_validation_campaign(there: Drawn, capsys: Capsys) -
         path.write_bytes(kept)
 
 
-def test_another_campaign_is_no_calibration(there: Drawn, cell: Path, capsys: Capsys) -> None:
+def test_another_campaign_is_no_calibration(there, cell, capsys):
     path = there.procedure.files.validation
     line = refused(
         capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--yes"
@@ -135,15 +132,13 @@ def test_another_campaign_is_no_calibration(there: Drawn, cell: Path, capsys: Ca
     assert "not a campaign of hilcal calibrate" in line
 
 
-def test_a_rehearsal_goes_on_as_one(there: Drawn, capsys: Capsys) -> None:
+def test_a_rehearsal_goes_on_as_one(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")
     assert "no rehearsal; leave --rehearse out" in refused(capsys, 2, *command)
 
 
-def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(tmp_path, capsys):
     path = tmp_path / "cell.toml"
     text = CELL.replace('model = "ur10e"', 'model = "ur10e"\ndriver = "ur"\nhost = "127.0.0.1"')
     path.write_text(

@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,7 +9,7 @@ import tomli_w
 
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.campaign_cases import STARVED, TRIES
-from tests.support.cli_cases import Outcome, ok, run
+from tests.support.cli_cases import ok, run
 from tests.support.random_cells import random_cell, random_options
 
 ENDS = (0, 4, 5)
@@ -20,9 +19,7 @@ SMALL = ("--poses", "4", "--validation", "3", "--rehearse", "--yes", "--json")
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_a_random_cell_is_calibrated_to_an_end(
-    seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_random_cell_is_calibrated_to_an_end(seed, tmp_path, capsys):
     rng = np.random.default_rng([seed, 32])
     cell = tmp_path / "CELL.toml"
     cell.write_text(tomli_w.dumps(random_cell(rng)), encoding="utf-8")
@@ -45,7 +42,7 @@ def test_a_random_cell_is_calibrated_to_an_end(
         assert json.loads(again.out)["improvement"] == document["improvement"]
 
 
-def steps_are_taken(capsys: pytest.CaptureFixture[str], found: Outcome, path: Path) -> None:
+def steps_are_taken(capsys, found, path):
     """Correct a point, and write a report, by the lines that are told, where it was measured."""
     points = path.with_name("points.csv")
     with CampaignFile.open(path, read_only=True) as campaign:
@@ -59,7 +56,7 @@ def steps_are_taken(capsys: pytest.CaptureFixture[str], found: Outcome, path: Pa
         ok(capsys, *given)
 
 
-def rehearsed(capsys: pytest.CaptureFixture[str], cell: Path, *options: str) -> Outcome:
+def rehearsed(capsys, cell, *options):
     """Rehearse; where this computer was too busy for the devices, go on as an operator does."""
     path = cell.with_name("run.hilcal")
     for _ in range(TRIES):

@@ -1,12 +1,8 @@
 """`check` refuses effects that do not exist before it talks to any device."""
 
-from pathlib import Path
-
 import pytest
 
 from tests.support.cli_cases import CELL, refused
-
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.mark.parametrize(
@@ -29,9 +25,7 @@ Capsys = pytest.CaptureFixture[str]
         ("[ordinary]\ncrep = 0.1", "[ordinary]: unknown effect 'crep' (did you mean \"creep\"?)"),
     ],
 )
-def test_an_unknown_effect_is_one_line(
-    section: str, said: str, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_an_unknown_effect_is_one_line(section, said, tmp_path, capsys):
     head, name = section.split("\n")[0], tmp_path / "mine.toml"
     text = CELL.read_text(encoding="utf-8")
     text = text.replace(head, section) if f"\n{head}\n" in text else f"{text}\n{section}\n"

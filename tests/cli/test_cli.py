@@ -3,7 +3,6 @@
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,24 +14,23 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import read_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run, table
 
-Capsys = pytest.CaptureFixture[str]
 ERROR = {"rms_m", "mean_m", "max_m", "rms_sigma"}
 VERDICTS = {"adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"}
 
 
 @pytest.fixture(scope="module")
-def hysteresis_table(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def hysteresis_table(tmp_path_factory):
     return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
 
 
 @pytest.fixture
-def campaign(hysteresis_table: Path, tmp_path: Path, capsys: Capsys) -> Path:
+def campaign(hysteresis_table, tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path)
     return path
 
 
-def test_import_says_what_was_read(hysteresis_table: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_import_says_what_was_read(hysteresis_table, tmp_path, capsys):
     path = tmp_path / "new.hilcal"
     words = ok(capsys, "import", hysteresis_table, "--config", CELL, "-o", path).out
     for part in ("70 readings of 14 poses", "ur10e", "10kg", "covariance: from the table"):
@@ -45,7 +43,7 @@ def test_import_says_what_was_read(hysteresis_table: Path, tmp_path: Path, capsy
     assert document["loads"][0] == "none"
 
 
-def test_identify_reports_what_the_contract_asks_for(campaign: Path, capsys: Capsys) -> None:
+def test_identify_reports_what_the_contract_asks_for(campaign, capsys):
     d = ok(capsys, "identify", campaign, "--json").document
     assert d["model"] == ["base_frame", "joint_compliance"]
     assert d["readings"] == "deflection"
@@ -72,14 +70,14 @@ def test_identify_reports_what_the_contract_asks_for(campaign: Path, capsys: Cap
     assert len(d["registration"]) == 4
 
 
-def test_identify_in_words(campaign: Path, capsys: Capsys) -> None:
+def test_identify_in_words(campaign, capsys):
     words = ok(capsys, "identify", campaign, "--details").out
     for part in ("µrad/(N·m)", "Condition number", "widened", "Not determined", "noise alone"):
         assert part in words
     assert max(map(len, words.splitlines())) <= 100
 
 
-def test_identify_names_directions_that_cannot_be_seen(campaign: Path, capsys: Capsys) -> None:
+def test_identify_names_directions_that_cannot_be_seen(campaign, capsys):
     arguments = ("identify", campaign, "--effects", "link_geometry,joint_compliance")
     d = ok(capsys, *arguments, "--readings", "absolute", "--json").document
     assert d["model"] == ["base_frame", "link_geometry", "joint_compliance"]
@@ -91,7 +89,7 @@ def test_identify_names_directions_that_cannot_be_seen(campaign: Path, capsys: C
 
 
 @pytest.mark.long
-def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None:
+def test_all_scalings_stand_side_by_side(campaign, capsys):
     d = ok(capsys, "identify", campaign, "--scaling", "all", "--json").document
     assert d["scaling"] == "gc"
     assert set(d["scalings"]) == {"none", "gu", "gc"}
@@ -106,8 +104,8 @@ def test_all_scalings_stand_side_by_side(campaign: Path, capsys: Capsys) -> None
 
 @pytest.mark.long
 def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_changes_it(
-    campaign: Path, capsys: Capsys
-) -> None:
+    campaign, capsys
+):
     result = ok(capsys, "compare", campaign, "--json")
     assert "no revision yet: taking the baseline" in result.err
     d = result.document
@@ -126,7 +124,7 @@ def test_the_baseline_is_taken_where_there_is_no_revision_and_kept_by_what_chang
     assert "baseline" not in again.err
 
 
-def test_diagnose_names_the_missing_effect(campaign: Path, capsys: Capsys) -> None:
+def test_diagnose_names_the_missing_effect(campaign, capsys):
     d = ok(capsys, "diagnose", campaign, "--json").document
     assert d["verdict"] == "missing_effect"
     assert "hysteresis" in d["message"]
@@ -140,7 +138,7 @@ def test_diagnose_names_the_missing_effect(campaign: Path, capsys: Capsys) -> No
     assert "hysteresis is missing" in words
 
 
-def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) -> None:
+def test_add_shows_the_error_before_and_after(campaign, capsys):
     d = ok(capsys, "add", campaign, "hysteresis", "--json").document
     before, after = d["revisions"]
     assert (before["revision"], before["added"]) == (1, None)
@@ -156,9 +154,7 @@ def test_add_shows_the_error_before_and_after(campaign: Path, capsys: Capsys) ->
 
 
 @pytest.mark.long
-def test_remove_takes_out_what_is_needless_and_says_what_is_not(
-    campaign: Path, capsys: Capsys
-) -> None:
+def test_remove_takes_out_what_is_needless_and_says_what_is_not(campaign, capsys):
     ok(capsys, "add", campaign, "hysteresis")
     ok(capsys, "add", campaign, "tracker_scale")
     d = ok(capsys, "diagnose", campaign, "--json").document
@@ -175,7 +171,7 @@ def test_remove_takes_out_what_is_needless_and_says_what_is_not(
     assert "unknown effect" in refused(capsys, 2, "remove", campaign, "friction")
 
 
-def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: Capsys) -> None:
+def test_refine_ends_adequate_and_keeps_every_revision(campaign, capsys):
     result = ok(capsys, "refine", campaign, "--json")
     d = result.document
     assert d["verdict"] == "adequate"
@@ -193,7 +189,7 @@ def test_refine_ends_adequate_and_keeps_every_revision(campaign: Path, capsys: C
 
 
 @pytest.mark.long
-def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
+def test_refine_can_start_elsewhere(campaign, capsys):
     refused(capsys, 2, "refine", campaign, "--from-latest")
     ok(capsys, "add", campaign, "hysteresis")
     d = ok(capsys, "refine", campaign, "--from-latest", "--json").document
@@ -211,8 +207,8 @@ def test_refine_can_start_elsewhere(campaign: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Capsys) -> None:
-    def numbers() -> list[int]:
+def test_what_is_stored_already_is_not_stored_again(campaign, capsys):
+    def numbers():
         with CampaignFile.open(campaign, read_only=True) as stored:
             return [r.number for r in stored.revisions()]
 
@@ -236,9 +232,7 @@ def test_what_is_stored_already_is_not_stored_again(campaign: Path, capsys: Caps
 
 
 @pytest.mark.long
-def test_validate_predicts_what_was_never_fitted(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_validate_predicts_what_was_never_fitted(campaign, tmp_path, capsys):
     ok(capsys, "refine", campaign)
     r = rehearsal("hysteresis")
     seen, rng = r.readings, np.random.default_rng(3)
@@ -269,9 +263,7 @@ def test_validate_predicts_what_was_never_fitted(
     assert again["error"]["rms_sigma"] < 1.3
 
 
-def test_view_writes_a_recording_that_can_be_read(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_view_writes_a_recording_that_can_be_read(campaign, tmp_path, capsys):
     from rerun.chunk import RrdReader
 
     path = tmp_path / "story.rrd"
@@ -285,9 +277,7 @@ def test_view_writes_a_recording_that_can_be_read(
     assert "no folder" in refused(capsys, 2, "view", campaign, "--record", missing)
 
 
-def test_export_writes_tables_that_go_in_again(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_export_writes_tables_that_go_in_again(campaign, tmp_path, capsys):
     readings, parameters = tmp_path / "readings.csv", tmp_path / "parameters.csv"
     assert "revision" in refused(capsys, 2, "export", campaign, "--parameters", parameters)
     assert "--table" in refused(capsys, 2, "export", campaign)
@@ -304,7 +294,7 @@ def test_export_writes_tables_that_go_in_again(
     assert j2["unit"] == "rad"
 
 
-def test_effects_lists_the_catalogue(capsys: Capsys) -> None:
+def test_effects_lists_the_catalogue(capsys):
     d = ok(capsys, "effects", "--json").document
     assert [e["name"] for e in d["effects"]] == list(installed().names)
     assert all(e["law"] and e["parameters"] for e in d["effects"])
@@ -313,7 +303,7 @@ def test_effects_lists_the_catalogue(capsys: Capsys) -> None:
     assert all(name in words for name in installed().names)
 
 
-def test_study_scaling(capsys: Capsys) -> None:
+def test_study_scaling(capsys):
     d = ok(capsys, "study", "scaling", "--runs", "20", "--json").document
     assert d["runs"] == 20
     assert set(d["summary"]) == {"none", "gu", "gc"}
@@ -322,7 +312,7 @@ def test_study_scaling(capsys: Capsys) -> None:
     assert "own workers" in refused(capsys, 2, "study", "scaling", *both)
 
 
-def test_a_scheduler_that_anybody_can_reach_is_said(capsys: Capsys) -> None:
+def test_a_scheduler_that_anybody_can_reach_is_said(capsys):
     given = ("study", "scaling", "--workers", "2", "--scheduler", "tcp://127.0.0.1:1")
     said, error = run(capsys, *given).err.splitlines()
     assert said.startswith("--scheduler tcp://127.0.0.1:1: without TLS")
@@ -330,18 +320,18 @@ def test_a_scheduler_that_anybody_can_reach_is_said(capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_json_leaves_words_to_stderr(campaign: Path, capsys: Capsys) -> None:
+def test_json_leaves_words_to_stderr(campaign, capsys):
     for command in (["identify"], ["compare"], ["diagnose"], ["refine"]):
         result = ok(capsys, *command, campaign, "--json")
         json.loads(result.out)
         assert "noise alone" in result.err
 
 
-def test_version(capsys: Capsys) -> None:
+def test_version(capsys):
     assert ok(capsys, "--version").out == f"hilcal {__version__}\n"
 
 
-def test_without_a_command_help_is_shown(capsys: Capsys) -> None:
+def test_without_a_command_help_is_shown(capsys):
     result = run(capsys)
     assert result.code == 2
     assert "refine" in result.out + result.err

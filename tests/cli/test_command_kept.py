@@ -2,7 +2,6 @@
 
 import json
 import shlex
-from pathlib import Path
 
 import pytest
 
@@ -18,7 +17,7 @@ from tests.support.cli_cases import ok
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Path:
+def run(tmp_path):
     content = json.loads(configuration().to_json())
     content["limits"]["accuracy_m"] = 2e-4
     path = tmp_path / "my run.hilcal"
@@ -28,9 +27,7 @@ def run(tmp_path: Path) -> Path:
 
 
 @pytest.mark.long
-def test_a_revision_keeps_its_command_and_the_page_shows_it(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
     words = ["identify", str(run), "--effects", "base_frame,joint_compliance"]
     ok(capsys, *words)
     with Campaign.open(run) as o:
@@ -48,7 +45,7 @@ def test_a_revision_keeps_its_command_and_the_page_shows_it(
     assert "within 200 µm" in html
 
 
-def test_a_campaign_keeps_the_command_that_made_it(tmp_path: Path) -> None:
+def test_a_campaign_keeps_the_command_that_made_it(tmp_path):
     with typed(["hilcal", "import", "a table.csv"]):
         content = configuration().to_json()
         with CampaignFile.create(tmp_path / "x.hilcal", content, "", "x") as file:

@@ -17,7 +17,6 @@ from studies.change import StudiedArm, measured, remeasured, studied_arm
 from studies.study_cases import with_study_loads
 from tests.support.cli_cases import ok, refused
 
-Capsys = pytest.CaptureFixture[str]
 CONFIG = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
 
 
@@ -52,7 +51,7 @@ class Site:
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
+def site(tmp_path_factory):
     arm = studied_arm(CONFIG, "ur10e", 0, poses=30)
     made = Site(arm, with_study_loads(CONFIG, "ur10e")[0], tmp_path_factory.mktemp("compare"))
     made.store("a.hilcal", arm.earlier.fit.readings)
@@ -62,9 +61,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
 
 
 @pytest.mark.long
-def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
-    site: Site, capsys: Capsys
-) -> None:
+def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(site, capsys):
     same = site.store("same.hilcal", site.measured(1))
     repaired = site.store("repaired.hilcal", site.measured(2, (0, 0, 1.2e-3, 0, 0, 0)))
     d = ok(capsys, "compare", site.earlier, same, "--json").document
@@ -91,9 +88,7 @@ def test_a_repaired_joint_is_named_and_without_a_repair_nothing_is(
 
 
 @pytest.mark.long
-def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
-    site: Site, capsys: Capsys
-) -> None:
+def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(site, capsys):
     rng = np.random.default_rng(9)
     path = site.store("whole.hilcal", measured(site.arm.world, site.arm.loads, 20, rng))
     with hc.Campaign.open(path) as run:
@@ -107,7 +102,7 @@ def test_a_later_campaign_with_a_fit_of_its_own_is_put_beside_the_earlier_one(
     assert "joint_compliance, as a whole" in words
 
 
-def test_what_cannot_be_compared_is_refused_in_one_line(site: Site, capsys: Capsys) -> None:
+def test_what_cannot_be_compared_is_refused_in_one_line(site, capsys):
     readings = site.measured(3)
     own = site.store("own.hilcal", site.arm.earlier.fit.readings[:30])
     assert "was fitted to all its 30 readings" in refused(capsys, 4, "compare", site.earlier, own)
@@ -122,7 +117,7 @@ def test_what_cannot_be_compared_is_refused_in_one_line(site: Site, capsys: Caps
     assert "later campaign" in refused(capsys, 2, "compare", site.earlier, "--same-setup")
 
 
-def test_readings_that_were_fitted_are_left_out_and_told(site: Site, capsys: Capsys) -> None:
+def test_readings_that_were_fitted_are_left_out_and_told(site, capsys):
     fitted = site.arm.earlier.fit.readings
     fresh = remeasured(site.arm.world, site.arm.loads, 15, np.random.default_rng(5))
     places = tuple(f"later{i}" for i in range(len(fresh.pose_names)))
@@ -138,7 +133,7 @@ def test_readings_that_were_fitted_are_left_out_and_told(site: Site, capsys: Cap
     assert d["changed"] is False
 
 
-def test_deflections_need_a_loaded_reading(site: Site, capsys: Capsys) -> None:
+def test_deflections_need_a_loaded_reading(site, capsys):
     with hc.Campaign.open(site.earlier) as run:
         model = hc.baseline(run.cell, run.readings, readings="deflection")
         run.append(hc.fit(model, run.readings, readings="deflection"))

@@ -1,12 +1,10 @@
 """The demo: it hides an effect, finds it, and says whether it did."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from hilcal.cli.running import RehearsalSettings, first_plan
-from hilcal.config import CellConfig, load_config
+from hilcal.cli.running import first_plan
+from hilcal.config import load_config
 from hilcal.drivers.simulated.rehearsal import (
     INVENTED,
     check_choice,
@@ -16,7 +14,6 @@ from hilcal.drivers.simulated.rehearsal import (
 )
 from hilcal.effects.catalogue import installed
 from hilcal.errors import InputError
-from hilcal.present.progress import Say
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.purpose import purpose_of
@@ -24,13 +21,12 @@ from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal
 from tests.support.user_effect_cases import CLASS
 
-Capsys = pytest.CaptureFixture[str]
 FAST = "--without-devices"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset", "base_frame"])
-def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_hidden_effect_is_found(effect, tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     result = ok(capsys, "demo", FAST, "--hide", effect, "--seed", "1", "-o", path, "--json")
     d = result.document
@@ -54,7 +50,7 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
 
 
 @pytest.mark.slow
-def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_hidden_is_nothing_found(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
     assert (d["hidden"], d["found"], d["verdict"]) == ("nothing", True, "adequate")
@@ -62,11 +58,11 @@ def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None
 
 
 @pytest.mark.long
-def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     asked: list[tuple[int, int]] = []
     made: list[Plan] = []
 
-    def plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
+    def plan(settings, config, poses, say):
         """Plan once, quickly; what a plan is worth, and that a seed gives one, is tested there."""
         asked.append((settings.seed, poses))
         if not made:
@@ -103,7 +99,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.M
     assert "is replaced" in again.err
 
 
-def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_demo_does_not_replace_another_file(tmp_path, capsys):
     path = tmp_path / "notes.txt"
     path.write_text("mine", encoding="utf-8")
     line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
@@ -112,7 +108,7 @@ def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) 
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsys) -> None:
+def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
     file = tmp_path / "mine.py"
     file.write_text(CLASS, encoding="utf-8")
     path = tmp_path / "own.hilcal"
@@ -131,7 +127,7 @@ def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsy
 
 
 @pytest.mark.slow
-def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
+def test_an_invented_law_is_discovered(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     result = ok(capsys, "demo", FAST, "--hide", "invented", "-o", path, "--json")
     d, words = result.document, " ".join(result.err.split())
@@ -147,21 +143,21 @@ def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
     assert stored.document["verdict"] == "adequate"
 
 
-def test_the_invented_law_is_an_effect_that_the_catalogue_lacks() -> None:
+def test_the_invented_law_is_an_effect_that_the_catalogue_lacks():
     world = invented_law(installed())
     assert INVENTED not in installed().names
     assert INVENTED in own_choices(world)
     check_choice(INVENTED, world)
 
 
-def test_what_cannot_be_hidden(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_cannot_be_hidden(tmp_path, capsys):
     line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
     assert all(name in line for name in (*choices(), "random", "nothing"))
     line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
     assert "--seed" in line
 
 
-def test_a_rehearsal_repeats_itself_and_loads_every_joint() -> None:
+def test_a_rehearsal_repeats_itself_and_loads_every_joint():
     one, two, other = rehearsal("hysteresis"), rehearsal("hysteresis"), rehearsal("hysteresis", 2)
     np.testing.assert_array_equal(one.readings.value, two.readings.value)
     assert not np.array_equal(one.readings.value, other.readings.value)
@@ -170,7 +166,7 @@ def test_a_rehearsal_repeats_itself_and_loads_every_joint() -> None:
     assert (np.abs(torque - unloaded).max(axis=0) > 5.0).all()  # N·m
 
 
-def test_a_random_choice_gives_nothing_away() -> None:
+def test_a_random_choice_gives_nothing_away():
     config = load_config(CELL)
     drawn = [rehearse(config, "random", seed, 3) for seed in range(6)]
     assert len({r.hidden for r in drawn}) > 2
@@ -178,7 +174,7 @@ def test_a_random_choice_gives_nothing_away() -> None:
     assert {r.cell.registration_known for r in drawn} == {False}
 
 
-def test_a_cell_without_loads_is_refused() -> None:
+def test_a_cell_without_loads_is_refused():
     config = load_config(CELL).model_copy(update={"loads": ()})
     with pytest.raises(InputError, match="loads"):
         rehearse(config, "nothing", 1)

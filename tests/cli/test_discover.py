@@ -24,14 +24,11 @@ from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.check import check_effect
 from hilcal.effects.example import example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
-from hilcal.identification.fit import Fit
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import States
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
-from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states, rehearse
-from studies.unmodelled_laws import Law, UnmodelledLaw, shift
+from studies.unmodelled_laws import UnmodelledLaw, shift
 from tests.support.cli_cases import CELL, ok, run
 
 SITUATION = example_situation(example_cell(), example_states(example_cell()))
@@ -39,11 +36,10 @@ VARIABLES = {v.symbol: v for v in variables(SITUATION)}
 PRODUCT = (Factor(VARIABLES["q_5"], shapes.COS, (1.0,)), Factor(VARIABLES["τ_3"], shapes.LINEAR))
 COMPLIANCE = Form((LawPart(sites(6)[2], Amplitude(PRODUCT), 0),))
 BASELINE = ["base_frame", "joint_compliance"]
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def campaign(tmp_path_factory):
     path = tmp_path_factory.mktemp("discover") / "run.hilcal"
     config = load_config(CELL)
     with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
@@ -51,9 +47,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(campaign, tmp_path, capsys):
     out = tmp_path / "found.py"
     found = run(capsys, "discover", campaign, "-o", out, "--json")
     assert found.code == 4
@@ -64,9 +58,7 @@ def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
 
 
 @pytest.mark.long
-def test_a_law_is_written_as_an_effect_and_told(
-    campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monkeypatch):
     form = Form((LawPart(sites(6)[1], Amplitude(()), 0),))
     law = FoundLaw(
         "bent", form, (Coefficient("a", 1e-4, 1e-6, "rad"),), 1e-9, 30.0, 0.8, 1.1, 0.7, (), ()
@@ -76,7 +68,7 @@ def test_a_law_is_written_as_an_effect_and_told(
     drawn = ((form, 0.7, 0.8, "bent"), (COMPLIANCE, 0.2, 0.8, ""), (hardly, 0.01, 0.2, ""))
     source = source_of_form(form, "bent", law.parameters)
 
-    def search(fit: Fit, say: object, name: str) -> Discovery:
+    def search(fit, say, name):
         assert name == "bent"
         d = Discovery(fit, "law", (law,), 0.9, 0.8, candidates=7, source=source)
         absorbed = np.zeros((fit.solution.rows.shape[1], 1))
@@ -126,9 +118,7 @@ def test_a_law_is_written_as_an_effect_and_told(
     assert "--effects-from" in found.err
 
 
-def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path, capsys):
     """The file of a law, its name changed by hand: the catalogue, fits, plans, and use."""
     run_file = tmp_path / "run.hilcal"
     run_file.write_bytes(campaign.read_bytes())
@@ -169,13 +159,12 @@ SOFTENING = 1e-3 * np.array([-4.0, -0.5, 2.0, -1.2, -0.2, -4.0])
 """Growth of each joint's compliance, at any size."""
 
 
-def softening(s: States, torque: Floats) -> Floats:
+def softening(s, torque):
     """dq_j = a_j τ_j t."""
-    assert s.time is not None
     return np.hstack([SOFTENING * torque * s.time[:, None], np.zeros((len(s), 3))])
 
 
-def one_sided(s: States, torque: Floats) -> Floats:
+def one_sided(s, torque):
     """dq_3 = a max(τ_3, 0)^1.5."""
     out = np.zeros((len(s), 9))
     out[:, 2] = np.maximum(torque[:, 2], 0.0) ** 1.5
@@ -187,9 +176,7 @@ def one_sided(s: States, torque: Floats) -> Floats:
     ("motion", "formula"),
     [(softening, r"dq_1 = a·τ_1·\(t .*dq_6 = "), (one_sided, r"dq_3 = a·max\(τ_3")],
 )
-def test_a_law_is_found_written_added_and_the_model_is_adequate(
-    motion: Law, formula: str, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula, tmp_path, capsys):
     """30 poses under 6 loads; what is found is added from its file."""
     config, rng = load_config(CELL), np.random.default_rng(1)
     pulls = ({"mass_kg": 3.0}, {"mass_kg": 6.0}, {"mass_kg": 9.0}, {"force_N": (60.0, 0.0, 0.0)},
@@ -223,9 +210,7 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(
 
 
 @pytest.mark.long
-def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, tmp_path, capsys):
     square = Factor(VARIABLES["q_5"], shapes.EVEN, (2.0, 0.01))
     other = Form((LawPart(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
     given: list[str | Path] = []
@@ -257,9 +242,7 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
         (("-o", "found.py", "--against", "no.json"), "no calibration"),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(
-    campaign: Path, capsys: Capsys, given: tuple[str, ...], message: str
-) -> None:
+def test_what_cannot_be_is_refused_by_name(campaign, capsys, given, message):
     found = run(capsys, "discover", campaign, *given)
     assert found.code == 2
     assert message in " ".join(found.err.split())

@@ -2,14 +2,10 @@
 
 from pathlib import Path
 
-import pytest
-
 from tests.support.cli_cases import CELL, ok, run
 
-Capsys = pytest.CaptureFixture[str]
 
-
-def test_the_document_and_the_words_say_the_same(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_document_and_the_words_say_the_same(tmp_path, capsys):
     d = ok(capsys, "doctor", "--folder", tmp_path, "--json").document
     assert d["ok"] is True
     names = {f["name"] for f in d["findings"]}
@@ -19,7 +15,7 @@ def test_the_document_and_the_words_say_the_same(tmp_path: Path, capsys: Capsys)
     assert "can be read" in words
 
 
-def test_what_hinders_a_campaign_is_named_and_ends_with_3(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_hinders_a_campaign_is_named_and_ends_with_3(tmp_path, capsys):
     cell = tmp_path / "cell.toml"
     text = Path(CELL).read_text(encoding="utf-8")
     port = tmp_path / "ttyUSB0"

@@ -1,22 +1,18 @@
 """Tables with many wrong readings, as a user meets them: imported, fitted, judged."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hilcal as hc
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.tables.table import write_table
 from studies.gross_errors import spoil
 from tests.support.cli_cases import CELL, ok, rehearsal
 
-Capsys = pytest.CaptureFixture[str]
 
-
-def imported(readings: Readings, folder: Path, capsys: Capsys) -> tuple[Path, str]:
+def imported(readings, folder, capsys):
     write_table(readings, folder / "t.csv", WHOLE)
     run = folder / "run.hilcal"
     said = ok(capsys, "import", folder / "t.csv", "--config", CELL, "-o", run).out
@@ -24,7 +20,7 @@ def imported(readings: Readings, folder: Path, capsys: Capsys) -> tuple[Path, st
 
 
 @pytest.mark.long
-def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys: Capsys) -> None:
+def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
     readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
     run, _ = imported(readings, tmp_path, capsys)
     d = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
@@ -40,7 +36,7 @@ def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path: Path, capsys:
         assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in command)
 
 
-def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
     """One reading off by 5 mm: errors and bands are those of the readings that were fitted."""
     readings = rehearsal("nothing").readings
     value = readings.value.copy()
@@ -62,7 +58,7 @@ def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path: Path, capsys: Ca
     np.testing.assert_allclose(its, band, rtol=0.2)
 
 
-def test_errors_of_centimetres_are_named_at_import(tmp_path: Path, capsys: Capsys) -> None:
+def test_errors_of_centimetres_are_named_at_import(tmp_path, capsys):
     readings, wrong = spoil(rehearsal("nothing").readings, 0.3, 5e-2, np.random.default_rng(0))
     run, said = imported(readings, tmp_path, capsys)
     assert f"{len(wrong)} of {len(readings)} rows do not fit" in said
@@ -71,7 +67,7 @@ def test_errors_of_centimetres_are_named_at_import(tmp_path: Path, capsys: Capsy
 
 
 @pytest.mark.long
-def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path, capsys):
     readings = rehearsal("nothing").readings
     value = readings.value.copy()
     value[40:62, :3] += [4e-3, 3e-3, 0.0]

@@ -19,7 +19,7 @@ ALL = [
 ]
 
 
-def words(text: str) -> list[str]:
+def words(text):
     """What is said, wherever its lines are broken; the line of usage has its own layout."""
     return text.partition("\n\n")[2].split()
 
@@ -39,7 +39,7 @@ def test_help_breaks_and_cuts_no_word_at_any_width(
     assert "130 interrupted with Ctrl-C" in " ".join(told[80]) or len(command) == 2
 
 
-def test_the_list_of_commands_is_in_the_order_of_the_work(capsys: Capsys) -> None:
+def test_the_list_of_commands_is_in_the_order_of_the_work(capsys):
     listed = [name for section in SECTIONS.values() for name in section]
     assert sorted(set(listed)) == sorted(listed)  # none twice
     assert set(COMMANDS) <= set(listed)  # none without a heading
@@ -52,10 +52,8 @@ def test_the_list_of_commands_is_in_the_order_of_the_work(capsys: Capsys) -> Non
     assert all(command.summary in told for command in COMMANDS.values())
 
 
-def test_a_shell_completes_commands_and_options(
-    capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def completed(line: str, word: int) -> list[str]:
+def test_a_shell_completes_commands_and_options(capsys, monkeypatch):
+    def completed(line, word):
         """What bash is offered for a word of a line."""
         monkeypatch.setenv("_HILCAL_COMPLETE", "complete_bash")
         monkeypatch.setenv("COMP_WORDS", line)
@@ -70,7 +68,7 @@ def test_a_shell_completes_commands_and_options(
     assert completed("hilcal run 'ce", 2) == []  # a quote that is still open
 
 
-def test_a_shell_is_told_how_to_complete(capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shell_is_told_how_to_complete(capsys, monkeypatch):
     # Which shell runs the tests is no matter; without this typer looks for it.
     monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     script = ok(capsys, "--show-completion", "bash").out
@@ -85,9 +83,7 @@ def test_a_shell_is_told_how_to_complete(capsys: Capsys, monkeypatch: pytest.Mon
         (("plan", "CELL", "--no-such-option"), "input", 2),
     ],
 )
-def test_an_error_is_one_document_with_json(
-    arguments: tuple[str, ...], kind: str, code: int, capsys: Capsys
-) -> None:
+def test_an_error_is_one_document_with_json(arguments, kind, code, capsys):
     result = run(capsys, *arguments, "--json")
     line = refused(capsys, code, *arguments)  # without it: the same line, and nothing on stdout
     assert result.code == code
@@ -96,12 +92,10 @@ def test_an_error_is_one_document_with_json(
     assert result.err.splitlines()[-1] == line
 
 
-def test_an_unexpected_error_and_an_interrupt_are_documents(
-    capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unexpected_error_and_an_interrupt_are_documents(capsys, monkeypatch):
 
-    def fails(error: BaseException) -> object:
-        def raises(*_: object) -> None:
+    def fails(error):
+        def raises(*_):
             raise error
 
         return raises
@@ -121,7 +115,7 @@ def test_an_unexpected_error_and_an_interrupt_are_documents(
     }
 
 
-def test_a_usage_error_names_the_help(capsys: Capsys) -> None:
+def test_a_usage_error_names_the_help(capsys):
     assert refused(capsys, 2, "run", "x", "--foo").endswith("see hilcal run -h")
     assert refused(capsys, 2, "diagnos").endswith("Did you mean 'diagnose'? See hilcal -h")
 
@@ -129,7 +123,7 @@ def test_a_usage_error_names_the_help(capsys: Capsys) -> None:
 SAID = re.compile(r"hilcal ([a-z]+)((?: (?!and |or |first|again|to )[^\s\"'`;,)(]+)*)")
 
 
-def test_every_step_that_a_message_names_can_be_taken() -> None:
+def test_every_step_that_a_message_names_can_be_taken():
     """Each command that the program's words name is one, and has the options that they give it."""
     wrong, seen = [], set()
     for path in sorted((*ROOT.glob("hilcal/**/*.py"), *ROOT.glob("drivers/**/*.py"))):

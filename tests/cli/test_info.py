@@ -1,7 +1,6 @@
 """`info`: what a campaign holds, told from the file alone."""
 
 import hashlib
-from pathlib import Path
 
 import pytest
 
@@ -13,11 +12,9 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, create_run
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
 
-Capsys = pytest.CaptureFixture[str]
-
 
 @pytest.fixture(scope="module")
-def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def imported(tmp_path_factory):
     """An imported campaign with two revisions, the second one from the first."""
     run = tmp_path_factory.mktemp("info") / "run.hilcal"
     csv = table(run.with_name("t.csv"), "hysteresis", poses=8)
@@ -32,7 +29,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_an_imported_campaign(imported: Path, capsys: Capsys) -> None:
+def test_an_imported_campaign(imported, capsys):
     before = hashlib.sha256(imported.read_bytes()).hexdigest()
     d = ok(capsys, "info", imported, "--json").document
     assert (d["n_readings"], d["n_poses"], d["robot"]) == (40, 8, "ur10e")
@@ -54,7 +51,7 @@ def test_an_imported_campaign(imported: Path, capsys: Capsys) -> None:
     assert hashlib.sha256(imported.read_bytes()).hexdigest() == before
 
 
-def test_the_accepted_revision_is_marked(imported: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_accepted_revision_is_marked(imported, tmp_path, capsys):
     run = tmp_path / "run.hilcal"
     run.write_bytes(imported.read_bytes())
     ok(capsys, "accept", run, "2")
@@ -87,7 +84,7 @@ ANSWERS = [
 
 
 @pytest.fixture
-def measured(tmp_path: Path) -> Path:
+def measured(tmp_path):
     """A campaign as `run` leaves it after an interruption, with everything that it notes."""
     r = rehearsal("nothing", poses=3).readings
     steps = tuple(
@@ -124,9 +121,7 @@ def measured(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_measured_campaign_says_by_what_and_how_it_was_measured(
-    measured: Path, capsys: Capsys
-) -> None:
+def test_a_measured_campaign_says_by_what_and_how_it_was_measured(measured, capsys):
     d = ok(capsys, "info", measured, "--json").document
     assert (d["n_readings"], d["measured"], d["planned"]) == (8, 8, 15)
     numbers = {i["device"]: i["serial_number"] for i in d["instruments"]}
@@ -158,7 +153,7 @@ def test_a_measured_campaign_says_by_what_and_how_it_was_measured(
         assert part in words, part
 
 
-def test_a_campaign_that_holds_nothing_yet(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
     path = tmp_path / "empty.hilcal"
     config = load_config(CELL).to_json()
     CampaignFile.create(path, config, str(CELL.parent), "test", more={COVERS: INSTRUMENT}).close()

@@ -16,16 +16,15 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
 from hilcal.store.run_log import RunLog
 from hilcal.workbench.session import WorkbenchSession
-from tests.cli.test_until_goal import Site, site
+from tests.cli.test_until_goal import site
 from tests.support.cli_cases import ok, refused
 from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
 
 __all__ = ["site"]
 ROOT = Path(__file__).resolve().parents[2]
-Capsys = pytest.CaptureFixture[str]
 
 
-def made(*names: str, shift: float = 0.0) -> Plan:
+def made(*names, shift=0.0):
     """Every pose unloaded and under a load; poses of one name are those of `MADE` if not moved."""
     q = np.array([np.arange(6.0) / 10 + int(n[-1]) if n[-1].isdigit() else np.zeros(6)
                   for n in names])  # fmt: skip
@@ -36,7 +35,7 @@ def made(*names: str, shift: float = 0.0) -> Plan:
 # names and cycles
 
 
-def test_new_poses_get_names_of_their_own() -> None:
+def test_new_poses_get_names_of_their_own():
     before, further = made(REFERENCE, "p1", "p2"), made(REFERENCE, "p1", "p3", shift=0.2)
     out = with_new_names(further, before, 2)
     assert out.pose_names == (REFERENCE, "p1-2", "p3")
@@ -52,7 +51,7 @@ def test_new_poses_get_names_of_their_own() -> None:
     assert {s.cycle for s in third.steps if s.pose == REFERENCE} == {2}
 
 
-def test_the_same_poses_again_are_new_cycles_with_references_of_their_own() -> None:
+def test_the_same_poses_again_are_new_cycles_with_references_of_their_own():
     plan = made(REFERENCE, "p1")
     again = with_new_names(plan, plan, 2)
     assert again.pose_names == plan.pose_names
@@ -62,7 +61,7 @@ def test_the_same_poses_again_are_new_cycles_with_references_of_their_own() -> N
     assert loaded <= {(s.pose, s.cycle) for s in again.steps if s.load == "none"}
 
 
-def test_a_name_that_was_made_up_is_not_taken_twice() -> None:
+def test_a_name_that_was_made_up_is_not_taken_twice():
     before = made("p1", "p1-2")
     further = made("p1", shift=0.1)
     assert with_new_names(further, before, 2).pose_names == ("p1-2-2",)
@@ -75,7 +74,7 @@ def test_a_name_that_was_made_up_is_not_taken_twice() -> None:
         (Plan((REFERENCE,), np.zeros((1, 7)), (Step(REFERENCE, "none"),)), "7 joint angles"),
     ],
 )
-def test_what_does_not_go_together(plan: Plan, words: str) -> None:
+def test_what_does_not_go_together(plan, words):
     with pytest.raises(InputError, match=words):
         with_new_names(plan, made(REFERENCE, "p1"), 2)
 
@@ -83,7 +82,7 @@ def test_what_does_not_go_together(plan: Plan, words: str) -> None:
 # the file
 
 
-def test_what_was_not_measured_before_is_given_up(tmp_path: Path) -> None:
+def test_what_was_not_measured_before_is_given_up(tmp_path):
     path = tmp_path / "run.hilcal"
     further = made("p1", "p7", shift=0.3)
     with _campaign(path) as campaign:
@@ -118,7 +117,7 @@ with CampaignFile.open(Path(sys.argv[1])) as campaign:
 
 
 @pytest.mark.long
-def test_an_appended_plan_survives_a_kill(tmp_path: Path) -> None:
+def test_an_appended_plan_survives_a_kill(tmp_path):
     path = tmp_path / "run.hilcal"
     _campaign(path).close()
     search = str(ROOT)
@@ -136,7 +135,7 @@ def test_an_appended_plan_survives_a_kill(tmp_path: Path) -> None:
 # the command
 
 
-def further_plan(site: Site) -> Path:
+def further_plan(site):
     """Half of the site's poses, a little elsewhere, at another reference."""
     plan = site.plan
     q = plan.q + 0.02
@@ -148,7 +147,7 @@ def further_plan(site: Site) -> Path:
 
 
 @pytest.mark.long
-def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys) -> None:
+def test_a_further_plan_is_measured_into_the_campaign(site, capsys):
     path, first = site.directory / "run.hilcal", len(site.plan.steps)
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.again()
@@ -177,7 +176,7 @@ def test_a_further_plan_is_measured_into_the_campaign(site: Site, capsys: Capsys
 
 
 @pytest.mark.long
-def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
+def test_the_line_that_next_prints(site, capsys):
     """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.again()
@@ -189,7 +188,7 @@ def test_the_line_that_next_prints(site: Site, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> None:
+def test_an_append_that_was_stopped_is_resumed(site, capsys):
     ok(capsys, *site.command(*site.fresh))
     site.bench.world.again()
     further = str(further_plan(site))
@@ -202,7 +201,7 @@ def test_an_append_that_was_stopped_is_resumed(site: Site, capsys: Capsys) -> No
     assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
 
 
-def test_wrong_ways_to_append(site: Site, capsys: Capsys) -> None:
+def test_wrong_ways_to_append(site, capsys):
     further = str(further_plan(site))
     line = refused(capsys, 2, *site.command("--append", "--plan", further))
     assert "no such campaign file" in line

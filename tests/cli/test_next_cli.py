@@ -1,7 +1,6 @@
 """`hilcal next` and `hilcal demo --ambiguous`: what they say, write and refuse."""
 
 import re
-from pathlib import Path
 
 import pytest
 
@@ -25,12 +24,11 @@ from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
 from tests.unit.design.test_many_poses import fine_error
 
-Capsys = pytest.CaptureFixture[str]
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
 CELLS = str(configs_dir() / "cells")
 
 
-def stored(path: Path, effect: str, seed: int) -> Path:
+def stored(path, effect, seed):
     """Write a small campaign, as `hilcal import` would."""
     with CampaignFile.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
         campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
@@ -38,12 +36,12 @@ def stored(path: Path, effect: str, seed: int) -> Path:
 
 
 @pytest.fixture
-def ambiguous(tmp_path: Path) -> Path:
+def ambiguous(tmp_path):
     assert doubtful(BASE, 2).suspects == (BASE, TILT)
     return stored(tmp_path / "run.hilcal", BASE, 2)
 
 
-def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     ok(capsys, "identify", ambiguous)
     plan, table = tmp_path / "next.json", tmp_path / "next.csv"
     arguments = ("--quick", "--poses", "8", "--csv", table, "--json")
@@ -78,9 +76,7 @@ def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Caps
 
 
 @pytest.mark.slow
-def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(ambiguous, tmp_path, capsys):
     old, plan = tmp_path / "old.hilcal", tmp_path / "next.json"
     ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 12), "--config", CELL, "-o", old)
     ok(capsys, "identify", old)
@@ -94,9 +90,7 @@ def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(
     assert ok(capsys, "info", ambiguous, "--json").document["revisions"][-1]["revision"] == 1
 
 
-def test_a_revision_with_a_prior_takes_no_other(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_revision_with_a_prior_takes_no_other(ambiguous, tmp_path, capsys):
     old = tmp_path / "old.hilcal"
     ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 8), "--config", CELL, "-o", old)
     ok(capsys, "identify", old)
@@ -106,9 +100,7 @@ def test_a_revision_with_a_prior_takes_no_other(
 
 
 @pytest.mark.long
-def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(ambiguous, tmp_path, capsys):
     """`refine` has added the leading suspect: the newest model is adequate, and may be wrong."""
     refined = ok(capsys, "refine", ambiguous, "--json").document
     assert refined["verdict"] == "ambiguous"
@@ -120,7 +112,7 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
 
 
 @pytest.mark.long
-def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
         campaign.append_readings(fine_error()[1])
@@ -137,9 +129,7 @@ def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: C
 
 
 @pytest.mark.long
-def test_four_suspects_fit_one_screen(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_four_suspects_fit_one_screen(tmp_path, capsys, monkeypatch):
     """By default the pair of each suspect that is separated least; all under --details."""
     stored(tmp_path / "run.hilcal", TILT, 1)
     monkeypatch.chdir(tmp_path)  # names of files are short, as people have them
@@ -158,7 +148,7 @@ def test_four_suspects_fit_one_screen(
 
 
 @pytest.mark.long
-def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
+def test_named_suspects_need_no_diagnosis(tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")
     d = ok(capsys, "next", path, "-o", tmp_path / "n.json", *arguments).document
@@ -167,7 +157,7 @@ def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_in_doubt_is_said_so(tmp_path, capsys):
     plan = tmp_path / "next.json"
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     line = refused_after(capsys, "next", path, "-o", plan)
@@ -180,13 +170,13 @@ def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
     assert not plan.exists()
 
 
-def refused_after(capsys: Capsys, *arguments: str | Path) -> str:
+def refused_after(capsys, *arguments):
     """The line of a refusal with exit 4, of a campaign that has its baseline."""
     ok(capsys, "identify", arguments[1])
     return refused(capsys, 4, *arguments)
 
 
-def test_pairs_that_nothing_separates_are_refused(tmp_path: Path, capsys: Capsys) -> None:
+def test_pairs_that_nothing_separates_are_refused(tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     ok(capsys, "identify", path)
     suspects = ("--suspects", "tracker_scale,hysteresis")
@@ -206,9 +196,7 @@ def test_pairs_that_nothing_separates_are_refused(tmp_path: Path, capsys: Capsys
         (("--cell", "nothing.toml"), ("nothing.toml",)),
     ],
 )
-def test_wrong_options(
-    arguments: tuple[str, ...], words: tuple[str, ...], tmp_path: Path, capsys: Capsys
-) -> None:
+def test_wrong_options(arguments, words, tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     line = refused(capsys, 2, "next", path, "-o", tmp_path / "n.json", *arguments)
     assert all(word in line for word in words)
@@ -218,7 +206,7 @@ def test_wrong_options(
 
 
 @pytest.mark.slow
-def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_demo_settles_a_doubt(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     arguments = ("demo", "--without-devices", "--ambiguous", "--hide", LINK, "--seed", "2")
     result = ok(capsys, *arguments, "-o", path, "--json")
@@ -236,24 +224,23 @@ def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
     assert records[0].data_hash != records[1].data_hash
     assert d["doubt"]["verdict"] == records[0].result_json["diagnose"]["verdict"]
     told = re.search(r"(\d+) readings were added. All (\d+)", result.err)
-    assert told is not None
     assert 0 < int(told[1]) < int(told[2]) == len(readings)
     viewed = ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json").document
     assert viewed["revisions"] == [2, 3]
 
 
 @pytest.mark.slow
-def test_a_demo_without_devices_can_be_viewed(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_demo_without_devices_can_be_viewed(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     ok(capsys, "demo", "--without-devices", "--hide", "nothing", "--poses", "6", "-o", path)
     ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json")
 
 
-def rehearsal_of(seed: int, path: Path) -> RehearsalSettings:
+def rehearsal_of(seed, path):
     return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, installed())
 
 
-def in_doubt_at_first(seed: int, path: Path) -> bool:
+def in_doubt_at_first(seed, path):
     """Whether the first readings of an ambiguous demo, which the seed determines, leave a doubt."""
     case, plan, doubtful = demo.doubtful_case(rehearsal_of(seed, path), None, print)
     assert doubtful
@@ -265,18 +252,18 @@ def in_doubt_at_first(seed: int, path: Path) -> bool:
 
 
 @pytest.mark.long
-def test_an_ambiguous_demo_is_in_doubt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ambiguous_demo_is_in_doubt(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "DRAWS", 2)
     assert in_doubt_at_first(2, tmp_path / "x")
 
 
 @pytest.mark.slow
-def test_every_ambiguous_demo_is_in_doubt(tmp_path: Path) -> None:
+def test_every_ambiguous_demo_is_in_doubt(tmp_path):
     assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
 
 
 @pytest.mark.long
-def test_a_case_without_a_doubt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_without_a_doubt_is_told(tmp_path, monkeypatch):
     """An effect that everything separates is hidden all the same, if that is asked for."""
     monkeypatch.setattr(demo, "TRIES", 2)
     monkeypatch.setattr(demo, "_resembled", lambda r, case: False)

@@ -9,9 +9,7 @@ import html
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -19,14 +17,12 @@ import hilcal as hc
 from hilcal.cli.commands import COMMANDS
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, Outcome, ok, refused, table
+from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
 
-Capsys = pytest.CaptureFixture[str]
 
-
-def follow(capsys: Capsys, said: str, step: str, **places: str | Path) -> Outcome:
+def follow(capsys, said, step, **places):
     """Take a step that a message names; its words in capitals stand for places."""
     assert step in " ".join(said.split()), said
     chosen = [str(places.get(word, word)) for word in shlex.split(step)]
@@ -34,7 +30,7 @@ def follow(capsys: Capsys, said: str, step: str, **places: str | Path) -> Outcom
     return ok(capsys, *chosen[1:])
 
 
-def imported(capsys: Capsys, path: Path, hidden: str = "hysteresis", seed: int = 1) -> Path:
+def imported(capsys, path, hidden="hysteresis", seed=1):
     """A campaign without revisions, the name of which must be quoted."""
     ok(
         capsys,
@@ -49,12 +45,12 @@ def imported(capsys: Capsys, path: Path, hidden: str = "hysteresis", seed: int =
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: Capsys) -> Path:
+def run(tmp_path, capsys):
     return imported(capsys, tmp_path / "a run.hilcal")
 
 
 @pytest.mark.long
-def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_without_a_revision(run, tmp_path, capsys):
     out, later = tmp_path / "p.json", imported(capsys, tmp_path / "later.hilcal", seed=2)
     for arguments in (
         ("accept", run),
@@ -73,7 +69,7 @@ def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert "no revision" not in ok(capsys, "compare", run, later).err
 
 
-def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
+def test_readings_were_appended(run, capsys):
     ok(capsys, "identify", run)
     ok(capsys, "accept", run)
     with hc.Campaign.open(run) as opened:
@@ -88,7 +84,7 @@ def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Capsys) -> None:
+def test_another_scaling_or_parameters_of_another_version(run, capsys):
     ok(capsys, "identify", run, "--scaling", "gu")
     said = refused(capsys, 2, "diagnose", run)
     follow(capsys, f"{said} hilcal identify RUN", "hilcal identify RUN", RUN=run)
@@ -104,7 +100,7 @@ def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Cap
 
 
 @pytest.mark.long
-def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_an_effect_of_ones_own(run, tmp_path, capsys):
     empty, path = tmp_path / "empty.py", tmp_path / "my effect.py"
     empty.write_text("")
     said = refused(capsys, 2, "effects", "--effects-from", empty)
@@ -120,7 +116,7 @@ def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     ok(capsys, "diagnose", run, "--effects-from", path)
 
 
-def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_deflections_lack_the_unloaded_arm(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--readings", "deflection")
     said = refused(capsys, 4, "export", run, "--urdf", tmp_path / "arm.urdf")
     follow(capsys, said, "hilcal identify RUN --readings absolute", RUN=run)
@@ -128,7 +124,7 @@ def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Ca
 
 
 @pytest.mark.long
-def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_to_carry_over(run, tmp_path, capsys):
     table(csv := tmp_path / "later.csv", "hysteresis", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
     ok(capsys, "identify", run, "--readings", "absolute", "--effects", "base_frame")
@@ -142,7 +138,7 @@ def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_diagnosis_says(run, tmp_path, capsys):
     ok(capsys, "add", run, "hysteresis")
     ok(capsys, "add", run, "tool_compliance")
     said = ok(capsys, "diagnose", run).out
@@ -151,7 +147,7 @@ def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_next_says(tmp_path, capsys):
     cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
     run = imported(capsys, tmp_path / "run.hilcal", "nothing")
@@ -166,7 +162,7 @@ def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_comparison_says(run, tmp_path, capsys):
     table(csv := tmp_path / "later.csv", "creep", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
     ok(capsys, "identify", run)
@@ -176,7 +172,7 @@ def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> No
     follow(capsys, said, "hilcal compare EARLIER LATER", EARLIER=run, LATER=later)
 
 
-def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_files_that_are_not_there_yet(run, tmp_path, capsys):
     assert "make one with: hilcal plan" in refused(
         capsys, 2, "check", CELL, "--plan", tmp_path / "plan.json"
     )
@@ -202,9 +198,7 @@ def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys)
 
 
 @pytest.mark.long
-def test_what_a_report_names(
-    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_report_names(run, tmp_path, capsys, monkeypatch):
     page = tmp_path / "page.html"
     ok(capsys, "report", run, "-o", page)
     assert "hilcal refine finds the effects that are missing" in page.read_text()
@@ -220,15 +214,13 @@ def test_what_a_report_names(
     ok(capsys, "accept", run, "1")
 
 
-def test_a_campaign_that_calibrate_did_not_make(run: Path, capsys: Capsys) -> None:
+def test_a_campaign_that_calibrate_did_not_make(run, capsys):
     said = refused(capsys, 2, "calibrate", CELL, "-o", run)
     follow(capsys, said, f"hilcal info '{run}'")
 
 
 @pytest.mark.long
-def test_another_arm_is_calibrated_by_itself(
-    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_arm_is_calibrated_by_itself(run, tmp_path, capsys, monkeypatch):
     later = imported(capsys, tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
     monkeypatch.setattr(Comparison, "another_arm", True)
@@ -400,7 +392,7 @@ NO_STEP = {
 """Modules that name commands as where something comes from, or as a title."""
 
 
-def sentences(path: Path) -> Iterator[str]:
+def sentences(path):
     """Yield the strings of a module, no docstrings and no helps of options, that name a command."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     left_out = {id(s.value) for s in ast.walk(tree) if isinstance(s, ast.Expr)}
@@ -417,7 +409,7 @@ def sentences(path: Path) -> Iterator[str]:
             yield text
 
 
-def test_every_message_is_taken() -> None:
+def test_every_message_is_taken():
     package = ROOT / "hilcal"
     found = {
         name: said
@@ -434,7 +426,7 @@ def test_every_message_is_taken() -> None:
 
 
 @pytest.mark.parametrize("test", sorted({test for of in TAKEN.values() for test in of.values()}))
-def test_the_tests_that_take_them_are_there(test: str) -> None:
+def test_the_tests_that_take_them_are_there(test):
     path, _, name = test.partition("::")
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}

@@ -2,25 +2,18 @@
 
 import json
 import sys
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.config import CellConfig, load_config
-from hilcal.diagnosis.diagnosis import Diagnosis
+from hilcal.config import load_config
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.doubt import in_doubt
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.baseline import baseline
-from hilcal.identification.fit import Fit
 from hilcal.present.story import build_story
 from hilcal.present.verdict import message
-from hilcal.readings.readings import Readings
-from hilcal.readings.whitening import Mode
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
@@ -30,26 +23,25 @@ from studies.study_cases import study_case
 from tests.support.cli_cases import CELL, ok, run
 from tests.support.next_cases import SMALL, doubtful
 
-Capsys = pytest.CaptureFixture[str]
 CELLS = str(configs_dir() / "cells")
 UR5E = load_config(CELL).model_copy(
     update={"robot": load_config(CELL).robot.model_copy(update={"model": "ur5e"})}
 )
 
 
-def stored(path: Path, config: CellConfig, readings: Readings, mode: Mode) -> Path:
+def stored(path, config, readings, mode):
     """A campaign file with its readings alone."""
     with CampaignFile.create(path, config.to_json(), CELLS, "a test") as file:
         file.append_readings(readings)
     return path
 
 
-def study(mode: Mode, *hidden: str, seed: int = 1, **options: Any) -> tuple[CellConfig, Readings]:
+def study(mode, *hidden, seed=1, **options):
     c = study_case(UR5E, "ur5e", mode, hidden, options.pop("strength", 3.0), seed, **options)
     return UR5E, c.readings
 
 
-def correlated() -> tuple[CellConfig, Readings]:
+def correlated():
     c = study_case(UR5E, "ur5e", "absolute", (), 1.0, 3, n_poses=12)
     return UR5E, serial_readings(c, 0.9, np.random.default_rng(3))
 
@@ -77,7 +69,7 @@ FIRST = {
 }
 
 
-def check_document(d: Mapping[str, Any]) -> None:
+def check_document(d):
     """One document, one verdict; and it is without contradiction."""
     inner = d.get("diagnosis", d)
     assert (d["verdict"], d["message"]) == (inner["verdict"], inner["message"])
@@ -99,15 +91,14 @@ def check_document(d: Mapping[str, Any]) -> None:
     assert set(passing).isdisjoint(rejected)
 
 
-def latest(path: Path) -> tuple[Mapping[str, Any], Diagnosis]:
+def latest(path):
     """The diagnosis as it is in the file, and as the library makes it."""
     with Campaign.open(path) as campaign:
         record = campaign.latest()
-        assert record is not None
         return record.result_json["diagnose"], diagnose(campaign.fit(), campaign.history())
 
 
-def check_doors(path: Path, expected: Mapping[str, Any], capsys: Capsys, tmp_path: Path) -> None:
+def check_doors(path, expected, capsys, tmp_path):
     """Every way to the diagnosis of the latest revision ends in the same verdict and message."""
     said = (expected["verdict"], expected["message"])
     d = ok(capsys, "diagnose", path, "--json").document
@@ -142,7 +133,7 @@ FAST = ("missing", "unknown although tried")
     "case",
     [pytest.param(c, marks=pytest.mark.long if c in FAST else pytest.mark.slow) for c in CASES],
 )
-def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_one_verdict_through_every_door(case, tmp_path, capsys):
     mode, make = CASES[case]
     path = stored(tmp_path / "run.hilcal", *make(), mode)
     ok(capsys, "identify", path, "--readings", mode)
@@ -164,9 +155,7 @@ def test_one_verdict_through_every_door(case: str, tmp_path: Path, capsys: Capsy
     assert (again["verdict"], again["message"]) == (refined["verdict"], refined["message"])
 
 
-def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", *study("deflection", "creep", n_poses=12), "deflection")
     ok(capsys, "identify", path)
     for name in ("creep", "hysteresis"):
@@ -179,12 +168,12 @@ def test_adding_gives_the_verdict_that_is_stored_and_diagnosed(
 
 
 @pytest.mark.long
-def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_steps_of_a_refinement_carry_what_it_tried(monkeypatch):
     """The effect that each step adds is the first suspect of the step before."""
     c = study_case(UR5E, "ur5e", "deflection", ("relaxing bench",), 3.0, 0, n_poses=12)
     answers = iter([False])  # the first trial does not lower the error on poses left out
 
-    def predicts_better(before: Fit, after: Fit) -> bool:
+    def predicts_better(before, after):
         return next(answers, None) is None and judged(before, after)
 
     refinement = sys.modules["hilcal.refinement"]  # hilcal.refine is a function of the library

@@ -1,7 +1,6 @@
 """`--prior` on `identify` and `refine`, and what it refuses."""
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -9,16 +8,14 @@ from hilcal.cli import main
 from tests.support.cli_cases import CELL, table
 
 
-def run(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str, str]:
+def run(capsys, *words):
     with pytest.raises(SystemExit) as end:
         main([str(w) for w in words])
     out = capsys.readouterr()
     return int(end.value.code or 0), out.out, out.err
 
 
-def test_the_next_campaign_starts_from_what_the_last_one_taught(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys):
     old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
     run(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 12), "--config", CELL, "-o", old)
     run(capsys, "import", table(tmp_path / "b.csv", "nothing", 2, 6), "--config", CELL, "-o", new)
@@ -46,9 +43,7 @@ def test_the_next_campaign_starts_from_what_the_last_one_taught(
 
 
 @pytest.mark.long
-def test_a_misfit_that_the_prior_does_not_know_is_told(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
     old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
     hidden = table(tmp_path / "b.csv", "joint_tilt_compliance", 1, 8)
     run(capsys, "import", table(tmp_path / "a.csv", "nothing", 2, 8), "--config", CELL, "-o", old)
@@ -61,7 +56,7 @@ def test_a_misfit_that_the_prior_does_not_know_is_told(
     assert "did not have joint_tilt_compliance; hilcal compare" in " ".join(out.split())
 
 
-def test_refusals(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_refusals(tmp_path, capsys):
     old = tmp_path / "old.hilcal"
     run(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 8), "--config", CELL, "-o", old)
     run(capsys, "identify", old)

@@ -7,10 +7,10 @@ from hilcal.cli.terminal import terminal
 from hilcal.errors import DeviceError, InputError
 
 
-def work(failures: int, kind: type[Exception] = DeviceError):
+def work(failures, kind=DeviceError):
     calls = []
 
-    def once() -> None:
+    def once():
         calls.append(1)
         if len(calls) <= failures:
             raise kind("force sensor: nothing came for 0.2 s")

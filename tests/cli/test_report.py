@@ -3,7 +3,6 @@
 import hashlib
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,19 +18,15 @@ from tests.support.campaigns import cell_of, configuration
 from tests.support.cli_cases import ok, refused
 from tests.support.report_pages import write_campaign
 
-Capsys = pytest.CaptureFixture[str]
-
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def campaign(tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "run.hilcal"
     write_campaign(path)
     return path
 
 
-def test_a_campaign_that_nothing_was_fitted_to_has_a_page_of_the_baseline(
-    campaign: Path, capsys: Capsys
-) -> None:
+def test_a_campaign_that_nothing_was_fitted_to_has_a_page_of_the_baseline(campaign, capsys):
     before = campaign.read_bytes()
     options = ("--limit", "0.001 um", "--operator", "A. Miller")
     found = ok(capsys, "report", campaign, *options, "--json")
@@ -49,9 +44,7 @@ def test_a_campaign_that_nothing_was_fitted_to_has_a_page_of_the_baseline(
 
 
 @pytest.mark.slow
-def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(
-    campaign: Path, capsys: Capsys
-) -> None:
+def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(campaign, capsys):
     world = simulated("joint_tilt_compliance", "deflection", poses=6, strength=8.0).world
     compliance = world.physics.joint_compliance * [1, 2, 1, 1, 1, 1]
     worn = replace(world, physics=world.physics.with_effect("joint_compliance", compliance))
@@ -78,16 +71,12 @@ def test_two_campaigns_of_one_arm_have_a_page_that_says_what_has_changed(
         (("--revision", "7"), "revision 7"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(
-    campaign: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch, arguments, says: str
-) -> None:
+def test_what_cannot_be_is_refused_in_one_line(campaign, capsys, monkeypatch, arguments, says):
     monkeypatch.chdir(campaign.parent)
     assert says in refused(capsys, 2, "report", "run.hilcal", *arguments)
 
 
-def test_the_certificate_never_takes_the_arm_to_come_back_exactly(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_certificate_never_takes_the_arm_to_come_back_exactly(tmp_path, capsys):
     """Unloaded readings are repeated, deflections are not; the cell states no repeatability."""
     site = simulated(poses=8, cycles=3)
     r, true = site.readings, replace(site.cell, registration=site.world.registration)
@@ -106,9 +95,7 @@ def test_the_certificate_never_takes_the_arm_to_come_back_exactly(
 
 
 @pytest.mark.long
-def test_deflection_and_absolute_revisions_stand_in_no_column_together(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_deflection_and_absolute_revisions_stand_in_no_column_together(tmp_path, capsys):
     run = tmp_path / "run.hilcal"
     write_campaign(run, poses=8)
     for kind in ("deflection", "absolute", "deflection"):

@@ -10,7 +10,7 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.handover import urdf
 from hilcal.cell import cell_from_config
-from hilcal.config import CellConfig, load_config
+from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
@@ -22,7 +22,7 @@ from tests.unit.discovery.test_discover import campaign as simulated
 
 
 @pytest.fixture
-def sent(tmp_path: Path) -> tuple[Path, CellConfig]:
+def sent(tmp_path):
     """A campaign that was sent: its robot's file stays where it was measured."""
     there, here = tmp_path / "there", tmp_path / "here"
     there.mkdir()
@@ -38,9 +38,7 @@ def sent(tmp_path: Path) -> tuple[Path, CellConfig]:
     return here / "run.hilcal", config
 
 
-def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file(
-    sent: tuple[Path, CellConfig], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file(sent, capsys):
     path, _ = sent
     told = json.loads(ok(capsys, "identify", path, "--json").out)
     found = {p["name"]: p["value"] for p in told["parameters"]}
@@ -55,9 +53,7 @@ def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file
         np.testing.assert_allclose(hc.Cell.load(cell).arm.links, run.cell.arm.links, atol=1e-12)
 
 
-def test_another_robots_file_beside_the_exported_cell_is_not_replaced(
-    sent: tuple[Path, CellConfig], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_another_robots_file_beside_the_exported_cell_is_not_replaced(sent, capsys):
     path, _ = sent
     other, cell = path.parent / "own.urdf", path.parent / "cell.toml"
     other.write_text("another", encoding="utf-8")
@@ -67,9 +63,7 @@ def test_another_robots_file_beside_the_exported_cell_is_not_replaced(
     assert other.read_text(encoding="utf-8").startswith("<")
 
 
-def test_a_run_does_not_go_on_with_another_robot(
-    sent: tuple[Path, CellConfig], tmp_path: Path
-) -> None:
+def test_a_run_does_not_go_on_with_another_robot(sent, tmp_path):
     path, config = sent
     with CampaignFile.open(path, read_only=True) as campaign:
         kept = campaign.about(ROBOT_FILE)
@@ -81,9 +75,7 @@ def test_a_run_does_not_go_on_with_another_robot(
             check_same_cell(campaign, config, tmp_path)
 
 
-def test_a_campaign_reads_no_file_that_it_names(
-    sent: tuple[Path, CellConfig], tmp_path: Path
-) -> None:
+def test_a_campaign_reads_no_file_that_it_names(sent, tmp_path):
     """The arm is the one that is kept, whatever stands at the path now."""
     path, config = sent
     with CampaignFile.open(path, read_only=True) as file:
@@ -98,7 +90,7 @@ def test_a_campaign_reads_no_file_that_it_names(
     )
 
 
-def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path: Path) -> None:
+def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path):
     """Neither one in the working directory, nor one where the campaign says that it was."""
     there, moved, run = tmp_path / "there", tmp_path / "moved", tmp_path / "run.hilcal"
     there.mkdir()

@@ -14,7 +14,7 @@ SLOW = ("asyncio", "plotly", "rerun", "sklearn")
 """Libraries that few commands need, each a tenth of a second or more to load."""
 
 
-def loaded(code: str, of: tuple[str, ...] = HEAVY) -> set[str]:
+def loaded(code, of=HEAVY):
     """Heavy modules that are loaded after a piece of code has run in a process of its own."""
     report = f"{code}\nimport sys\nprint(*sys.modules, sep='\\n', file=sys.stderr)"
     done = subprocess.run(
@@ -24,7 +24,7 @@ def loaded(code: str, of: tuple[str, ...] = HEAVY) -> set[str]:
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
-def test_help_and_version_load_no_library_of_the_computation(option: str) -> None:
+def test_help_and_version_load_no_library_of_the_computation(option):
     code = f"""
 from hilcal.cli import main
 try:
@@ -35,7 +35,7 @@ except SystemExit as ended:
     assert loaded(code) == set()
 
 
-def test_completing_a_command_loads_no_library_of_the_computation() -> None:
+def test_completing_a_command_loads_no_library_of_the_computation():
     code = """
 import os
 os.environ.update(_HILCAL_COMPLETE="complete_bash", COMP_WORDS="hilcal di", COMP_CWORD="1")
@@ -48,14 +48,14 @@ except SystemExit as ended:
     assert loaded(code) <= {"pydantic"}  # typer parses by it
 
 
-def test_the_package_loads_nothing_until_a_name_is_used() -> None:
+def test_the_package_loads_nothing_until_a_name_is_used():
     assert loaded("import hilcal") == set()
     assert "numpy" in loaded(
         "import hilcal.model.model"
     )  # the measurement itself can find something
 
 
-def test_commands_load_no_library_that_they_may_not_need() -> None:
+def test_commands_load_no_library_that_they_may_not_need():
     places = {name: c.place or c.subcommands[0][1] for name, c in COMMANDS.items()}
     places = [place for name, place in places.items() if name != "workbench"]
     code = f"from hilcal.cli.commands import load\nfor place in {places}:\n    load(place)"

@@ -16,13 +16,13 @@ SHELL = re.compile(r"^# !(.+)$", re.MULTILINE)
 """A line of a script that is a command of the shell in a notebook, as jupytext writes it."""
 
 
-def test_there_are_three() -> None:
+def test_there_are_three():
     assert len(list(FOLDER.glob("*.py"))) == 3
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("script", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
-def test_a_tutorial_runs(script: Path, tmp_path: Path) -> None:
+def test_a_tutorial_runs(script, tmp_path):
     shutil.copytree(FOLDER / "data", tmp_path / "data")
     text, count = SHELL.subn(
         lambda m: f"__import__('subprocess').run({m[1]!r}, shell=True, check=True)",
@@ -40,7 +40,7 @@ def test_a_tutorial_runs(script: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_the_table_of_the_other_arm_is_what_the_simulation_gives() -> None:
+def test_the_table_of_the_other_arm_is_what_the_simulation_gives():
     from hilcal.cell import Cell
     from studies.another_arm import CELL, table
 

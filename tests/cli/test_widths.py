@@ -11,24 +11,23 @@ from hilcal.cli.terminal import Terminal
 from tests.cli.test_asking import TOML
 from tests.support.cli_cases import CELL, ok, table
 
-Capsys = pytest.CaptureFixture[str]
 WIDTHS = (60, 80, 120)
 ROOM = 1000
 """Columns with which no line is broken."""
 
 
 @pytest.fixture(scope="module")
-def readings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def readings(tmp_path_factory):
     return table(tmp_path_factory.mktemp("t") / "r.csv", "periodic_joint_compliance", poses=8)
 
 
 @pytest.fixture
-def pages(monkeypatch: pytest.MonkeyPatch) -> dict[int, io.StringIO]:
+def pages(monkeypatch):
     """What a command prints, at every width at once."""
     streams = {width: io.StringIO() for width in (*WIDTHS, ROOM)}
     consoles = [Console(file=stream, width=width) for width, stream in streams.items()]
 
-    def show(self: Terminal, parts: object) -> None:
+    def show(self, parts):
         shown = (parts,) if isinstance(parts, str) or not isinstance(parts, Iterable) else parts
         for part in shown:
             for console in consoles:
@@ -39,13 +38,13 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> dict[int, io.StringIO]:
 
 
 @pytest.fixture
-def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def home(tmp_path, monkeypatch):
     """An operator's directory; a path that is longer than a line has to be broken."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def whole(pages: dict[int, io.StringIO]) -> None:
+def whole(pages):
     """Check that no line is too long, and that every word is one of the lines with much room."""
     known = set(pages[ROOM].getvalue().split())
     assert len(known) > 5
@@ -57,9 +56,7 @@ def whole(pages: dict[int, io.StringIO]) -> None:
         assert new == lists, width
 
 
-def test_the_words_of_a_campaign_stay_whole(
-    readings: Path, home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
-) -> None:
+def test_the_words_of_a_campaign_stay_whole(readings, home, capsys, pages):
     run = "run.hilcal"
     ok(capsys, "import", readings, "--config", CELL, "-o", run)
     ok(capsys, "identify", run, "--scaling", "all")
@@ -71,9 +68,7 @@ def test_the_words_of_a_campaign_stay_whole(
 
 
 @pytest.mark.long
-def test_the_words_of_lists_and_plans_stay_whole(
-    home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
-) -> None:
+def test_the_words_of_lists_and_plans_stay_whole(home, capsys, pages):
     Path("cell.toml").write_text(TOML, encoding="utf-8")
     ok(capsys, "effects")
     ok(capsys, "plan", "cell.toml", "-o", "plan.json")
@@ -81,9 +76,7 @@ def test_the_words_of_lists_and_plans_stay_whole(
 
 
 @pytest.mark.long
-def test_what_commands_print_unasked_is_one_screen(
-    readings: Path, home: Path, capsys: Capsys, pages: dict[int, io.StringIO]
-) -> None:
+def test_what_commands_print_unasked_is_one_screen(readings, home, capsys, pages):
     run, many = (
         "run.hilcal",
         "joint_compliance,link_geometry,transmission_error,joint_tilt_compliance",

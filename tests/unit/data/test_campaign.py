@@ -7,7 +7,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +16,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from hilcal.errors import InputError
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.records import content_hash
 from hilcal.store.revision import RevisionRecord
@@ -48,7 +46,7 @@ REVISION = RevisionRecord(
 )
 
 
-def make(path: Path, x: Readings | None = None) -> Path:
+def make(path, x=None):
     with CampaignFile.create(path, '{"robot": "ur10"}', "base/dir", "a test") as campaign:
         if x is not None:
             campaign.append_readings(x)
@@ -56,14 +54,14 @@ def make(path: Path, x: Readings | None = None) -> Path:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[CampaignFile]:
+def run(tmp_path):
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "a test") as campaign:
         yield campaign
 
 
 @per_example_file
 @given(x=readings())
-def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
+def test_round_trip_is_exact(tmp_path, x):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, "{}", "", "", overwrite=True) as campaign:
         assert campaign.append_readings(x) == len(x)
@@ -73,7 +71,7 @@ def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run.hilcal"]
 
 
-def test_description_is_kept(tmp_path: Path) -> None:
+def test_description_is_kept(tmp_path):
     path = make(tmp_path / "run.hilcal")
     with CampaignFile.open(path) as campaign:
         assert campaign.config_json == '{"robot": "ur10"}'
@@ -87,9 +85,7 @@ def test_description_is_kept(tmp_path: Path) -> None:
 
 @per_example_file
 @given(cuts=st.lists(st.integers(0, 12), max_size=4).map(sorted))
-def test_hash_does_not_depend_on_how_readings_were_appended(
-    tmp_path: Path, cuts: list[int]
-) -> None:
+def test_hash_does_not_depend_on_how_readings_were_appended(tmp_path, cuts):
     x = simple(12)
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "", overwrite=True) as campaign:
         for start, stop in zip([0, *cuts], [*cuts, 12], strict=True):
@@ -98,13 +94,13 @@ def test_hash_does_not_depend_on_how_readings_were_appended(
         assert campaign.data_hash() == content_hash(x)
 
 
-def test_hash_does_not_depend_on_the_numbers_of_names() -> None:
+def test_hash_does_not_depend_on_the_numbers_of_names():
     x = simple(3)
     other = replace(x, pose=np.array([3, 1, 0]), pose_names=("p2", "p1", "unused", "p0"))
     assert content_hash(other) == content_hash(x)
 
 
-def test_hash_sees_every_change() -> None:
+def test_hash_sees_every_change():
     x = simple(3)
     value = x.value.copy()
     value[2, 1] = np.nextafter(value[2, 1], 9.0)
@@ -125,7 +121,7 @@ def test_hash_sees_every_change() -> None:
     assert len(hashes) == len(others) + 1
 
 
-def test_later_readings_bring_new_poses_and_loads(run: CampaignFile) -> None:
+def test_later_readings_bring_new_poses_and_loads(run):
     x, y = simple(2), simple(3, seed=1)
     y = replace(y, pose_names=("p1", "new", "p0"), load_names=("plate",))
     q = y.states.q.copy()
@@ -141,7 +137,7 @@ def test_later_readings_bring_new_poses_and_loads(run: CampaignFile) -> None:
     np.testing.assert_array_equal(z.value, np.vstack([x.value, y.value]))
 
 
-def test_readings_that_do_not_fit_are_refused_whole(run: CampaignFile) -> None:
+def test_readings_that_do_not_fit_are_refused_whole(run):
     x = simple(4)
     run.append_readings(x[:2])
     nan = x.value.copy()
@@ -164,7 +160,7 @@ def test_readings_that_do_not_fit_are_refused_whole(run: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize("table", ["readings", "revisions", "poses", "loads", "meta"])
-def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) -> None:
+def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path, table):
     path = make(tmp_path / "run.hilcal", simple(3))
     with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
@@ -183,7 +179,7 @@ def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) 
         assert len(campaign.revisions()) == 1
 
 
-def test_revisions_are_numbered_and_come_back(run: CampaignFile) -> None:
+def test_revisions_are_numbered_and_come_back(run):
     first = replace(REVISION, added=None, number=99)
     assert run.append_revision(first) == 1
     assert run.append_revision(REVISION) == 2
@@ -196,7 +192,7 @@ def test_revisions_are_numbered_and_come_back(run: CampaignFile) -> None:
     assert len(run.revisions()) == 2
 
 
-def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten_unasked(tmp_path):
     path = make(tmp_path / "run.hilcal", simple(2))
     with pytest.raises(InputError, match="the file exists"):
         make(path)
@@ -213,7 +209,7 @@ def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
         CampaignFile.create(tmp_path / "absent" / "run.hilcal", "{}", "", "")
 
 
-def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: Path) -> None:
+def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path):
     path = tmp_path / "run.hilcal"
     stray = tmp_path / "run.hilcal-journal"
     stray.write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(1000))
@@ -223,8 +219,8 @@ def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: P
         assert_same(campaign.readings(), simple(2))
 
 
-def test_files_that_are_no_campaign(tmp_path: Path) -> None:
-    def refused(path: Path, message: str) -> None:
+def test_files_that_are_no_campaign(tmp_path):
+    def refused(path, message):
         with pytest.raises(InputError, match=message) as error:
             CampaignFile.open(path)
         assert "\n" not in str(error.value)
@@ -248,7 +244,7 @@ def test_files_that_are_no_campaign(tmp_path: Path) -> None:
     refused(path, "newer hilcal")
 
 
-def test_every_truncation_is_noticed(tmp_path: Path) -> None:
+def test_every_truncation_is_noticed(tmp_path):
     whole = make(tmp_path / "run.hilcal", simple(60)).read_bytes()
     cut = tmp_path / "cut.hilcal"
     rng = random.Random(3)
@@ -264,7 +260,7 @@ def test_every_truncation_is_noticed(tmp_path: Path) -> None:
         assert_same(campaign.readings(), simple(60))
 
 
-def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
+def test_damaged_bytes_never_give_wrong_data(tmp_path):
     x = simple(40)
     path = make(tmp_path / "run.hilcal", x)
     with CampaignFile.open(path) as campaign:
@@ -297,7 +293,7 @@ with CampaignFile.open(sys.argv[2]) as run:
 """
 
 
-def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path):
     x = simple(400)
     source = make(tmp_path / "source.hilcal", x)
     path = make(tmp_path / "run.hilcal")
@@ -308,7 +304,6 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
             stdout=subprocess.PIPE,
             text=True,
         )
-        assert process.stdout is not None
         for _ in range(rng.randrange(1, 30)):
             acknowledged = int(process.stdout.readline())
         time.sleep(rng.random() * 0.01)
@@ -335,7 +330,7 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
     connection.close()
 
 
-def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
+def test_a_second_writer_waits_or_is_told(tmp_path):
     path = make(tmp_path / "run.hilcal", simple(2))
     with CampaignFile.open(path) as one, CampaignFile.open(path) as two:
         one.append_readings(replace(simple(1), pose_names=("a",)))
@@ -346,7 +341,7 @@ def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", ["attempt to write a readonly database", "unable to open database file"]
 )
-def test_a_read_only_file_or_folder_is_said(words: str) -> None:
+def test_a_read_only_file_or_folder_is_said(words):
     """As SQLite words them: for the superuser, who may run the tests, nothing is read-only."""
     with (
         pytest.raises(

@@ -15,7 +15,6 @@ from hilcal.readings.covariance import (
     tracker_covariance,
 )
 from hilcal.robot import se3
-from hilcal.types import Floats
 
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
@@ -26,17 +25,17 @@ vectors = arrays(np.float64, 3, elements=st.floats(-3, 3))
 
 
 @given(points, vectors)
-def test_only_the_position_from_the_station_matters(p: Floats, station: Floats) -> None:
+def test_only_the_position_from_the_station_matters(p, station):
     moved = tracker_covariance(p + station, NOISE, station)
     np.testing.assert_allclose(moved, tracker_covariance(p, NOISE), rtol=1e-9, atol=1e-20)
 
 
-def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range() -> None:
+def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range():
     p = np.array([[2.0, -1.0, 0.5]])
     d = np.linalg.norm(p)
     azimuth, elevation = np.arctan2(p[0, 1], p[0, 0]), np.arcsin(p[0, 2] / d)
 
-    def point(az: float, el: float, r: float) -> Floats:
+    def point(az, el, r):
         c = np.cos(el)
         return r * np.array([c * np.cos(az), c * np.sin(az), np.sin(el)])
 
@@ -49,7 +48,7 @@ def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range() -> No
     )
 
 
-def test_pose_covariance_adds_the_rotation_block() -> None:
+def test_pose_covariance_adds_the_rotation_block():
     p = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.0]])
     cov = tracker_covariance(p, NOISE, m=6)
     np.testing.assert_array_equal(cov[:, :3, :3], tracker_covariance(p, NOISE))
@@ -57,7 +56,7 @@ def test_pose_covariance_adds_the_rotation_block() -> None:
     assert not cov[:, :3, 3:].any()
 
 
-def test_what_no_instrument_has_is_refused() -> None:
+def test_what_no_instrument_has_is_refused():
     with pytest.raises(InputError, match="range_std = -1"):
         TrackerNoise(-1.0, 0.0, 1e-5, 0.0)
     with pytest.raises(InputError, match="transverse_std"):
@@ -70,7 +69,7 @@ def test_what_no_instrument_has_is_refused() -> None:
         tracker_covariance(np.ones((1, 3)), TrackerNoise(1e-5, 0.0, 1e-5, 0.0), m=6)
 
 
-def test_joint_scatter_is_its_formula_and_turns_with_the_base() -> None:
+def test_joint_scatter_is_its_formula_and_turns_with_the_base():
     rng = np.random.default_rng(5)
     jac, std = rng.normal(size=(4, 6, 7)), rng.uniform(1e-5, 5e-5, 7)
     turn = se3.rotation(rng.normal(size=(4, 3)))
@@ -82,7 +81,7 @@ def test_joint_scatter_is_its_formula_and_turns_with_the_base() -> None:
     np.testing.assert_array_equal(joint_scatter(jac, std, turn, 3), whole[:, :3, :3])
 
 
-def test_the_mean_keeps_the_expected_share_of_what_is_stated() -> None:
+def test_the_mean_keeps_the_expected_share_of_what_is_stated():
     """A scatter of just the random part makes s Σ + (1 - s) Σ / K; then nothing is learnt."""
     stated, samples, share = np.diag([1.0, 4.0, 9.0]) * 1e-10, 6, 0.3
     basis = np.sqrt((samples - 1) * (1 - share)) * np.linalg.cholesky(stated).T

@@ -34,14 +34,14 @@ HASHES = {
 }
 
 
-def unpacked(path: Path, folder: Path) -> Path:
+def unpacked(path, folder):
     out = folder / path.stem
     out.write_bytes(gzip.decompress(path.read_bytes()))
     return out
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name.split(".")[0])
-def test_a_file_of_an_older_program(path: Path, tmp_path: Path) -> None:
+def test_a_file_of_an_older_program(path, tmp_path):
     old = unpacked(path, tmp_path)
     before = old.read_bytes()
     with Campaign.open(old, read_only=True) as run:
@@ -55,7 +55,7 @@ def test_a_file_of_an_older_program(path: Path, tmp_path: Path) -> None:
     assert old.read_bytes() == before, "reading an old file must not change it"
 
 
-def test_a_revision_that_another_processor_hashed(tmp_path: Path) -> None:
+def test_a_revision_that_another_processor_hashed(tmp_path):
     """Its hash is of computed covariances, whose last bits differ there."""
     (path,) = (p for p in FILES if p.name.startswith("version-5.hilcal"))
     with Campaign.open(unpacked(path, tmp_path), read_only=True) as run:
@@ -71,12 +71,12 @@ def test_a_revision_that_another_processor_hashed(tmp_path: Path) -> None:
             restore(today, run.cell, run.readings, stored="2" * 64)
 
 
-def test_every_version_is_there() -> None:
+def test_every_version_is_there():
     versions = {int(path.name.split("-")[1].split(".")[0]) for path in FILES}
     assert versions == set(range(1, schema.VERSION + 1)), "keep a file of the new version, too"
 
 
-def test_a_newer_version_is_refused_in_words(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_a_newer_version_is_refused_in_words(tmp_path, capsys):
     path = unpacked(FILES[-1], tmp_path)
     with sqlite3.connect(path) as db:
         db.execute(f"PRAGMA user_version = {schema.VERSION + 1}")

@@ -1,7 +1,5 @@
 """What an imported covariance covers: the arm's repeatability is added once, never twice."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -11,27 +9,24 @@ from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.readings.covariance import COVERS, WHOLE
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
-from hilcal.types import Floats
-from tests.support.cli_cases import CELL, Capsys, ok, rehearsal
+from tests.support.cli_cases import CELL, ok, rehearsal
 
 
 @pytest.fixture(scope="module")
-def table(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def table(tmp_path_factory):
     """Readings with a covariance that the table does not explain."""
     path = tmp_path_factory.mktemp("import") / "t.csv"
     write_table(rehearsal("nothing").readings, path)
     return path
 
 
-def covariances(run: Path) -> tuple[Floats, Floats]:
+def covariances(run):
     """As stored, and in full."""
     with hc.Campaign.open(run) as opened:
         return opened.file.readings().covariance, opened.readings.covariance
 
 
-def test_repeatability_is_added_to_an_imported_table(
-    table: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_repeatability_is_added_to_an_imported_table(table, tmp_path, capsys):
     run = tmp_path / "run.hilcal"
     told = ok(capsys, "import", table, "--config", CELL, "-o", run, "--json").document
     assert told["covariance"] == "instrument and repeatability"
@@ -45,7 +40,7 @@ def test_repeatability_is_added_to_an_imported_table(
     assert "[repeatability]" in ok(capsys, "identify", run, "--details").out
 
 
-def test_what_was_exported_is_not_added_again(table: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_was_exported_is_not_added_again(table, tmp_path, capsys):
     first, again, out = tmp_path / "a.hilcal", tmp_path / "b.hilcal", tmp_path / "out.csv"
     ok(capsys, "import", table, "--config", CELL, "-o", first)
     ok(capsys, "export", first, "--table", out)
@@ -54,9 +49,7 @@ def test_what_was_exported_is_not_added_again(table: Path, tmp_path: Path, capsy
     np.testing.assert_allclose(covariances(again)[1], covariances(first)[1], rtol=1e-9)
 
 
-def test_the_cell_may_say_that_tables_include_it(
-    table: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_cell_may_say_that_tables_include_it(table, tmp_path, capsys):
     cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
     text = CELL.read_text(encoding="utf-8")
     cell.write_text(text.replace("[repeatability]", "[repeatability]\nin_tables = true"))
@@ -64,9 +57,7 @@ def test_the_cell_may_say_that_tables_include_it(
     np.testing.assert_array_equal(*covariances(run))
 
 
-def test_a_campaign_that_an_older_version_imported_is_read_as_it_was(
-    table: Path, tmp_path: Path
-) -> None:
+def test_a_campaign_that_an_older_version_imported_is_read_as_it_was(table, tmp_path):
     config, run = hc.Cell.load(CELL).configured(), tmp_path / "old.hilcal"
     with CampaignFile.create(run, config.to_json(), str(CELL.parent), "t.csv (table)") as file:
         file.append_readings(rehearsal("nothing").readings)
@@ -74,7 +65,7 @@ def test_a_campaign_that_an_older_version_imported_is_read_as_it_was(
     np.testing.assert_array_equal(*covariances(run))
 
 
-def test_a_table_says_the_same_in_all_rows(tmp_path: Path) -> None:
+def test_a_table_says_the_same_in_all_rows(tmp_path):
     path = tmp_path / "t.csv"
     write_table(rehearsal("nothing").readings, path, WHOLE)
     lines = path.read_text(encoding="utf-8").splitlines()

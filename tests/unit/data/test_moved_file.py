@@ -12,13 +12,13 @@ from hilcal.store.run_log import RunLog
 from tests.unit.data.test_run_log import STEPS, _campaign, _reading
 
 
-def _replace(path: Path) -> None:
+def _replace(path):
     other = path.with_name("other")
     _campaign(other).close()
     other.replace(path)
 
 
-def _rename_folder(path: Path) -> None:
+def _rename_folder(path):
     path.parent.rename(path.parent.with_name("renamed"))
 
 
@@ -32,20 +32,18 @@ LOST = {
 }
 
 
-def _found(error: MovedFileError) -> Path:
+def _found(error):
     return Path(str(error).partition(" are in ")[2].partition(": move that back")[0])
 
 
 @pytest.mark.parametrize("how", LOST)
 @pytest.mark.parametrize("when", ["before a store", "at the end"])
-def test_what_was_measured_is_found_again(
-    how: str, when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_measured_is_found_again(how, when, tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     path = tmp_path / "folder" / "run.hilcal"
     path.parent.mkdir()
 
-    def measure() -> None:
+    def measure():
         with _campaign(path) as file:
             log = RunLog(file)
             for step in STEPS[:2]:
@@ -68,7 +66,7 @@ def test_what_was_measured_is_found_again(
         assert path.read_text() == "x"
 
 
-def test_a_rescued_copy_replaces_no_file(tmp_path: Path) -> None:
+def test_a_rescued_copy_replaces_no_file(tmp_path):
     path, there = tmp_path / "run.hilcal", tmp_path / "run.rescued.hilcal"
     there.write_text("kept")
     file = _campaign(path)
@@ -81,7 +79,7 @@ def test_a_rescued_copy_replaces_no_file(tmp_path: Path) -> None:
     assert _found(told.value).name == "run.rescued-2.hilcal"
 
 
-def test_a_link_to_a_campaign_is_its_place(tmp_path: Path) -> None:
+def test_a_link_to_a_campaign_is_its_place(tmp_path):
     real, link = tmp_path / "real.hilcal", tmp_path / "link.hilcal"
     _campaign(real).close()
     link.symlink_to(real)
@@ -94,7 +92,7 @@ def test_a_link_to_a_campaign_is_its_place(tmp_path: Path) -> None:
     assert link.is_symlink()
 
 
-def test_a_killed_transaction_of_a_linked_campaign_is_undone(tmp_path: Path) -> None:
+def test_a_killed_transaction_of_a_linked_campaign_is_undone(tmp_path):
     """Its journal lies beside the file, not beside the link."""
     real, link = tmp_path / "a" / "real.hilcal", tmp_path / "link.hilcal"
     real.parent.mkdir()
@@ -115,7 +113,7 @@ def test_a_killed_transaction_of_a_linked_campaign_is_undone(tmp_path: Path) -> 
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="for the superuser nothing is read-only")
-def test_a_folder_made_read_only_is_said(tmp_path: Path) -> None:
+def test_a_folder_made_read_only_is_said(tmp_path):
     path = tmp_path / "run.hilcal"
     with _campaign(path) as file:
         log = RunLog(file)

@@ -31,7 +31,7 @@ with CampaignFile.create(folder / "run.hilcal", "{}", "", "a test") as run:
 """Readings go in one by one; a revision comes after the second, is accepted, and is not counted."""
 
 
-def _lost(tmp_path: Path, batches: int, tries: int, writer: str = WRITER, syncs: int = 4) -> int:
+def _lost(tmp_path, batches, tries, writer=WRITER, syncs=4):
     folder = tmp_path / "disk"
     folder.mkdir()
     recorder = power_loss.compiled(tmp_path)
@@ -69,17 +69,17 @@ def _lost(tmp_path: Path, batches: int, tries: int, writer: str = WRITER, syncs:
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
-def test_power_loss_at_every_write(tmp_path: Path) -> None:
+def test_power_loss_at_every_write(tmp_path):
     assert _lost(tmp_path, 3, tries=2) > 50
 
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
-def test_power_loss_in_many_orders(tmp_path: Path) -> None:
+def test_power_loss_in_many_orders(tmp_path):
     assert _lost(tmp_path, 6, tries=30) > 1000
 
 
-def test_the_model_loses_what_was_never_synced(tmp_path: Path) -> None:
+def test_the_model_loses_what_was_never_synced(tmp_path):
     folder = tmp_path / "disk"
     make = power_loss.Op
     path = str(folder / "a")
@@ -98,7 +98,7 @@ def test_the_model_loses_what_was_never_synced(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
-def test_a_program_that_does_not_sync_is_found_out(tmp_path: Path) -> None:
+def test_a_program_that_does_not_sync_is_found_out(tmp_path):
     careless = WRITER.replace("    x = simple", "    run.connection.execute(OFF)\n    x = simple")
     careless = 'OFF = "PRAGMA synchronous = OFF"\n' + careless
     with pytest.raises((AssertionError, InputError)):

@@ -11,12 +11,12 @@ from hilcal.tables.units import parse_duration, parse_length
 @pytest.mark.parametrize(
     ("text", "metres"), [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)]
 )
-def test_a_length(text: str, metres: float) -> None:
+def test_a_length(text, metres):
     assert math.isclose(parse_length(text, "--limit"), metres)
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90 min", 5400), ("1.5h", 5400), ("20 s", 20)])
-def test_a_duration(text: str, seconds: float) -> None:
+def test_a_duration(text, seconds):
     assert math.isclose(parse_duration(text, "--max-time"), seconds)
 
 
@@ -32,7 +32,7 @@ def test_a_duration(text: str, seconds: float) -> None:
         ("1e999 mm", "is not over 0"),  # infinite
     ],
 )
-def test_anything_else_is_refused_with_its_reason(text: str, why: str) -> None:
+def test_anything_else_is_refused_with_its_reason(text, why):
     with pytest.raises(InputError, match="--limit") as refused:
         parse_length(text, "--limit")
     assert why in str(refused.value)

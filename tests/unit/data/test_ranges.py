@@ -20,7 +20,7 @@ MEASURED = Range("joint 1 angle", "rad", np.radians(-176.0), np.radians(168.0))
         (-720.0, 544.0, -168.0),
     ],
 )
-def test_whole_turns(degrees: float, plain: float, turning: float) -> None:
+def test_whole_turns(degrees, plain, turning):
     value = np.radians([degrees])
     np.testing.assert_allclose(np.degrees(MEASURED.over(value)), plain, atol=1e-9)
     over = np.degrees(MEASURED.over(value, turning=True))
@@ -30,7 +30,7 @@ def test_whole_turns(degrees: float, plain: float, turning: float) -> None:
         assert over[0] <= 0.0
 
 
-def test_a_range_of_more_than_a_turn_has_every_angle() -> None:
+def test_a_range_of_more_than_a_turn_has_every_angle():
     wide = Range("joint 6 angle", "rad", -4.0, 4.0)
     angles = np.linspace(-20, 20, 500)
     assert not wide.beyond(angles, turning=True).any()

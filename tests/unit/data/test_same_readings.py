@@ -13,7 +13,7 @@ LOADS = 3
 NOISE_M = 5e-6
 
 
-def campaign(m: int = 3, poses: int = 40, seed: int = 0) -> Readings:
+def campaign(m=3, poses=40, seed=0):
     """Poses with an unloaded and two loaded readings each."""
     rng = np.random.default_rng(seed)
     n = poses * LOADS
@@ -35,7 +35,7 @@ def campaign(m: int = 3, poses: int = 40, seed: int = 0) -> Readings:
 
 
 @pytest.mark.parametrize("m", [3, 6])
-def test_a_copy_is_known_whatever_it_went_through(m: int) -> None:
+def test_a_copy_is_known_whatever_it_went_through(m):
     r = campaign(m)
     order = np.random.default_rng(1).permutation(len(r))
     shuffled = r[order]
@@ -60,13 +60,13 @@ def test_a_copy_is_known_whatever_it_went_through(m: int) -> None:
     assert already(r, copy).all()
 
 
-def test_positions_alone_are_compared_with_positions() -> None:
+def test_positions_alone_are_compared_with_positions():
     r = campaign(6)
     alone = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
     assert already(alone, r).all()
 
 
-def test_what_was_measured_again_is_another_reading() -> None:
+def test_what_was_measured_again_is_another_reading():
     r = campaign(poses=300)
     again = replace(r, value=r.value + np.random.default_rng(2).normal(0, NOISE_M, r.value.shape))
     assert already(again, r).mean() < 0.002  # (0.2 µm)³ in (5 µm √2π)³: none is expected
@@ -74,7 +74,7 @@ def test_what_was_measured_again_is_another_reading() -> None:
     assert not already(turned, r).any()
 
 
-def test_loaded_and_unloaded_readings_differ_and_arms_with_other_joints() -> None:
+def test_loaded_and_unloaded_readings_differ_and_arms_with_other_joints():
     r = campaign()
     swapped = replace(r, load=np.where(r.load == 0, 1, 0))
     assert not already(swapped, r)[r.load < 2].any()
@@ -83,7 +83,7 @@ def test_loaded_and_unloaded_readings_differ_and_arms_with_other_joints() -> Non
     assert len(already(r[:0], r)) == 0
 
 
-def test_a_deflection_is_unseen_only_if_neither_reading_of_it_was_fitted() -> None:
+def test_a_deflection_is_unseen_only_if_neither_reading_of_it_was_fitted():
     r = campaign(poses=4)
     fitted = r[[0, 4, 8]]  # p0 unloaded, p1 under 5kg, p2 under 10kg
     known, unseen = never_fitted(r, fitted, deflections=True)

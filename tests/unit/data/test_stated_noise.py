@@ -1,15 +1,13 @@
 """Stated uncertainties that cannot be right are refused, raised, or doubted in words."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
-from hilcal.readings.readings import Readings
-from hilcal.tables.table import ImportResult, import_table, write_table
+from hilcal.tables.table import import_table, write_table
 from hilcal.tables.uncertainty import rounding_variance, step
 from tests.support.readings_cases import make_arm, simple
 
@@ -17,21 +15,19 @@ ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
 
-def through_a_table(
-    tmp_path: Path, x: Readings, noise: TrackerNoise | None = NOISE
-) -> ImportResult:
+def through_a_table(tmp_path, x, noise=NOISE):
     write_table(x, tmp_path / "t.csv")
     return import_table(tmp_path / "t.csv", ARM, noise)
 
 
-def with_variances(x: Readings, row: int, *variances: float) -> Readings:
+def with_variances(x, row, *variances):
     cov = x.covariance.copy()
     cov[row] = np.diag(variances)
     return replace(x, covariance=cov)
 
 
 @pytest.mark.parametrize("tiny", [0.0, 1e-30, 1e-15])
-def test_one_variance_of_zero_is_the_instruments(tmp_path: Path, tiny: float) -> None:
+def test_one_variance_of_zero_is_the_instruments(tmp_path, tiny):
     x = with_variances(simple(20), 4, 1e-10, tiny, 1e-10)
     result = through_a_table(tmp_path, x)
     cov = result.readings.covariance
@@ -45,7 +41,7 @@ def test_one_variance_of_zero_is_the_instruments(tmp_path: Path, tiny: float) ->
         through_a_table(tmp_path, x, None)
 
 
-def test_angles_have_a_floor_of_their_own(tmp_path: Path) -> None:
+def test_angles_have_a_floor_of_their_own(tmp_path):
     x = with_variances(simple(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
     assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2
 
@@ -58,7 +54,7 @@ def test_angles_have_a_floor_of_their_own(tmp_path: Path) -> None:
         (2e-8, "1000 times too small"),
     ],
 )
-def test_precision_that_nothing_has_is_refused(tmp_path: Path, sigma: float, looks: str) -> None:
+def test_precision_that_nothing_has_is_refused(tmp_path, sigma, looks):
     x = simple(20)
     cov = np.tile(sigma**2 * np.eye(3), (20, 1, 1))
     with pytest.raises(InputError, match="no instrument reaches") as error:
@@ -68,9 +64,7 @@ def test_precision_that_nothing_has_is_refused(tmp_path: Path, sigma: float, loo
 
 
 @pytest.mark.parametrize(("m", "sigma", "unit"), [(3, 5e-3, "m"), (3, 40.0, "m"), (6, 0.1, "rad")])
-def test_noise_that_calibrates_nothing_is_refused(
-    tmp_path: Path, m: int, sigma: float, unit: str
-) -> None:
+def test_noise_that_calibrates_nothing_is_refused(tmp_path, m, sigma, unit):
     x = simple(20, m=m)
     cov = x.covariance.copy()
     cov[:, -1, -1] = sigma**2
@@ -78,7 +72,7 @@ def test_noise_that_calibrates_nothing_is_refused(
         through_a_table(tmp_path, replace(x, covariance=cov))
 
 
-def test_rounding_is_found_and_added(tmp_path: Path) -> None:
+def test_rounding_is_found_and_added(tmp_path):
     x = simple(20)
     fine = through_a_table(tmp_path, x)
     np.testing.assert_array_equal(fine.readings.covariance, x.covariance)
@@ -92,7 +86,7 @@ def test_rounding_is_found_and_added(tmp_path: Path) -> None:
     assert len(through_a_table(tmp_path, coarse).notes) == 1  # it does not count beside 1 mm
 
 
-def test_the_step_of_values() -> None:
+def test_the_step_of_values():
     rng = np.random.default_rng(0)
     values = rng.uniform(-2000, 2000, 50)
     assert step(values) == 0
@@ -103,7 +97,7 @@ def test_the_step_of_values() -> None:
                                (1e-5) ** 2 / 12)  # fmt: skip
 
 
-def test_rounding_changes_the_spread_by_its_variance() -> None:
+def test_rounding_changes_the_spread_by_its_variance():
     """Δ²/12 against the scatter that rounding really makes."""
     rng = np.random.default_rng(1)
     exact = rng.uniform(-1, 1, (20000, 3))

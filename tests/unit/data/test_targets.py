@@ -1,7 +1,6 @@
 """Several targets per pose: the column `target`, the campaign file, the configuration."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ target_rotvec_rad = [0.0, 0.1, 0.0]
 HEADER = "pose,load,target,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m\n"
 
 
-def readings_of(target: list[int], names: tuple[str, ...] = NAMES, seed: int = 0) -> Readings:
+def readings_of(target, names=NAMES, seed=0):
     """Readings of two poses in turn, one for each number of a target."""
     rng, count = np.random.default_rng(seed), len(target)
     pose = np.arange(count) % 2
@@ -53,7 +52,7 @@ def readings_of(target: list[int], names: tuple[str, ...] = NAMES, seed: int = 0
     )
 
 
-def table_of(path: Path, *targets: str) -> Path:
+def table_of(path, *targets):
     at = "0,-1,0,0,0,0,0.1,0.2,0.3"
     rows = [f"p{k},none,{name},{at}" for k, name in enumerate(targets)]
     path.write_text(HEADER + "\n".join(rows) + "\n")
@@ -61,9 +60,7 @@ def table_of(path: Path, *targets: str) -> Path:
 
 
 @given(st.lists(st.integers(0, 2), min_size=1, max_size=8))
-def test_tables_and_files_keep_the_targets(
-    tmp_path_factory: pytest.TempPathFactory, target: list[int]
-) -> None:
+def test_tables_and_files_keep_the_targets(tmp_path_factory, target):
     folder, arm = tmp_path_factory.mktemp("targets"), cell_of().arm
     one = readings_of(target)
     write_table(one, folder / "t.csv")
@@ -78,7 +75,7 @@ def test_tables_and_files_keep_the_targets(
         assert content_hash(found) == content_hash(one)
 
 
-def test_a_campaign_numbers_targets_by_their_names(tmp_path: Path) -> None:
+def test_a_campaign_numbers_targets_by_their_names(tmp_path):
     first, other = readings_of([0, 1, 2]), readings_of([0, 1, 1], ("R3", "R1"))
     with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
         file.append_readings(first)
@@ -89,7 +86,7 @@ def test_a_campaign_numbers_targets_by_their_names(tmp_path: Path) -> None:
             file.append_readings(replace(first, target_names=("R1", "R2", "R4")))
 
 
-def test_one_target_is_stored_as_before(tmp_path: Path) -> None:
+def test_one_target_is_stored_as_before(tmp_path):
     several = readings_of([0, 0])
     one = replace(several, states=replace(several.states, target=None), target_names=())
     assert content_hash(one) == ("eae7c0c5c00b9316cd4e55433994b936612c7b72e5f6544934f63c6fc6bc16f6")
@@ -102,7 +99,7 @@ def test_one_target_is_stored_as_before(tmp_path: Path) -> None:
     assert versions == [2, 3]
 
 
-def test_readings_of_one_arrival() -> None:
+def test_readings_of_one_arrival():
     target = np.array([0, 1, 2, 0, 1, 2, 0, 1, 0])
     load = np.array([0, 0, 0, 1, 1, 1, 1, 1, 0])
     many = readings_of(target.tolist())
@@ -114,7 +111,7 @@ def test_readings_of_one_arrival() -> None:
     assert len(np.unique(replace(same, cycle=np.arange(9)).arrivals)) == 9
 
 
-def test_the_cell_names_its_targets(tmp_path: Path) -> None:
+def test_the_cell_names_its_targets(tmp_path):
     (tmp_path / "cell.toml").write_text(CELL)
     cell = Cell.load(tmp_path / "cell.toml")
     assert cell.target_names == NAMES
@@ -138,15 +135,13 @@ NOISE = TrackerNoise(5e-6, 0.0, 7e-6, 0.0)
         (NAMES, ("R1", ""), r"row 3, column 'target': the cell is empty; name the target"),
     ],
 )
-def test_table_and_cell_disagree(
-    tmp_path: Path, targets: tuple[str, ...], rows: tuple[str, ...], message: str
-) -> None:
+def test_table_and_cell_disagree(tmp_path, targets, rows, message):
     with pytest.raises(InputError, match=message) as raised:
         read_table(table_of(tmp_path / "t.csv", *rows), cell_of().arm, None, targets=targets)
     assert "\n" not in str(raised.value)
 
 
-def test_a_table_without_the_column(tmp_path: Path) -> None:
+def test_a_table_without_the_column(tmp_path):
     path = table_of(tmp_path / "t.csv", "R1", "R1")
     assert read_table(path, cell_of().arm, NOISE).states.target is None
     path.write_text(path.read_text().replace("target,", "").replace(",R1", ""))
@@ -163,7 +158,7 @@ def test_a_table_without_the_column(tmp_path: Path) -> None:
         ('name = "R2"', 'nam = "R2"', r'has no key "nam"'),
     ],
 )
-def test_wrong_targets(tmp_path: Path, old: str, new: str, message: str) -> None:
+def test_wrong_targets(tmp_path, old, new, message):
     (tmp_path / "cell.toml").write_text(CELL.replace(old, new, 1))
     with pytest.raises(InputError, match=message) as raised:
         Cell.load(tmp_path / "cell.toml")

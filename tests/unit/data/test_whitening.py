@@ -6,29 +6,26 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import MANY, MODES, Mode, Scaling, inverse_root, measured, whitening
+from hilcal.readings.whitening import MANY, MODES, inverse_root, measured, whitening
 from hilcal.robot import se3
-from hilcal.types import Floats, Ints
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.sampled_from([3, 6])
 
 
-def spd(rng: np.random.Generator, count: int, k: int, decades: float = 3.0) -> Floats:
+def spd(rng, count, k, decades=3.0):
     """Covariances (count, k, k) of full rank; standard deviations over some decades."""
     b = rng.standard_normal((count, k, k))
     std = 10 ** rng.uniform(-decades, decades, (count, k))
     return std[:, :, None] * (b @ np.swapaxes(b, 1, 2) + 0.1 * np.eye(k)) * std[:, None, :]
 
 
-def random_units(rng: np.random.Generator, k: int) -> Floats:
+def random_units(rng, k):
     """Factors (k,) such as from m to mm."""
     return np.asarray(10 ** rng.uniform(-6, 6, k))
 
 
-def make_readings(
-    pose: Ints, cycle: Ints, load: Ints, value: Floats, covariance: Floats
-) -> Readings:
+def make_readings(pose, cycle, load, value, covariance):
     """Readings with load 0 the unloaded state."""
     count = len(pose)
     return Readings(
@@ -43,7 +40,7 @@ def make_readings(
     )
 
 
-def random_readings(rng: np.random.Generator, m: int, decades: float = 3.0) -> Readings:
+def random_readings(rng, m, decades=3.0):
     """Poses in random order, 1-2 cycles, 1-3 unloaded and 1-4 loaded readings in each."""
     rows = []
     for pose in range(int(rng.integers(1, 6))):
@@ -62,7 +59,7 @@ def random_readings(rng: np.random.Generator, m: int, decades: float = 3.0) -> R
 
 
 @given(seeds, sizes)
-def test_gc_whitens(seed: int, k: int) -> None:
+def test_gc_whitens(seed, k):
     v = spd(np.random.default_rng(seed), 4, k)
     f = inverse_root(v, "gc")
     np.testing.assert_allclose(
@@ -71,7 +68,7 @@ def test_gc_whitens(seed: int, k: int) -> None:
 
 
 @given(seeds, sizes)
-def test_gu_divides_by_the_standard_deviations(seed: int, k: int) -> None:
+def test_gu_divides_by_the_standard_deviations(seed, k):
     v = spd(np.random.default_rng(seed), 4, k)
     eps = np.random.default_rng(seed).standard_normal((4, k))
     white = (inverse_root(v, "gu") @ eps[:, :, None])[:, :, 0]
@@ -79,12 +76,12 @@ def test_gu_divides_by_the_standard_deviations(seed: int, k: int) -> None:
     np.testing.assert_allclose(white, eps / std, rtol=1e-14)
 
 
-def test_none_leaves_everything_as_it_is() -> None:
+def test_none_leaves_everything_as_it_is():
     v = spd(np.random.default_rng(0), 2, 6)
     np.testing.assert_array_equal(inverse_root(v, "none"), np.tile(np.eye(6), (2, 1, 1)))
 
 
-def estimate(factor: Floats, a: Floats, y: Floats) -> tuple[Floats, float]:
+def estimate(factor, a, y):
     """Least squares of the scaled regression, and its χ²; one measurement per factor."""
     count, k = factor.shape[:2]
     ga = (factor @ a.reshape(count, k, -1)).reshape(count * k, -1)
@@ -95,7 +92,7 @@ def estimate(factor: Floats, a: Floats, y: Floats) -> tuple[Floats, float]:
 
 @pytest.mark.parametrize("scaling", ["gu", "gc"])
 @given(seeds, sizes)
-def test_change_of_units_changes_nothing(scaling: Scaling, seed: int, k: int) -> None:
+def test_change_of_units_changes_nothing(scaling, seed, k):
     rng = np.random.default_rng(seed)
     v, u = spd(rng, 6, k, decades=1.0), random_units(rng, k)
     a, y = rng.standard_normal((6, k, 3)), rng.standard_normal((6, k))
@@ -106,7 +103,7 @@ def test_change_of_units_changes_nothing(scaling: Scaling, seed: int, k: int) ->
 
 
 @given(seeds, sizes)
-def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed: int, k: int) -> None:
+def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed, k):
     """Cholesky's factor or eigenvectors: V⁻¹ = S⁻ᵀ S⁻¹ is the same, singular blocks included."""
     rng = np.random.default_rng(seed)
     v = spd(rng, 50, k)
@@ -127,7 +124,7 @@ def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed: int, k: in
 
 
 @given(seeds, sizes, st.data())
-def test_direction_without_noise_is_left_out(seed: int, k: int, data: st.DataObject) -> None:
+def test_direction_without_noise_is_left_out(seed, k, data):
     rank = data.draw(st.integers(1, k - 1))
     rng = np.random.default_rng(seed)
     b = rng.standard_normal((k, rank)) * random_units(rng, k)[:, None]
@@ -141,9 +138,7 @@ def test_direction_without_noise_is_left_out(seed: int, k: int, data: st.DataObj
 
 @pytest.mark.parametrize("scaling", ["gu", "gc"])
 @given(seeds, st.data())
-def test_element_without_noise_is_left_out(
-    scaling: Scaling, seed: int, data: st.DataObject
-) -> None:
+def test_element_without_noise_is_left_out(scaling, seed, data):
     dead = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=6, unique=True))
     v = spd(np.random.default_rng(seed), 1, 6)[0]
     v[dead], v[:, dead] = 0.0, 0.0
@@ -154,7 +149,7 @@ def test_element_without_noise_is_left_out(
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_rank_counts_what_carries_information(mode: Mode) -> None:
+def test_rank_counts_what_carries_information(mode):
     """Three elements that lie in a plane that the instrument sees: two rows per measurement."""
     rng = np.random.default_rng(3)
     b = rng.standard_normal((3, 2)) * 1e-5
@@ -171,7 +166,7 @@ def test_rank_counts_what_carries_information(mode: Mode) -> None:
 # --- readings and deflections --------------------------------------------------------------
 
 
-def whitened_covariance(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Floats:
+def whitened_covariance(readings, mode, scaling="gc"):
     """Covariance (D·m, D·m) of the whitened rows, by propagation from independent readings."""
     w = whitening(readings, mode, scaling)
     count, m = readings.value.shape
@@ -183,9 +178,7 @@ def whitened_covariance(readings: Readings, mode: Mode, scaling: Scaling = "gc")
 
 @pytest.mark.parametrize("mode", MODES)
 @given(seeds, sizes)
-def test_all_whitened_rows_are_independent_with_unit_variance(
-    mode: Mode, seed: int, m: int
-) -> None:
+def test_all_whitened_rows_are_independent_with_unit_variance(mode, seed, m):
     """Exactly, by propagation from the readings: shared, repeated and uneven unloaded readings."""
     readings = random_readings(np.random.default_rng(seed), m, decades=1.0)
     w = whitening(readings, mode)
@@ -195,7 +188,7 @@ def test_all_whitened_rows_are_independent_with_unit_variance(
 
 
 @given(seeds, sizes)
-def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed: int, m: int) -> None:
+def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed, m):
     r = random_readings(np.random.default_rng(seed), m)
     w = whitening(r, "deflection")
     raw = w.raw(r.value)
@@ -209,7 +202,7 @@ def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed: int, m
 
 
 @given(seeds, sizes)
-def test_absolute_readings_stand_for_themselves(seed: int, m: int) -> None:
+def test_absolute_readings_stand_for_themselves(seed, m):
     r = random_readings(np.random.default_rng(seed), m)
     w = whitening(r, "absolute")
     np.testing.assert_array_equal(w.reading, np.arange(len(r)))
@@ -218,7 +211,7 @@ def test_absolute_readings_stand_for_themselves(seed: int, m: int) -> None:
     np.testing.assert_array_equal(w.covariance, r.covariance)
 
 
-def test_pose_measured_only_unloaded_gives_no_deflection() -> None:
+def test_pose_measured_only_unloaded_gives_no_deflection():
     pose, load = np.array([0, 0, 1]), np.array([0, 1, 0])
     covariance = spd(np.random.default_rng(0), 3, 3)
     r = make_readings(pose, np.zeros(3, np.int64), load, np.zeros((3, 3)), covariance)
@@ -229,7 +222,7 @@ def test_pose_measured_only_unloaded_gives_no_deflection() -> None:
 
 
 @given(seeds)
-def test_measured_rotation_is_that_from_unloaded_to_loaded(seed: int) -> None:
+def test_measured_rotation_is_that_from_unloaded_to_loaded(seed):
     rng = np.random.default_rng(seed)
     unloaded = rng.uniform(-1.5, 1.5, 3)
     turn = rng.uniform(-0.5, 0.5, 3)
@@ -241,7 +234,7 @@ def test_measured_rotation_is_that_from_unloaded_to_loaded(seed: int) -> None:
     np.testing.assert_allclose(measured(r, whitening(r, "deflection"))[0, 3:], turn, atol=1e-9)
 
 
-def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
+def rotation_variance(unloaded, count=4000):
     """Variances (3,) of the whitened rotations of poses with some unloaded readings each."""
     rng = np.random.default_rng(5)
     std = 1e-4
@@ -261,5 +254,5 @@ def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
     return np.asarray(w.whiten(measured(r, w)).reshape(-1, 6)[:, 3:].var(axis=0))
 
 
-def test_rotations_have_the_stated_noise() -> None:
+def test_rotations_have_the_stated_noise():
     assert np.abs(rotation_variance(1) - 1).max() < 4 * np.sqrt(2 / 4000)
