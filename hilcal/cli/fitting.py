@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import cast
 
 from hilcal import numbers
 from hilcal.calibration.streamed import calibration_of_stream
@@ -48,10 +49,7 @@ def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[
     _tell_accepted(t, run, revision)
     number, found = run.fit_in_use(say, revision)
     if number is None:
-        t.notice(
-            f"no revision yet: taking the baseline ({model_name(found.model.named)}; "
-            f"{found.mode} readings); hilcal identify keeps it"
-        )
+        t.notice(f"no revision yet: taking the baseline {_what(found)}; hilcal identify keeps it")
     return number, found
 
 
@@ -70,11 +68,12 @@ def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tu
     number, found = run.fit_in_use(say, revision)
     if number is None:
         number = run.store(found)
-        t.notice(
-            f"no revision yet: made the baseline, revision {number} "
-            f"({model_name(found.model.named)}; {found.mode} readings)"
-        )
+        t.notice(f"no revision yet: made the baseline, revision {number} {_what(found)}")
     return number, found
+
+
+def _what(found: Fit) -> str:
+    return f"({model_name(found.model.named)}; {found.mode} readings)"
 
 
 def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
@@ -82,6 +81,18 @@ def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
     accepted, latest = run.file.accepted(), run.latest()
     if revision is None and latest is not None and accepted not in (None, latest.number):
         t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
+
+
+def starting_model(
+    o: Campaign,
+    mode: Mode,
+    effects: Mapping[str, Options] | None,
+    prior: CarriedPrior | None = None,
+) -> Model:
+    """Return a model of unknown frames and these effects; the baseline without any named."""
+    if effects is None:
+        return baseline(o.cell, o.readings, mode, o.catalogue, prior)
+    return with_effects(o.cell, o.readings, mode, effects, effects, o.catalogue, prior)
 
 
 def finish(found: Fit, say: Say) -> None:
@@ -101,17 +112,14 @@ def mode_of_option(run: Campaign, asked: str | None) -> Mode:
     """Kind of readings: as asked, else as in the latest revision, else what they allow."""
     if asked is None:
         return run.mode()
-    for known in MODES:
-        if asked == known:
-            return known
-    raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
+    if asked not in MODES:
+        raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
+    return cast(Mode, asked)
 
 
 def scalings(name: str) -> tuple[Scaling, ...]:
     """Return the scalings that `--scaling` asks for; the one that is kept comes last."""
-    if name == "all":
-        return SCALINGS
-    found = tuple(s for s in SCALINGS if s == name)
+    found = tuple(s for s in SCALINGS if name in (s, "all"))
     if not found:
         raise InputError(f"--scaling {name!r} is unknown; valid: {', '.join(SCALINGS)}, all")
     return found
@@ -287,10 +295,7 @@ def identify(
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
             say("registering")
-            if named is None:
-                model = baseline(o.cell, o.readings, mode, catalogue, known)
-            else:
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
+            model = starting_model(o, mode, named, known)
             fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
                 say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
@@ -309,27 +314,26 @@ def identify(
     other = other_arm_of(o.cell, o.readings)
     if other is not None:
         t.show(other_arm_line(other))
-    document = {"revision": number, **to_json(kept), "options": options_json(kept)}
-    document["covariance"] = o.covariance_parts
-    if torques is not None:
-        document["torques"] = torques.to_json()
-    document["other_arm"] = None if other is None else other.to_json()
+    document = {
+        "revision": number,
+        **to_json(kept),
+        "options": options_json(kept),
+        "covariance": o.covariance_parts,
+        **({} if torques is None else {"torques": torques.to_json()}),
+        "other_arm": None if other is None else other.to_json(),
+    }
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}
-    if number <= before:
-        t.show(f"\nRevision {number} of {run} is this fit already; nothing was stored.")
-    else:
-        t.show(f"\nStored as revision {number} of {run}.")
+    already = f"Revision {number} of {run} is this fit already; nothing was stored."
+    t.show(f"\n{already if number <= before else f'Stored as revision {number} of {run}.'}")
     t.document(document)
 
 
 def options_line(found: Fit) -> list[str]:
     """Return a line with the options that are not the usual ones; none where all are usual."""
-    given = chosen(found)
-    if not given:
-        return []
-    return [f"Options: {', '.join(write_effect(name, of) for name, of in given.items())}."]
+    given = [write_effect(name, options) for name, options in chosen(found).items()]
+    return [f"Options: {', '.join(given)}."] if given else []
 
 
 def options_json(found: Fit) -> dict[str, dict[str, object]]:

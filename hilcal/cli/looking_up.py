@@ -133,7 +133,13 @@ def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
     t = terminal(as_json)
     path = Path(f"{name}.py") if output is None else output
-    _check_name(name)
+    if not NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise InputError(
+            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
+            "Python's own"
+        )
+    if name in installed().names:
+        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
     if path.suffix != ".py":
         raise InputError(f"{path}: effects are in a Python file; end its name in .py")
     replace_file(path, template_of(name), must_be_new=True)
@@ -143,16 +149,6 @@ def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
         f"  hilcal diagnose RUN.hilcal --effects-from {quoted(path)}"
     )
     t.document({"written": str(path), "effect": name})
-
-
-def _check_name(name: str) -> None:
-    if not NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise InputError(
-            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
-            "Python's own"
-        )
-    if name in installed().names:
-        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
 
 
 def template_of(name: str) -> str:

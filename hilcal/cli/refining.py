@@ -20,6 +20,7 @@ from hilcal.cli.fitting import (
     options_json,
     options_line,
     record_story,
+    starting_model,
     stored_fit,
     wanted_effects,
 )
@@ -41,7 +42,6 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
@@ -255,17 +255,13 @@ def refine(
         mode = mode_of_option(o, readings)
         check_options(o, named or {})
         with working(t.progress) as say:
-            fitted = o.readings
             if latest is not None:
                 say(f"restoring revision {latest.number}")
                 restored = o.restore(latest)
                 model, fitted = restored.model, restored.readings
-            elif named is None:
-                say("registering")
-                model = baseline(o.cell, o.readings, mode, catalogue, known)
             else:
                 say("registering")
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
+                model, fitted = starting_model(o, mode, named, known), o.readings
             how = NOTHING if latest is None else o.history(latest.number)
             numbers_to_be = itertools.count(len(o.file.revisions()) + 1)
             first = latest
@@ -303,8 +299,7 @@ def refine(
         other = other_arm_of(o.cell, o.readings) if latest is None else None
         if other is not None:
             t.show(other_arm_line(other))
-        weight = masses_note(found.fit)
-        if weight is not None:
+        if weight := masses_note(found.fit):
             t.show(numbers.sentence(weight))
         if found.rejected:
             t.show(
@@ -317,8 +312,7 @@ def refine(
         if last.verdict != "adequate" and not last.dependences:
             t.show(follows(last.misfit_breakdown))
         t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
-        steps = zip(rows, found.steps, strict=True)
-        chapters = [chapter_of(r.number, s) for r, s in steps]
+        chapters = [chapter_of(n, s) for n, s in zip(numbered, found.steps, strict=True)]
         if live is not None:  # its verdict may have changed when others were tried
             live.revised(chapters[-1])
         record_story(t, chapters, record)
@@ -398,11 +392,7 @@ def discover(
             number, found = fit_of(t, o, say, revision)
         else:
             check_options(o, wanted)
-            model = (
-                with_effects(o.cell, o.readings, o.mode(), wanted, wanted, catalogue)
-                if wanted
-                else baseline(o.cell, o.readings, o.mode(), catalogue)
-            )
+            model = starting_model(o, o.mode(), wanted or None)
             say(f"fitting {model_name(model.named)}")
             found = with_serial_noise(fit(model, o.readings, o.mode()))
         d = search(found, say, name)

@@ -231,8 +231,10 @@ def measure(
     """
     log = RunLog(campaign)
     stored = log.readings()
-    if goal is not None and stored is not None and goal(stored, last=True).met and _is_home(log):
-        return campaign.n_readings
+    if goal is not None and stored is not None and goal(stored, last=True).met:
+        kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
+        if kinds[-1:] == ["finished"]:  # the last session came to its end: nothing hangs
+            return campaign.n_readings
     with _ends_as_interrupt(t), ExitStack() as stack:
         with working(t.progress) as say:
             say("connecting to every device")
@@ -264,12 +266,6 @@ def estimate_noise(t: Terminal, config: CellConfig, cell: Cell, campaign: Campai
         t.notice(sentence(covariance_words("instrument", found)))
     elif log.last(NOISE) is not None:  # of fewer readings, which these do not bear out
         log.event(NOISE, {"factors": None})
-
-
-def _is_home(log: RunLog) -> bool:
-    """Whether the last session came to its end: the arm is home and nothing hangs."""
-    kinds = [e["kind"] for e in log.events() if e["kind"] != "noise"]
-    return kinds[-1:] == ["finished"]
 
 
 def _sighted(rig: Rig, answer: ConnectionResult, say: Say) -> ConnectionResult:

@@ -141,7 +141,7 @@ def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]
     if not asked:
         yield None
         return
-    live = LiveViewer(live_recording(run), t.notice)
+    live = LiveViewer(run.with_name(f"{run.stem}.live.rrd"), t.notice)
     try:
         with working(t.progress) as say:
             say("starting the live viewer")
@@ -154,11 +154,6 @@ def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]
         live.close()
         if live.record.exists():
             t.notice(f"recorded {live.record}; open it with: {opening(live.record)}")
-
-
-def live_recording(run: Path) -> Path:
-    """Return where the recording of a live viewer goes: beside the campaign."""
-    return run.with_name(f"{run.stem}.live.rrd")
 
 
 def opening(recording: Path) -> str:

@@ -336,19 +336,12 @@ def _mat(path: str, how: FileFormat, check: Check | None) -> Grid:
             f"written by writetable as CSV"
         )
     rows = max(lengths, key=lambda k: (lengths.count(k), k))
-    named = [
-        part for name, values in blocks if len(values) == rows for part in _split(name, values)
-    ]
+    named = []
+    for name, values in blocks:
+        for k in range(values.shape[1] if len(values) == rows else 0):
+            title = name if values.shape[1] == 1 else f"{name}({k + 1})"
+            named.append((title, [_cell(v) for v in values[:, k].tolist()]))
     return _columns(path, named, how, check)
-
-
-def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
-    count = values.shape[1]
-    for k in range(count):
-        yield (
-            (name if count == 1 else f"{name}({k + 1})"),
-            [_cell(v) for v in values[:, k].tolist()],
-        )
 
 
 SEPARATORS = {"tab": "\t", "blanks": " "}  # Separators that have a name in a mapping file
@@ -387,25 +380,21 @@ def read_text(path: str, content: bytes, how: FileFormat, check: Check | None = 
 def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[str]]]:
     """Rows of cells that are neither blank nor comments, with their numbers from 1."""
     separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
-    if how.separator == "blanks":
-        text = text.replace("\t", " ")
+    blanks = how.separator == "blanks"
+    text = text.replace("\t", " ") if blanks else text
     if how.comment is not None and how.header_row:
         text = _header_uncommented(text, how.header_row, how.comment)
     lines = limits.Lines(path, io.StringIO(text, newline=None))
-    reader = csv.reader(
-        lines, delimiter=separator, skipinitialspace=how.separator == "blanks", strict=True
-    )
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
     try:
         begun = 1
         for cells in reader:
             row, begun = begun, reader.line_num + 1
             lines.row(len(cells))
-            stripped = [c.strip() for c in cells]
-            while how.separator == "blanks" and stripped and not stripped[-1]:
-                stripped.pop()
-            comment = how.comment is not None and bool(stripped)
-            if any(stripped) and not (comment and stripped[0].startswith(how.comment or "")):
-                yield row, stripped
+            plain = [c.strip() for c in cells]
+            plain = plain[: length_of(plain)] if blanks else plain
+            if any(plain) and not (how.comment and plain[0].startswith(how.comment)):
+                yield row, plain
     except csv.Error as e:
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
 
@@ -442,14 +431,14 @@ def grid_of_rows(
     body = [(row, c) for row, c in found if row > how.header_row and row not in skipped]
     if not body:
         raise InputError(f"{path}: no readings below row {how.header_row}")
-    width = len(header) or max(_length(c) for _, c in body)
-    while header and not header[-1] and all(_length(c) < width for _, c in body):
+    width = len(header) or max(length_of(c) for _, c in body)
+    while header and not header[-1] and all(length_of(c) < width for _, c in body):
         header.pop()
         width -= 1
     for row, cells in body:
-        if _length(cells) > width or (how.header_row and len(cells) < width):
+        if length_of(cells) > width or (how.header_row and len(cells) < width):
             raise InputError(
-                f"{path}: row {row} has {_length(cells)} cells, "
+                f"{path}: row {row} has {length_of(cells)} cells, "
                 f"{'the header' if header else 'others'} {width}; a mapping lists rows that are "
                 "no readings in [file] skip_rows, or has them begin with [file] comment"
             )
@@ -464,7 +453,11 @@ def grid_of_rows(
     return Grid(path, names, rows, columns, (how,) * len(names), units)
 
 
-def _length(cells: Sequence[Cell]) -> int:
+def filled(cell: Cell) -> bool:
+    """Whether a cell holds anything."""
+    return cell is not None and cell != ""
+
+
+def length_of(cells: Sequence[Cell]) -> int:
     """Cells up to the last one that is not empty."""
-    filled = [k for k, c in enumerate(cells, start=1) if c is not None and c != ""]
-    return filled[-1] if filled else 0
+    return max((k for k, cell in enumerate(cells, start=1) if filled(cell)), default=0)
