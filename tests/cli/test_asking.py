@@ -42,13 +42,9 @@ def toml(tmp_path):
     return path
 
 
-@pytest.mark.parametrize(
-    "columns",
-    [
-        pytest.param(80, marks=pytest.mark.long),
-        *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120)),
-    ],
-)
+@pytest.mark.parametrize("columns", [
+    pytest.param(80, marks=pytest.mark.long),
+    *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120))])  # fmt: skip
 def test_a_person_is_shown_the_plan_and_asked(columns, toml):
     home = toml.parent
     with AtTerminal("run", "cell.toml", "-o", "run.hilcal", columns=columns, home=home) as person:

@@ -39,16 +39,12 @@ def test_nothing_moves_where_nobody_can_be_asked(cell, capsys):
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "said"),
-    [
-        ("--goal", "0.1", "has no unit"),
-        ("--limit", "much", "is not understood"),
-        ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
-        ("--poses", "0", "valid: a whole number from 1"),
-        ("--validation", "0", "valid: a whole number from 1"),
-    ],
-)
+@pytest.mark.parametrize(("option", "value", "said"), [
+    ("--goal", "0.1", "has no unit"),
+    ("--limit", "much", "is not understood"),
+    ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
+    ("--poses", "0", "valid: a whole number from 1"),
+    ("--validation", "0", "valid: a whole number from 1")])  # fmt: skip
 def test_bad_options(cell, capsys, option, value, said):
     line = refused(
         capsys, 2, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--yes", option, value

@@ -95,18 +95,14 @@ def test_refine_starts_from_options(campaign, capsys):
     assert added == {"hysteresis", "joint_compliance(joints=each)"}
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
-        ("hysteresis(joints=7)", "effect hysteresis: joints = 7, there is no joint 7; valid: each"),
-        ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
-        ("base_frame(prior_m=-1; prior_rad=1)", "prior_m and prior_rad must be positive"),
-        ("hysteresis(joints=1", "hysteresis(joints=1': ) is missing at the end; valid: NAME or"),
-        ("hysteresis(joints)", "hysteresis: 'joints' is not an option with a value; valid: NAME"),
-        ("histeresis(joints=1)", "unknown effect 'histeresis'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "wrong"), [
+    ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
+    ("hysteresis(joints=7)", "effect hysteresis: joints = 7, there is no joint 7; valid: each"),
+    ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
+    ("base_frame(prior_m=-1; prior_rad=1)", "prior_m and prior_rad must be positive"),
+    ("hysteresis(joints=1", "hysteresis(joints=1': ) is missing at the end; valid: NAME or"),
+    ("hysteresis(joints)", "hysteresis: 'joints' is not an option with a value; valid: NAME"),
+    ("histeresis(joints=1)", "unknown effect 'histeresis'")])  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(campaign, capsys, text, wrong):
     for command in (("identify", campaign, "--effects", f"joint_compliance,{text}"),
                     ("refine", campaign, "--effects", text),

@@ -273,13 +273,9 @@ def test_a_program_without_a_place_to_write(good, tmp_path, capsys):
     assert "written" in line
 
 
-@pytest.mark.parametrize(
-    ("no_wheel", "said"),
-    [
-        ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
-        ((4, 0), "is not installed; pip install ur-rtde"),
-    ],
-)
+@pytest.mark.parametrize(("no_wheel", "said"), [
+    ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
+    ((4, 0), "is not installed; pip install ur-rtde")])  # fmt: skip
 def test_a_ur_arm_without_ur_rtde(
     no_wheel, said, tmp_path, capsys,
     monkeypatch,

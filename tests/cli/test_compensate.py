@@ -186,17 +186,13 @@ def test_points_outside_are_refused_by_name_unless_told_otherwise(capsys, fitted
     assert out.exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--load", "2t"), "--load 2t: no such load; valid: none, 5kg, 10kg"),
-        (("--load", "10kg", "--wrench", "0 0 1 0 0 0"), "the load is given twice"),
-        (("--wrench", "0 0"), "--wrench '0 0'; valid: 6 numbers"),
-        (("--tool", "a b c d e f"), "--tool 'a b c d e f'; valid: 6 numbers"),
-        (("-o", "x.pdf"), "x.pdf: unknown kind of file; valid: .csv, .json, .script"),
-        (("--revision", "7"), "revision"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("--load", "2t"), "--load 2t: no such load; valid: none, 5kg, 10kg"),
+    (("--load", "10kg", "--wrench", "0 0 1 0 0 0"), "the load is given twice"),
+    (("--wrench", "0 0"), "--wrench '0 0'; valid: 6 numbers"),
+    (("--tool", "a b c d e f"), "--tool 'a b c d e f'; valid: 6 numbers"),
+    (("-o", "x.pdf"), "x.pdf: unknown kind of file; valid: .csv, .json, .script"),
+    (("--revision", "7"), "revision")])  # fmt: skip
 def test_wrong_options_are_refused(capsys, fitted, tmp_path, arguments, words):
     assert words in refused(capsys, 2, "compensate", fitted, table(tmp_path, fitted), *arguments)
 

@@ -231,17 +231,13 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, t
     assert plan.exists()
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (("-o", "found.txt"), "the effect is called after its file"),
-        (("-o", "creep.py"), "no name of the catalogue"),
-        (("-o", "nowhere/found.py"), "no folder"),
-        (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
-        (("-o", "found.py", "--against", "crep"), "unknown effect"),
-        (("-o", "found.py", "--against", "no.json"), "no calibration"),
-    ],
-)
+@pytest.mark.parametrize(("given", "message"), [
+    (("-o", "found.txt"), "the effect is called after its file"),
+    (("-o", "creep.py"), "no name of the catalogue"),
+    (("-o", "nowhere/found.py"), "no folder"),
+    (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
+    (("-o", "found.py", "--against", "crep"), "unknown effect"),
+    (("-o", "found.py", "--against", "no.json"), "no calibration")])  # fmt: skip
 def test_what_cannot_be_is_refused_by_name(campaign, capsys, given, message):
     found = run(capsys, "discover", campaign, *given)
     assert found.code == 2

@@ -53,27 +53,16 @@ def full_after(size):
 
 
 COMMANDS = [
-    *(
-        ("export", "run.hilcal", option, name)
-        for option, name in (
-            ("--readings", "r.csv"),
-            ("--readings", "r.parquet"),
-            ("--table", "t.csv"),
-            ("--cell", "C.toml"),
-            ("--parameters", "p.csv"),
-            ("--parameters", "p.json"),
-            ("--residuals", "e.csv"),
-            ("--calibration", "c.json"),
-        )
-    ),
-    *(
-        ("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", name)
-        for name in ("o.script", "o.csv", "o.json")
-    ),
+    *(("export", "run.hilcal", option, name) for option, name in (("--readings", "r.csv"),
+        ("--readings", "r.parquet"), ("--table", "t.csv"), ("--cell", "C.toml"), ("--parameters",
+        "p.csv"), ("--parameters", "p.json"), ("--residuals", "e.csv"), ("--calibration",
+        "c.json"))),
+    *(("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o",
+        name) for name in ("o.script", "o.csv", "o.json")),
     ("report", "run.hilcal", "-o", "story.html"),
     ("import", "table.csv", "--preview", "-o", "m.toml"),
     ("effects", "new", "mine", "-o", "mine.py"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("size", first(1, [0, 200]))

@@ -75,14 +75,10 @@ def test_a_shell_is_told_how_to_complete(capsys, monkeypatch):
     assert "complete -o default -F _hilcal_completion hilcal" in script
 
 
-@pytest.mark.parametrize(
-    ("arguments", "kind", "code"),
-    [
-        (("diagnose", "none.hilcal"), "input", 2),
-        (("plan",), "input", 2),
-        (("plan", "CELL", "--no-such-option"), "input", 2),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "kind", "code"), [
+    (("diagnose", "none.hilcal"), "input", 2),
+    (("plan",), "input", 2),
+    (("plan", "CELL", "--no-such-option"), "input", 2)])  # fmt: skip
 def test_an_error_is_one_document_with_json(arguments, kind, code, capsys):
     result = run(capsys, *arguments, "--json")
     line = refused(capsys, code, *arguments)  # without it: the same line, and nothing on stdout

@@ -64,22 +64,14 @@ def test_the_accepted_revision_is_marked(imported, tmp_path, capsys):
 
 
 ANSWERS = [
-    {
-        "device": "arm", "driver": "ur", "answers": True, "problems": [],
-        "name": "Universal Robots UR10e", "facts": {"serial number": "20235500001"},
-    },
-    {
-        "device": "tracker", "driver": "geocom", "answers": True, "problems": [],
-        "name": "LASER STATION, serial 123456", "facts": {"firmware": "6.20"},
-    },
-    {
-        "device": "force sensor", "driver": "ft300", "answers": True, "problems": [],
-        "name": "Robotiq FT 300, serial number F3004242", "facts": {},
-    },
-    {
-        "device": "operator", "driver": "terminal", "answers": True, "problems": [],
-        "name": "a person", "facts": {},
-    },
+    {"device": "arm", "driver": "ur", "answers": True, "problems": [],
+        "name": "Universal Robots UR10e", "facts": {"serial number": "20235500001"}},
+    {"device": "tracker", "driver": "geocom", "answers": True, "problems": [],
+        "name": "LASER STATION, serial 123456", "facts": {"firmware": "6.20"}},
+    {"device": "force sensor", "driver": "ft300", "answers": True, "problems": [],
+        "name": "Robotiq FT 300, serial number F3004242", "facts": {}},
+    {"device": "operator", "driver": "terminal", "answers": True, "problems": [],
+        "name": "a person", "facts": {}},
 ]  # fmt: skip
 
 

@@ -72,22 +72,18 @@ def also(package, words):
     return pytest.param(package, words, marks=pytest.mark.long)
 
 
-@pytest.mark.parametrize(
-    ("package", "words"),
-    [
-        also("jinja2", ("report", "run.hilcal")),
-        ("plotly", ("report", "run.hilcal")),
-        also("rerun", ("view", "run.hilcal")),
-        also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
-        also("nicegui", ("workbench", "run.hilcal")),
-        also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
-        also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
-        also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
-        also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
-        also("geocompy", ("config", "tracker")),
-        also("serial", ("doctor",)),
-    ],
-)
+@pytest.mark.parametrize(("package", "words"), [
+    also("jinja2", ("report", "run.hilcal")),
+    ("plotly", ("report", "run.hilcal")),
+    also("rerun", ("view", "run.hilcal")),
+    also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
+    also("nicegui", ("workbench", "run.hilcal")),
+    also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
+    also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
+    also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
+    also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
+    also("geocompy", ("config", "tracker")),
+    also("serial", ("doctor",))])  # fmt: skip
 def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(package, words, folder):
     if package == "openpyxl":
         openpyxl.Workbook().save(folder / "t.xlsx")

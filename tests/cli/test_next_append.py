@@ -67,13 +67,10 @@ def test_a_name_that_was_made_up_is_not_taken_twice():
     assert with_new_names(further, before, 2).pose_names == ("p1-2-2",)
 
 
-@pytest.mark.parametrize(
-    ("plan", "words"),
-    [
-        (made("p1"), 'only the campaign has a pose "reference"'),
-        (Plan((REFERENCE,), np.zeros((1, 7)), (Step(REFERENCE, "none"),)), "7 joint angles"),
-    ],
-)
+@pytest.mark.parametrize(("plan", "words"), [
+    (made("p1"), 'only the campaign has a pose "reference"'),
+    (Plan((REFERENCE,), np.zeros((1, 7)), (Step(REFERENCE, "none"),)), "7 joint angles"),
+])  # fmt: skip
 def test_what_does_not_go_together(plan, words):
     with pytest.raises(InputError, match=words):
         with_new_names(plan, made(REFERENCE, "p1"), 2)

@@ -242,53 +242,37 @@ TAKEN: dict[str, dict[str, str]] = {
         "--preview -o M.toml": "tests/unit/calibration/test_points.py"
         "::test_poses_without_joint_values_by_a_mapping"
     },
-    "campaign/campaign": {
-        "is used: hilcal accept {} --release": f"{HERE}readings_were_appended",
+    "campaign/campaign": {"is used: hilcal accept {} --release": f"{HERE}readings_were_appended",
         "use it first: hilcal accept": f"{RARE}a_revision_in_a_cell_that_was_changed",
         "needs gc: run hilcal identify": f"{HERE}another_scaling_or_parameters_of_another_version",
-        "no revision yet; run hilcal identify or refine": f"{HERE}without_a_revision",
-    },
-    "campaign/revisions": {
-        "before readings were appended": f"{HERE}readings_were_appended",
+        "no revision yet; run hilcal identify or refine": f"{HERE}without_a_revision"},
+    "campaign/revisions": {"before readings were appended": f"{HERE}readings_were_appended",
         "targets, the cell has": f"{RARE}a_revision_of_other_targets",
         "other parameters": f"{HERE}another_scaling_or_parameters_of_another_version",
-        "fit again: hilcal identify or refine": f"{HERE}an_effect_of_ones_own",
-    },
-    "cli/campaigns": {
-        "hilcal identify {}": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again",
+        "fit again: hilcal identify or refine": f"{HERE}an_effect_of_ones_own"},
+    "cli/campaigns": {"hilcal identify {}": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again",
         "take it back with: hilcal accept": f"{RARE}what_accept_says",
-        "make one with hilcal identify or refine": f"{HERE}without_a_revision",
-    },
+        "make one with hilcal identify or refine": f"{HERE}without_a_revision"},
     "cli/comparing": {"hilcal refine makes a model": f"{HERE}without_a_revision"},
-    "cli/demo": {
-        "hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
-        "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words",
-    },
+    "cli/demo": {"hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
+        "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words"},
     "cli/refining": {
         "hilcal add": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal diagnose": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal next": f"{DISCOVER}a_law_is_written_as_an_effect_and_told",
     },
-    "cli/exporting": {
-        "hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
-        "run hilcal identify first": f"{HERE}without_a_revision",
-    },
-    "cli/fitting": {
-        "hilcal identify keeps it": f"{HERE}without_a_revision",
-        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign",
-    },
-    "cli/preparing": {
-        "hilcal config explains": f"{HERE}files_that_are_not_there_yet",
-        "hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names",
-    },
+    "cli/exporting": {"hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
+        "run hilcal identify first": f"{HERE}without_a_revision"},
+    "cli/fitting": {"hilcal identify keeps it": f"{HERE}without_a_revision",
+        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"},
+    "cli/preparing": {"hilcal config explains": f"{HERE}files_that_are_not_there_yet",
+        "hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
     "cli/looking_up": {"hilcal diagnose RUN.hilcal": f"{HERE}an_effect_of_ones_own"},
     "cli/planning": {
         "hilcal run {}": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
     },
-    "cli/running": {
-        "Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
-        "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until",
-    },
+    "cli/running": {"Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
+        "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until"},
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
     "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
     "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
@@ -300,48 +284,32 @@ TAKEN: dict[str, dict[str, str]] = {
     "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
     "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
     "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
-    "present/campaign": {
-        "hilcal accept RUN N": f"{HERE}what_a_report_names",
-        "None yet: hilcal identify": f"{HERE}without_a_revision",
-    },
-    "present/comparison": {
-        "hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
+    "present/campaign": {"hilcal accept RUN N": f"{HERE}what_a_report_names",
+        "None yet: hilcal identify": f"{HERE}without_a_revision"},
+    "present/comparison": {"hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
         "hilcal refine {} --prior": f"{HERE}what_a_comparison_says",
-        "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks",
-    },
-    "present/diagnosis": {
-        "remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
+        "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks"},
+    "present/diagnosis": {"remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
         "to remove {}: hilcal remove": f"{HERE}what_a_diagnosis_says",
         "hilcal effects new NAME": f"{HERE}an_effect_of_ones_own",
-        "its own: hilcal add RUN": f"{RARE}joints_that_differ",
-    },
+        "its own: hilcal add RUN": f"{RARE}joints_that_differ"},
     "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
     "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
-    "present/html/certificate": {
-        "report --limit": f"{RARE}the_page_says_how_to_be_judged",
-        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged",
-    },
+    "present/html/certificate": {"report --limit": f"{RARE}the_page_says_how_to_be_judged",
+        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged"},
     "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
-    "present/html/sections": {
-        "hilcal report --appendix": f"{HERE}what_a_report_names",
-        "hilcal refine finds": f"{HERE}what_a_report_names",
-    },
-    "present/preparing": {
-        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
-        "hilcal init writes a file.": f"{RARE}sections_of_a_cell",
-    },
-    "present/story": {
-        "run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
-        "run hilcal identify first": f"{RARE}what_a_recording_names",
-    },
+    "present/html/sections": {"hilcal report --appendix": f"{HERE}what_a_report_names",
+        "hilcal refine finds": f"{HERE}what_a_report_names"},
+    "present/preparing": {"(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
+        "hilcal init writes a file.": f"{RARE}sections_of_a_cell"},
+    "present/story": {"run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
+        "run hilcal identify first": f"{RARE}what_a_recording_names"},
     "present/verdict": {
         "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
-    "present/viewer/live_scene": {
-        "`hilcal refine` does": f"{RARE}what_a_recording_names",
-        "hilcal refine says what": f"{RARE}what_a_recording_names",
-    },
+    "present/viewer/live_scene": {"`hilcal refine` does": f"{RARE}what_a_recording_names",
+        "hilcal refine says what": f"{RARE}what_a_recording_names"},
     "procedure/state": {"hilcal info": f"{HERE}a_campaign_that_calibrate_did_not_make"},
     "procedure/next_plan": {
         "see hilcal diagnose {}, or give": f"{RARE}what_next_says_of_each_verdict",
@@ -373,11 +341,9 @@ TAKEN: dict[str, dict[str, str]] = {
     "workbench/session": {
         "hilcal run CELL.toml": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
     },
-    "write_report": {
-        "hilcal info": f"{HERE}what_a_report_names",
-        "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command",
-    },
-}
+    "write_report": {"hilcal info": f"{HERE}what_a_report_names",
+        "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command"},
+}  # fmt: skip
 """By module, what tells each sentence that names a command from the others, and the test that takes
 the step."""
 NO_STEP = {

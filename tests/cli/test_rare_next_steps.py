@@ -135,22 +135,18 @@ def test_joints_that_differ(tmp_path, capsys):
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 
-@pytest.mark.parametrize(
-    ("reason", "words", "step"),
-    [
-        ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
-        ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
-        *(
-            pytest.param(*further, marks=pytest.mark.long)
-            for further in (
-                ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
-                ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
-                ("background", "one by one", PLAN_AFTER),
-                ("residual_is_noise", "is adequate", PLAN_AFTER),
-            )
-        ),
-    ],
-)
+@pytest.mark.parametrize(("reason", "words", "step"), [
+    ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
+    ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
+    *(
+        pytest.param(*further, marks=pytest.mark.long)
+        for further in (
+            ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
+            ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
+            ("background", "one by one", PLAN_AFTER),
+            ("residual_is_noise", "is adequate", PLAN_AFTER),
+        )
+    )])  # fmt: skip
 def test_what_next_says_of_each_verdict(run, tmp_path, capsys, reason, words, step):
     cell = tmp_path / "cell.toml"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))

@@ -89,15 +89,11 @@ READING = (
 )
 
 
-@pytest.mark.parametrize(
-    ("reading", "revisions"),
-    [
-        *((c, True) for c in READING[:-1]),
-        *((c, False) for c in READING[:3]),
-        pytest.param(READING[-1], True, marks=pytest.mark.slow),
-    ],
-    ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x],
-)
+@pytest.mark.parametrize(("reading", "revisions"), [
+    *((c, True) for c in READING[:-1]),
+    *((c, False) for c in READING[:3]),
+    pytest.param(READING[-1], True, marks=pytest.mark.slow),
+], ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x])  # fmt: skip
 def test_a_command_that_reads_writes_nothing_to_the_campaign(
     reading, revisions, fresh, fitted, tmp_path, capsys
 ):
@@ -257,15 +253,11 @@ def take(said, run, capsys):
 
 
 @pytest.mark.parametrize("made", [outdated, of_another_scaling])
-@pytest.mark.parametrize(
-    "asked",
-    [
-        ("compare",),
-        ("diagnose",),
-        pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
-    ],
-    ids=lambda x: x[0],
-)
+@pytest.mark.parametrize("asked", [
+    ("compare",),
+    ("diagnose",),
+    pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
+], ids=lambda x: x[0])  # fmt: skip
 def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
     run, tmp_path, capsys, made, asked
 ):
@@ -287,18 +279,13 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         assert len(o.fit().readings) == len(o.readings)
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        ("accept", "{run}"),
-        ("export", "{run}", "--urdf", "{out}/arm.urdf"),
-        ("report", "{run}", "-o", "{out}/r.html"),
-        ("compensate", "{run}", "{out}/points.csv"),
-        pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
-        ("view", "{run}", "--record", "{out}/v.rrd"),
-    ],
-    ids=lambda x: x[0],
-)
+@pytest.mark.parametrize("asked", [
+    ("accept", "{run}"),
+    ("export", "{run}", "--urdf", "{out}/arm.urdf"),
+    ("report", "{run}", "-o", "{out}/r.html"),
+    ("compensate", "{run}", "{out}/points.csv"),
+    pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
+    ("view", "{run}", "--record", "{out}/v.rrd")], ids=lambda x: x[0])  # fmt: skip
 def test_every_step_that_is_named_leads_on(fresh, cell, tmp_path, capsys, asked):
     """From a campaign without a fit: the step is taken until the command is done, or a plan is."""
     run = tmp_path / "run.hilcal"

@@ -178,19 +178,15 @@ def test_what_is_not_toml_is_told_by_its_place(tmp_path, text, place):
         load(tmp_path, ROBOT + text)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
-        ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
-        ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
-        (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
-        (
-            ROBOT + "[repeatability]\njoint_std_rad = [1e-5, 1e-5]\n",
-            r"joint_std_rad has 2 values; it must be one number or 6, one per joint",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
+    ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
+    ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
+    (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
+    (
+        ROBOT + "[repeatability]\njoint_std_rad = [1e-5, 1e-5]\n",
+        r"joint_std_rad has 2 values; it must be one number or 6, one per joint",
+    )])  # fmt: skip
 def test_wrong_cell(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         cell_from_config(load(tmp_path, text), tmp_path)
@@ -206,14 +202,10 @@ def test_files_that_cannot_be_read(tmp_path):
         load_config(tmp_path / "binary.toml")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", r"stored cell configuration: not JSON.*line 1"),
-        ("[]", "stored cell configuration: "),
-        ('{"robot": {"model": "ur10", "x": 1}}', r'\[robot\] has no key "x"'),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("{", r"stored cell configuration: not JSON.*line 1"),
+    ("[]", "stored cell configuration: "),
+    ('{"robot": {"model": "ur10", "x": 1}}', r'\[robot\] has no key "x"')])  # fmt: skip
 def test_wrong_json(text, message):
     with pytest.raises(InputError, match=message) as raised:
         CellConfig.from_json(text)
@@ -305,14 +297,10 @@ def test_the_work_may_be_a_box(tmp_path):
     assert planning.against == ()
 
 
-@pytest.mark.parametrize(
-    ("load", "hangs"),
-    [
-        (CellLoad(name="a", mass_kg=1.0), 0.3),
-        (CellLoad(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
-        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
-        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1),
-    ],
-)
+@pytest.mark.parametrize(("load", "hangs"), [
+    (CellLoad(name="a", mass_kg=1.0), 0.3),
+    (CellLoad(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
+    (CellLoad(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
+    (CellLoad(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1)])  # fmt: skip
 def test_only_a_load_with_a_mass_hangs_unless_told(load, hangs):
     assert load.hanging_m == hangs

@@ -154,19 +154,15 @@ def test_repeats_that_cannot_both_be_right_are_left_out(tmp_path):
     assert result.notes[1].startswith("2 of 6 rows left out (3, 7): they repeat a pose")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"elbow_joint": "abc"}, r"row 3, column 'elbow_joint': 'abc' is not a number with ','"),
-        ({"elbow_joint": "0.5"}, r"row 3, column 'elbow_joint': '0.5' is not a number with ','"),
-        ({"elbow_joint": "inf"}, r"row 3, column 'elbow_joint': 'inf' is not a number"),
-        ({"elbow_joint": 90.0}, r"row 3, column 'elbow_joint': 90 rad .* looks like degrees"),
-        ({"measurement_rx": 1e4}, r"row 3, column 'measurement_rx': 10000 deg is more than a turn"),
-        ({"measurement_x": 1e9}, r"row 3, column 'measurement_x': 1e\+06 m cannot be right"),
-        ({"measurement_std_x": -1.0}, r"row 3, column 'measurement_std_x': -1: a standard dev"),
-        ({"measurement_std_x": 50.0}, r"row 3: a standard deviation of 0.05 m cannot"),
-    ],
-)
+@pytest.mark.parametrize(("change", "message"), [
+    ({"elbow_joint": "abc"}, r"row 3, column 'elbow_joint': 'abc' is not a number with ','"),
+    ({"elbow_joint": "0.5"}, r"row 3, column 'elbow_joint': '0.5' is not a number with ','"),
+    ({"elbow_joint": "inf"}, r"row 3, column 'elbow_joint': 'inf' is not a number"),
+    ({"elbow_joint": 90.0}, r"row 3, column 'elbow_joint': 90 rad .* looks like degrees"),
+    ({"measurement_rx": 1e4}, r"row 3, column 'measurement_rx': 10000 deg is more than a turn"),
+    ({"measurement_x": 1e9}, r"row 3, column 'measurement_x': 1e\+06 m cannot be right"),
+    ({"measurement_std_x": -1.0}, r"row 3, column 'measurement_std_x': -1: a standard dev"),
+    ({"measurement_std_x": 50.0}, r"row 3: a standard deviation of 0.05 m cannot")])  # fmt: skip
 def test_bad_cells(tmp_path, change, message):
     table = rows()
     table[1] |= change

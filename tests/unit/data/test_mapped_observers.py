@@ -30,14 +30,9 @@ BAR: dict[str, Any] = {
     "joints": {"columns": JOINTS, "unit": "deg"},
     "pose": {"column": "Messpunkt"},
     "load": {"column": "Last"},
-    "distance": {
-        "column": "Abstand [mm]",
-        "unit": "mm",
-        "name_column": "Kugel",
-        "std_column": "Unsicherheit Abstand [µm]",
-        "std_unit": "um",
-    },
-}
+    "distance": {"column": "Abstand [mm]", "unit": "mm", "name_column": "Kugel",
+        "std_column": "Unsicherheit Abstand [µm]", "std_unit": "um"},
+}  # fmt: skip
 
 
 def measured(who, seed):
@@ -144,16 +139,13 @@ def test_a_preview_proposes_the_mapping(who, tmp_path, capsys):
     )
 
 
-@pytest.mark.parametrize(
-    ("sections", "message"),
-    [
-        ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
-        ({"distance": None}, r"no reading: it must be a section \[position\]"),
-        ({"std": {"values": [0.1]}}, r"\[std\], .* need \[position\]"),
-        ({"rows": {"plausible_only": True}}, "give those in a table of their own"),
-        ({"torques": TORQUES | {"columns": MOMENTS[:4]}}, "4 columns of torques; .* has 6 joints"),
-    ],
-)
+@pytest.mark.parametrize(("sections", "message"), [
+    ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
+    ({"distance": None}, r"no reading: it must be a section \[position\]"),
+    ({"std": {"values": [0.1]}}, r"\[std\], .* need \[position\]"),
+    ({"rows": {"plausible_only": True}}, "give those in a table of their own"),
+    ({"torques": TORQUES | {"columns": MOMENTS[:4]}}, "4 columns of torques; .* has 6 joints"),
+])  # fmt: skip
 def test_mappings_that_cannot_be(sections, message, tmp_path):
     (tmp_path / "t.csv").write_text(german(measured(["A", "B", "C"], 0).readings))
     with pytest.raises(InputError, match=message):

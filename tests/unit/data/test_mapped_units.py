@@ -45,22 +45,18 @@ START = datetime(2024, 2, 28, 23, 0, 0)
 DATES = [START + timedelta(seconds=float(s)) for s in SECONDS]
 
 
-@pytest.mark.parametrize(
-    ("cells", "section"),
-    [
-        (SECONDS, {"unit": "s"}),
-        (1e3 * SECONDS, {"unit": "ms"}),
-        (SECONDS / 3600, {"unit": "h"}),
-        (1.7e9 + SECONDS, {"unit": "s"}),
-        (45350.958333333336 + SECONDS / 86400, {"unit": "excel"}),
-        ([d.isoformat() for d in DATES], {"unit": "iso"}),
-        ([d.isoformat() + "+01:00" for d in DATES], {"unit": "iso"}),
-        (
-            [d.strftime("%d.%m.%y %H:%M:%S.%f") for d in DATES],
-            {"unit": "format", "format": "%d.%m.%y %H:%M:%S.%f"},
-        ),
-    ],
-)
+@pytest.mark.parametrize(("cells", "section"), [
+    (SECONDS, {"unit": "s"}),
+    (1e3 * SECONDS, {"unit": "ms"}),
+    (SECONDS / 3600, {"unit": "h"}),
+    (1.7e9 + SECONDS, {"unit": "s"}),
+    (45350.958333333336 + SECONDS / 86400, {"unit": "excel"}),
+    ([d.isoformat() for d in DATES], {"unit": "iso"}),
+    ([d.isoformat() + "+01:00" for d in DATES], {"unit": "iso"}),
+    (
+        [d.strftime("%d.%m.%y %H:%M:%S.%f") for d in DATES],
+        {"unit": "format", "format": "%d.%m.%y %H:%M:%S.%f"},
+    )])  # fmt: skip
 def test_times(cells, section, tmp_path):
     x = read(tmp_path, {"when": cells}, time={"column": "when", **section})
     assert x.states.time is not None

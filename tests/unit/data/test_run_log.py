@@ -159,33 +159,26 @@ def test_a_plan_is_read_back_as_written(poses, rows, angle):
     assert again.about == {"note": 1}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "not JSON"),
-        ("[]", "not a plan"),
-        ('{"format": "hilcal-plan", "version": 9}', "version 9"),
-        ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
-    ],
-)
+@pytest.mark.parametrize(("text", "message"), [
+    ("{", "not JSON"),
+    ("[]", "not a plan"),
+    ('{"format": "hilcal-plan", "version": 9}', "version 9"),
+    ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
+])  # fmt: skip
 def test_what_is_not_a_plan_is_refused_in_one_line(text, message):
     with pytest.raises(InputError, match=message) as raised:
         read_plan(text, "p.json")
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
-        ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
-        ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
-        ('"cycle": 0', '"cycle": -1', "must be a whole number"),
-        ('"load": "5kg"', '"load": "none"', "are the same"),
-        ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
-        ("0.1,", '"a",', "finite numbers"),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
+    ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
+    ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
+    ('"cycle": 0', '"cycle": -1', "must be a whole number"),
+    ('"load": "5kg"', '"load": "none"', "are the same"),
+    ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
+    ("0.1,", '"a",', "finite numbers")])  # fmt: skip
 def test_a_wrong_edit_of_a_plan_is_named(tmp_path, old, new, message):
     path = tmp_path / "plan.json"
     path.write_text(MADE.to_json().replace(old, new, 1))

@@ -154,21 +154,17 @@ def _zip(**members):
     return out.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"\x89HDF\r\n\x1a\n and so on", r"HDF5 file \(MATLAB's -v7.3\); save it with -v7"),
-        (pickle.dumps([1, 2]), "pickle, which is never loaded"),
-        (b"\xd0\xcf\x11\xe0 and so on", r"old Excel file"),
-        (_zip(a=b"1"), "a zip archive that is no XLSX"),
-        (b"PK\x03\x04 cut", "damaged"),
-        (b"PAR1 cut", "damaged"),
-        (b"MATLAB 5.0 MAT-file cut", "t.bin"),
-        (b"\x1f\x8b\x08", "gzip"),
-        (b"a\x00b", "binary data"),
-        (b"", "empty"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"\x89HDF\r\n\x1a\n and so on", r"HDF5 file \(MATLAB's -v7.3\); save it with -v7"),
+    (pickle.dumps([1, 2]), "pickle, which is never loaded"),
+    (b"\xd0\xcf\x11\xe0 and so on", r"old Excel file"),
+    (_zip(a=b"1"), "a zip archive that is no XLSX"),
+    (b"PK\x03\x04 cut", "damaged"),
+    (b"PAR1 cut", "damaged"),
+    (b"MATLAB 5.0 MAT-file cut", "t.bin"),
+    (b"\x1f\x8b\x08", "gzip"),
+    (b"a\x00b", "binary data"),
+    (b"", "empty")])  # fmt: skip
 def test_what_is_no_table(content, message, tmp_path):
     path = tmp_path / "t.bin"
     path.write_bytes(content)

@@ -46,14 +46,10 @@ def test_angles_have_a_floor_of_their_own(tmp_path):
     assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2
 
 
-@pytest.mark.parametrize(
-    ("sigma", "looks"),
-    [
-        (1e-15, "expected the standard deviations"),
-        (1e-10, "variances given as standard deviations"),
-        (2e-8, "1000 times too small"),
-    ],
-)
+@pytest.mark.parametrize(("sigma", "looks"), [
+    (1e-15, "expected the standard deviations"),
+    (1e-10, "variances given as standard deviations"),
+    (2e-8, "1000 times too small")])  # fmt: skip
 def test_precision_that_nothing_has_is_refused(tmp_path, sigma, looks):
     x = simple(20)
     cov = np.tile(sigma**2 * np.eye(3), (20, 1, 1))

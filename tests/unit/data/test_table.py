@@ -129,24 +129,18 @@ def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write):
 
 
 BAD: dict[str, tuple[Table, str]] = {
-    "misspelled": (
-        renamed(good(), "q3_rad", "q3_rda"),
-        r"unknown column 'q3_rda'; did you mean 'q3_rad'",
-    ),
+    "misspelled": (renamed(good(), "q3_rad", "q3_rda"),
+        r"unknown column 'q3_rda'; did you mean 'q3_rad'"),
     "capital": (renamed(good(), "y_m", "Y_m"), r"unknown column 'Y_m'; did you mean 'y_m'"),
     "unknown": (with_column("temperature", "20"), r"unknown column 'temperature'.*start with 'x_'"),
     "missing": (without(good(), "q4_rad"), r"column 'q4_rad' is missing.*needs pose, load, q1_rad"),
-    "in millimetres by name": (
-        renamed(good(), "x_m", "x_mm"),
-        r"column 'x_m' is missing; 'x_mm' is taken as a column of your own",
-    ),
+    "in millimetres by name": (renamed(good(), "x_m", "x_mm"),
+        r"column 'x_m' is missing; 'x_mm' is taken as a column of your own"),
     "unnamed": (with_column("", ""), r"column 21 has no name"),
     "lower triangle": (with_column("cov_y_x", "1e-11"), r"upper triangle only: 'cov_x_y'"),
     "incomplete covariance": (without(good(), "cov_y_z"), r"'cov_y_z' is missing.*upper triangle"),
-    "covariance of what was not read": (
-        with_column("cov_rx_rx", "1e-10"),
-        r"'cov_rx_rx' needs the rotation vector",
-    ),
+    "covariance of what was not read": (with_column("cov_rx_rx", "1e-10"),
+        r"'cov_rx_rx' needs the rotation vector"),
     "half a rotation": (with_column("rx_rad", "0.1"), r"'ry_rad' is missing; give all of"),
     "half the approaches": (with_column("approach1", "1"), r"'approach2' is missing"),
     "empty cell": (with_cell(3, x_m=""), r"row 3, column 'x_m': the cell is empty"),
@@ -156,67 +150,43 @@ BAD: dict[str, tuple[Table, str]] = {
     "too large": (with_cell(2, z_m="1e999"), r"row 2, column 'z_m': '1e999' is not a number"),
     "underscore": (with_cell(2, z_m="1_0"), r"row 2, column 'z_m': '1_0' is not a number"),
     "decimal comma": (with_cell(2, z_m="0,1"), r"row 2, column 'z_m': '0,1' is not a number"),
-    "one position in millimetres": (
-        with_cell(4, x_m="1400"),
-        r"row 4, column 'x_m': 1400 m cannot be right \(looks like millimetres\)",
-    ),
+    "one position in millimetres": (with_cell(4, x_m="1400"),
+        r"row 4, column 'x_m': 1400 m cannot be right \(looks like millimetres\)"),
     "far from the others": (with_cell(4, x_m="40"), r"row 4: position is .* m from the others"),
-    "degrees": (
-        with_cell(2, q5_rad="90"),
-        r"row 2, column 'q5_rad': 90 rad .* -6.28319 to 6.28319 rad \(looks like degrees\)",
-    ),
+    "degrees": (with_cell(2, q5_rad="90"),
+        r"row 2, column 'q5_rad': 90 rad .* -6.28319 to 6.28319 rad \(looks like degrees\)"),
     "beyond a limit": (with_cell(2, q5_rad="6.5"), r"row 2, column 'q5_rad': 6.5 rad is beyond"),
-    "zero covariance": (
-        with_cell(6, **dict.fromkeys(COVARIANCE, "0")),
-        r"row 6: the covariance is zero",
-    ),
+    "zero covariance": (with_cell(6, **dict.fromkeys(COVARIANCE, "0")),
+        r"row 6: the covariance is zero"),
     "negative variance": (with_cell(6, cov_y_y="-1e-10"), r"row 6: variance 2 .* is -1e-10"),
     "indefinite": (with_cell(6, cov_x_y="5e-10"), r"row 6: the covariance is not positive semi"),
-    "correlated with what has no variance": (
-        with_cell(6, cov_y_y="0"),
-        r"row 6: the covariance is not positive semi",
-    ),
-    "covariance in mm²": (
-        with_cell(6, cov_x_x="4e-4", cov_x_y="0"),
-        r"row 6: a standard deviation of 0.02 m .* m²",
-    ),
-    "time in nanoseconds": (
-        with_column("time_s", "1.7e18"),
-        r"row 2, column 'time_s': 1.7e\+18 s cannot be right; expected -1e\+12 to 1e\+12 s",
-    ),
+    "correlated with what has no variance": (with_cell(6, cov_y_y="0"),
+        r"row 6: the covariance is not positive semi"),
+    "covariance in mm²": (with_cell(6, cov_x_x="4e-4", cov_x_y="0"),
+        r"row 6: a standard deviation of 0.02 m .* m²"),
+    "time in nanoseconds": (with_column("time_s", "1.7e18"),
+        r"row 2, column 'time_s': 1.7e\+18 s cannot be right; expected -1e\+12 to 1e\+12 s"),
     "no load": (with_cell(3, load=" "), r"row 3, column 'load': the cell is empty"),
     "no pose": (with_cell(3, pose=""), r"row 3, column 'pose': the cell is empty"),
     "two lines": (with_cell(3, pose="a\nb"), r"row 3, column 'pose': 'a\\u000ab' holds the"),
-    "column of two lines": (
-        with_column("a\nb", ""),
-        r"row 1, column 21: 'a\\u000ab' holds the char",
-    ),
+    "column of two lines": (with_column("a\nb", ""),
+        r"row 1, column 21: 'a\\u000ab' holds the char"),
     "None": (with_cell(2, load="None"), r"row 2, column 'load': 'None' must be spelled 'none'"),
-    "wrench without a load": (
-        with_cell(4, fz_N="-50"),
-        r"row 4, column 'fz_N': -50: the load is 'none'",
-    ),
+    "wrench without a load": (with_cell(4, fz_N="-50"),
+        r"row 4, column 'fz_N': -50: the load is 'none'"),
     "wrench in millinewton": (with_cell(3, fz_N="-50000"), r"row 3, column 'fz_N'.*expected N"),
-    "approach": (
-        [row | {f"approach{i}": "0.5" for i in range(1, 7)} for row in good()],
-        r"row 2, column 'approach1': 0.5 must be -1 or \+1",
-    ),
-    "actual joints in degrees": (
-        [row | {f"qa{i}_rad": "57.3" for i in range(1, 7)} for row in good()],
-        r"row 2, column 'qa1_rad': 57.3 rad is not within",
-    ),
+    "approach": ([row | {f"approach{i}": "0.5" for i in range(1, 7)} for row in good()],
+        r"row 2, column 'approach1': 0.5 must be -1 or \+1"),
+    "actual joints in degrees": ([row | {f"qa{i}_rad": "57.3" for i in range(1,
+        7)} for row in good()], r"row 2, column 'qa1_rad': 57.3 rad is not within"),
     "kelvin": (with_column("air_degC", "293"), r"row 2, column 'air_degC': 293 °C cannot be"),
     "negative load time": (with_column("load_time_s", "-1"), r"column 'load_time_s': -1 s"),
     "half a cycle": (with_cell(2, cycle="0.5"), r"row 2, column 'cycle': 0.5 must be a whole"),
-    "covariance of a position for a pose": (
-        [row | {"rx_rad": "1", "ry_rad": "0", "rz_rad": "0"} for row in good()],
-        r"'cov_x_rx' is missing",
-    ),
-    "one pose, two joints": (
-        with_cell(5, q2_rad="0.5"),
-        r"row 5: pose 'P1' commands joint 2 to 0.5 rad, row 4 to",
-    ),
-}
+    "covariance of a position for a pose": ([row | {"rx_rad": "1", "ry_rad": "0",
+        "rz_rad": "0"} for row in good()], r"'cov_x_rx' is missing"),
+    "one pose, two joints": (with_cell(5, q2_rad="0.5"),
+        r"row 5: pose 'P1' commands joint 2 to 0.5 rad, row 4 to"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD)
@@ -267,21 +237,17 @@ def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
         read_table(tmp_path / "t.csv", ARM, None)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "the file is empty"),
-        (b"\xef\xbb\xbf \n\n", "the file is empty"),
-        (b"\x00\x01\x02", "binary data"),
-        (b"PK\x03\x04 and so on", "damaged, or not an XLSX file"),
-        ("name,age\n".encode("utf-16"), "not an exchange table"),
-        (b"pose,load\xff\xfe,q1_rad\n", "not UTF-8"),
-        (b"Timestamp;Goal x;Goal y\n2;3;4\n", "separated by ','"),
-        (b"pose;load;q1_rad\na;none;0,1\n", "separated by ','"),
-        (b"name,age\nbob,7\n", "not an exchange table"),
-        (b'pose,load\n"a,none\n', "row 2: not delimited text"),
-    ],
-)
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "the file is empty"),
+    (b"\xef\xbb\xbf \n\n", "the file is empty"),
+    (b"\x00\x01\x02", "binary data"),
+    (b"PK\x03\x04 and so on", "damaged, or not an XLSX file"),
+    ("name,age\n".encode("utf-16"), "not an exchange table"),
+    (b"pose,load\xff\xfe,q1_rad\n", "not UTF-8"),
+    (b"Timestamp;Goal x;Goal y\n2;3;4\n", "separated by ','"),
+    (b"pose;load;q1_rad\na;none;0,1\n", "separated by ','"),
+    (b"name,age\nbob,7\n", "not an exchange table"),
+    (b'pose,load\n"a,none\n', "row 2: not delimited text")])  # fmt: skip
 def test_files_of_another_format(tmp_path, content, message):
     path = tmp_path / "t.csv"
     path.write_bytes(content)

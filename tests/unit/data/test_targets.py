@@ -127,14 +127,11 @@ def test_the_cell_names_its_targets(tmp_path):
 NOISE = TrackerNoise(5e-6, 0.0, 7e-6, 0.0)
 
 
-@pytest.mark.parametrize(
-    ("targets", "rows", "message"),
-    [
-        ((), ("A", "B"), r"column 'target' names 'A', 'B', but the cell has one target"),
-        (NAMES, ("R1", "r2"), r"row 3, column 'target': target 'r2' is .* valid: R1, R2, R3"),
-        (NAMES, ("R1", ""), r"row 3, column 'target': the cell is empty; name the target"),
-    ],
-)
+@pytest.mark.parametrize(("targets", "rows", "message"), [
+    ((), ("A", "B"), r"column 'target' names 'A', 'B', but the cell has one target"),
+    (NAMES, ("R1", "r2"), r"row 3, column 'target': target 'r2' is .* valid: R1, R2, R3"),
+    (NAMES, ("R1", ""), r"row 3, column 'target': the cell is empty; name the target"),
+])  # fmt: skip
 def test_table_and_cell_disagree(tmp_path, targets, rows, message):
     with pytest.raises(InputError, match=message) as raised:
         read_table(table_of(tmp_path / "t.csv", *rows), cell_of().arm, None, targets=targets)
@@ -149,15 +146,11 @@ def test_a_table_without_the_column(tmp_path):
         read_table(path, cell_of().arm, NOISE, targets=NAMES)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
-        ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
-        ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
-        ('name = "R2"', 'nam = "R2"', r'has no key "nam"'),
-    ],
-)
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
+    ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
+    ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
+    ('name = "R2"', 'nam = "R2"', r'has no key "nam"')])  # fmt: skip
 def test_wrong_targets(tmp_path, old, new, message):
     (tmp_path / "cell.toml").write_text(CELL.replace(old, new, 1))
     with pytest.raises(InputError, match=message) as raised:

@@ -106,16 +106,12 @@ def test_what_a_killed_worker_held_is_computed_by_another(tmp_path):
         assert engine.map(refuse, range(2)) == (0, 1)  # nothing of it is left
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        signal.SIGINT,
-        *(
-            pytest.param(kind, marks=pytest.mark.slow)
-            for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
-        ),
-    ],
-)
+@pytest.mark.parametrize("kind", [
+    signal.SIGINT,
+    *(
+        pytest.param(kind, marks=pytest.mark.slow)
+        for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+    )])  # fmt: skip
 def test_a_signal_leaves_no_process_and_no_folder(kind, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],

@@ -169,14 +169,11 @@ def nan_at(table):
     return table.set_column(table.column_names.index("y_m"), "y_m", pa.array(y))
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (nan_at, "row 42, column 'y_m': not a finite number"),
-        (lambda t: t.drop_columns(["q4_rad"]), "column 'q4_rad' is missing"),
-        (lambda t: t.rename_columns([*t.column_names[:-1], "speed"]), "unknown column 'speed'"),
-    ],
-)
+@pytest.mark.parametrize(("damage", "words"), [
+    (nan_at, "row 42, column 'y_m': not a finite number"),
+    (lambda t: t.drop_columns(["q4_rad"]), "column 'q4_rad' is missing"),
+    (lambda t: t.rename_columns([*t.column_names[:-1], "speed"]), "unknown column 'speed'"),
+])  # fmt: skip
 def test_what_cannot_be_read_is_said_in_one_line(capsys, tmp_path, damage, words):
     path = tmp_path / "s.parquet"
     write(path, 300, damage=damage)

@@ -174,17 +174,13 @@ def test_arm_too_weak_is_said():
         scaling_study(np.random.default_rng(0), arm=arm)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"runs": 1}, "runs = 1"),
-        ({"poses": 1}, "poses = 1"),
-        ({"correlations": ()}, "none given"),
-        ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
-        ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
-        ({"correlations": (float("nan"),)}, "correlation nan: must be"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    ({"runs": 1}, "runs = 1"),
+    ({"poses": 1}, "poses = 1"),
+    ({"correlations": ()}, "none given"),
+    ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
+    ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
+    ({"correlations": (float("nan"),)}, "correlation nan: must be")])  # fmt: skip
 def test_wrong_options_are_named(options, message):
     with pytest.raises(InputError, match=message) as caught:
         scaling_study(np.random.default_rng(0), **options)  # type: ignore[arg-type]
