@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import cast
 
 from hilcal import numbers
 from hilcal.calibration.streamed import calibration_of_stream
@@ -114,7 +113,7 @@ def mode_of_option(run: Campaign, asked: str | None) -> Mode:
         return run.mode()
     if asked not in MODES:
         raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
-    return cast(Mode, asked)
+    return asked
 
 
 def scalings(name: str) -> tuple[Scaling, ...]:
