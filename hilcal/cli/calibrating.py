@@ -58,7 +58,7 @@ LONGEST = "2 h"  # How long measuring may last; a choice
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CalibrationOptions:
     """What is wanted of a calibration."""
 
     goal: str | None = None
@@ -86,7 +86,7 @@ class Asked:
         return {key: value for key, value in asked.items() if value is not None}
 
 
-AS_USUAL = Asked()
+AS_USUAL = CalibrationOptions()
 
 
 @command(
@@ -111,7 +111,7 @@ def calibrate(
     cell: Path,
     output: Path,
     resume: bool = False,
-    asked: Asked = AS_USUAL,
+    asked: CalibrationOptions = AS_USUAL,
     rehearse: bool = False,
     yes: bool = False,
     view: bool = False,

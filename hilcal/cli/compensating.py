@@ -53,7 +53,7 @@ class _Task:
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class CompensationOptions:
     """Options of what acts at the points, and how they are reached."""
 
     load: str | None = None
@@ -65,7 +65,7 @@ class Asked:
     leave: bool = False
 
 
-AS_USUAL = Asked()
+AS_USUAL = CompensationOptions()
 
 
 @command(
@@ -92,7 +92,7 @@ def compensate(
     model: Path,
     points: Path,
     output: list[Path] | None = None,
-    asked: Asked = AS_USUAL,
+    asked: CompensationOptions = AS_USUAL,
     revision: int | None = None,
     effects_from: list[Path] | None = None,
     kind: str = "table",
@@ -177,7 +177,7 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
 
 
 def _task(
-    path: Path, calibration: Calibration, asked: Asked, near: Floats | None, kind: str
+    path: Path, calibration: Calibration, asked: CompensationOptions, near: Floats | None, kind: str
 ) -> _Task:
     arm, given = calibration.model.cell.arm, None
     if asked.tool is not None:
@@ -223,7 +223,7 @@ def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
     return replace(task, points=points, waypoints=waypoints)
 
 
-def _wrench(points: Points, calibration: Calibration, asked: Asked) -> Floats | None:
+def _wrench(points: Points, calibration: Calibration, asked: CompensationOptions) -> Floats | None:
     """(6,) or (N, 6) wrench at the points."""
     load, wrench = asked.load, asked.wrench
     if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:

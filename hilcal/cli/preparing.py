@@ -177,7 +177,7 @@ def ports() -> list[str]:
 
 
 @dataclass(frozen=True, slots=True)
-class Question:
+class CellQuestion:
     """One thing that is asked for."""
 
     asked: str  # parameter of the option that gives it without a question
@@ -196,7 +196,7 @@ class Question:
         return needed.get(self.asked, "")
 
 
-def questions() -> list[Question]:
+def questions() -> list[CellQuestion]:
     """Return all that is asked for, in order."""
     trackers, sensors = drivers(devices.TRACKERS), drivers(devices.FORCE_SENSORS)
     written = f"""
@@ -222,7 +222,7 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     not known: sight is not checked
 """
     lines = written.replace("\n    ", " ").strip().splitlines()
-    return [Question(*(part.strip() for part in line.split(" |"))) for line in lines]
+    return [CellQuestion(*(part.strip() for part in line.split(" |"))) for line in lines]
 
 
 @command(
@@ -310,7 +310,7 @@ def _lacking(draft: Draft) -> str:
     return f", once it has {' and '.join(wanted)}" if wanted else ""
 
 
-def _from_option(draft: Draft, question: Question, words: str) -> None:
+def _from_option(draft: Draft, question: CellQuestion, words: str) -> None:
     if question.needs and question.needs not in draft.data:
         raise InputError(
             f"{question.option} without --{question.needs.replace('_', '-')}; give both"
@@ -321,7 +321,7 @@ def _from_option(draft: Draft, question: Question, words: str) -> None:
         raise InputError(f'{question.option} "{words}": {_shortly(error)}') from None
 
 
-def _ask(t: Terminal, draft: Draft, question: Question) -> None:
+def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
     """Ask until the answer is valid, or empty where that means something."""
     if question.needs and question.needs not in draft.data:
         return
