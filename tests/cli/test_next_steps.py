@@ -269,7 +269,7 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
     "cli/looking_up": {"hilcal diagnose RUN.hilcal": f"{HERE}an_effect_of_ones_own"},
     "cli/planning": {
-        "hilcal run {}": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+        "hilcal run {}": "tests/cli/test_next_cli.py::test_the_line_that_next_prints"
     },
     "cli/running": {"Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
         "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until"},
@@ -339,7 +339,7 @@ TAKEN: dict[str, dict[str, str]] = {
         "start hilcal workbench again": f"{PAGE}the_token_is_good_for_one_exchange",
     },
     "workbench/session": {
-        "hilcal run CELL.toml": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+        "hilcal run CELL.toml": "tests/cli/test_next_cli.py::test_the_line_that_next_prints"
     },
     "write_report": {"hilcal info": f"{HERE}what_a_report_names",
         "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command"},

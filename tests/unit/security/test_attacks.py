@@ -22,7 +22,7 @@ from hilcal.store.rows import text_crc
 from hilcal.tables.files import open_grid
 from hilcal.tables.mapping import FileFormat, Mapping, load_mapping
 from tests.support.unguarded import unguarded
-from tests.unit.data.test_file_versions import HASHED, unpacked
+from tests.unit.data.test_campaign import HASHED, unpacked
 
 SHEET = "xl/worksheets/sheet1.xml"
 
