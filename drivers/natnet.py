@@ -18,7 +18,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from hilcal.config import CellConfig
-from hilcal.config.rig import Whole
+from hilcal.config.sections import Whole
 from hilcal.drivers import natnet_frames as nn
 from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError

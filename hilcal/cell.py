@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hilcal.config import STANDARD_GRAVITY_M_S2, CellConfig, load_config
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.errors import InputError
 from hilcal.readings.readings import ObserverName
 from hilcal.robot.arm import Arm
@@ -214,11 +214,7 @@ def cell_from_config(
     """
     robot, tool, tracker = config.robot, config.tool, config.tracker
     arm = load_arm(
-        robot.model,
-        base_dir,
-        base_link=robot.base_link,
-        tip_link=robot.tip_link,
-        text=robot_file,
+        robot.model, base_dir, base_link=robot.base_link, tip_link=robot.tip_link, text=robot_file
     )
     factory = None
     if robot.calibration is not None:

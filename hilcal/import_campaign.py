@@ -18,23 +18,14 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Imported:
-    """What was imported.
+    """What was imported."""
 
-    Attributes:
-        config: of the cell.
-        cell: the cell.
-        readings: as they are stored.
-        noise: its estimate; None where it is stated, or cannot be estimated.
-        parts: what the covariances consist of.
-        notes: one sentence for each decision.
-    """
-
-    config: CellConfig
-    cell: Cell
-    readings: Readings
-    noise: NoiseEstimate | None
-    parts: CovarianceParts
-    notes: tuple[str, ...]
+    config: CellConfig  # of the cell
+    cell: Cell  # the cell
+    readings: Readings  # as they are stored
+    noise: NoiseEstimate | None  # its estimate; None where it is stated, or cannot be estimated
+    parts: CovarianceParts  # what the covariances consist of
+    notes: tuple[str, ...]  # one sentence for each decision
 
 
 def import_campaign(

@@ -92,7 +92,6 @@ def fit_stream(
     Args:
         path: a Parquet file with the columns of the exchange table; `pose` and `load` are not
             needed, each row stands alone.
-        cell: the cell that it was measured in.
         effects: names of effects, besides unknown frames; the baseline's where None.
         prior: what another campaign taught of the arm.
         workers: processes of this machine, one per processor by default.
@@ -127,15 +126,10 @@ def bootstrap(
 
     Args:
         found: the fit whose standard uncertainties are in question; `ratio` compares them.
-        draws: how many.
         seed: of the draws; the result does not depend on the workers.
         workers: processes of this machine; None is one per processor, for scripts that begin with
             `if __name__ == "__main__"`.
         scheduler: address of a Dask cluster in their place.
-
-    Raises:
-        InputError: too few draws.
-        CannotAnswerError: too few poses.
     """
     with open_engine(None if scheduler is not None else workers, scheduler) as engine:
         return bootstraps.bootstrap(found, engine, draws, seed)
@@ -159,8 +153,6 @@ def baseline(
     ('base_frame', 'joint_compliance', 'base_compliance', 'creep')
 
     Args:
-        cell: the cell.
-        data: what is to be fitted.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         catalogue: the effects that a model can have; the installed ones where None.
         prior: what another campaign taught of this arm, from `load_posterior`; its effects are in
@@ -208,8 +200,6 @@ def fit(
     True
 
     Args:
-        model: robot and effects.
-        data: what was measured.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         scaling: "none", "gu" or "gc" (whitened by the full covariance).
         prior: what another campaign taught of this arm, for those effects that the model has in
@@ -281,8 +271,6 @@ def refine(
     [None, 'joint_tilt_compliance']
 
     Args:
-        model: the model to start from.
-        data: what was measured.
         readings: "deflection" or "absolute"; as the cell plans and the data allow where None.
         prior: as for `fit`.
         discover: a folder; a law is then searched where no effect explains the misfit, as by
@@ -370,7 +358,6 @@ def simulate(
     Args:
         cell: the cell, whose `[simulation]` has the strength of what is hidden; or what an earlier
             call returned, for a further campaign of the same arm.
-        plan: what is measured.
         hide: of the first campaign: an effect of `hilcal effects`, "random", "nothing", or
             "invented", a law that the catalogue lacks.
         seed: of everything random; of a further campaign of its noise.
@@ -403,13 +390,6 @@ def view(run: Campaign, port: int = 9877) -> Iterator[str]:
     >>> with hc.Campaign.open(RUN) as run, hc.view(run, port=PORT) as url:
     ...     url
     'rerun+http://127.0.0.1:.../proxy'
-
-    Args:
-        run: the campaign; without a revision the baseline is shown.
-        port: on this machine.
-
-    Raises:
-        InputError: the port is taken, or rerun-sdk is not installed.
     """
     from hilcal.present.viewer import serve
 

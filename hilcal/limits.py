@@ -16,64 +16,37 @@ from typing import Concatenate, ParamSpec, Self, TextIO, TypeVar
 
 from hilcal.errors import InputError
 
-SETTINGS = 1 << 19
-"""Bytes of a TOML file."""
+SETTINGS = 1 << 19  # Bytes of a TOML file
 DOTS = 100
 """Dots in a line of it: the time that its parser takes grows by the square of a key's parts."""
-PROGRAM = 1 << 22
-"""Bytes of a robot's description, a file of effects."""
-SCRIPT = 1 << 21
-"""Bytes of a program of the robot."""
-STATEMENTS = 100_000
-"""Statements of it."""
-STATEMENT = 10_000
-"""Characters of one."""
-BLOCKS = 100
-"""Blocks in each other in which one stands."""
-NESTED = 100
-"""Expressions in each other in one."""
-DOCUMENT = 1 << 25
-"""Bytes of a JSON document: plan, calibration, prior."""
-VALUES = 2_000_000
-"""Values of it: Python takes some 100 bytes for the three of an empty list."""
-TABLE = 1 << 27
-"""Bytes of a table, as text or packed."""
-UNPACKED = 1 << 28
-"""Bytes that a packed table unpacks to."""
-LINE = 1 << 20
-"""Characters of a row of a table."""
-ROWS = 1 << 20
-"""Rows of a table, empty ones included."""
-COLUMNS = 2000
-"""Columns of a table."""
-CELLS = 5_000_000
-"""Cells of a table."""
-SHEETS = 100
-"""Sheets of a workbook."""
-ELEMENTS = 1_000_000
-"""Elements of a part of a workbook that is no sheet, as its texts and styles."""
-DEEP = 50
-"""Elements in each other."""
-DESCRIBED = 500
-"""Joints of a robot's description, fixed ones and those of grippers included."""
-MOVING = 100
-"""Of them those that are not fixed."""
-JOINTS = 32
-"""Joints of an arm."""
-PARAMETERS = 4000
-"""Parameters of a model that a file holds."""
-NUMBERS = 1 << 26
-"""Numbers of an array that a file makes."""
+PROGRAM = 1 << 22  # Bytes of a robot's description, a file of effects
+SCRIPT = 1 << 21  # Bytes of a program of the robot
+STATEMENTS = 100_000  # Statements of it
+STATEMENT = 10_000  # Characters of one
+BLOCKS = 100  # Blocks in each other in which one stands
+NESTED = 100  # Expressions in each other in one
+DOCUMENT = 1 << 25  # Bytes of a JSON document: plan, calibration, prior
+VALUES = 2_000_000  # Values of it: Python takes some 100 bytes for the three of an empty list
+TABLE = 1 << 27  # Bytes of a table, as text or packed
+UNPACKED = 1 << 28  # Bytes that a packed table unpacks to
+LINE = 1 << 20  # Characters of a row of a table
+ROWS = 1 << 20  # Rows of a table, empty ones included
+COLUMNS = 2000  # Columns of a table
+CELLS = 5_000_000  # Cells of a table
+SHEETS = 100  # Sheets of a workbook
+ELEMENTS = 1_000_000  # Elements of a part of a workbook that is no sheet, as its texts and styles
+DEEP = 50  # Elements in each other
+DESCRIBED = 500  # Joints of a robot's description, fixed ones and those of grippers included
+MOVING = 100  # Of them those that are not fixed
+JOINTS = 32  # Joints of an arm
+PARAMETERS = 4000  # Parameters of a model that a file holds
+NUMBERS = 1 << 26  # Numbers of an array that a file makes
 SHARED = 1 << 24
 """Numbers of the joint covariances of readings that share an error, (L m)² for L of m elements."""
-FITTED = 150_000
-"""Readings, times elements, of a campaign: that are fitted together."""
-PLANNED = 20_000
-"""Poses of a plan, and its steps: a week of measuring."""
-MEMORY = 3 << 28
-"""Bytes that reading one file may take beyond what the process has."""
-_KEPT = 1 << 23
-"""Bytes that are given back before anything is done about memory that is short."""
+FITTED = 150_000  # Readings, times elements, of a campaign: that are fitted together
+PLANNED = 20_000  # Poses of a plan, and its steps: a week of measuring
+MEMORY = 3 << 28  # Bytes that reading one file may take beyond what the process has
+_KEPT = 1 << 23  # Bytes that are given back before anything is done about memory that is short
 _ONE = threading.RLock()
 """The limit of memory is the whole process's, so that one thread at a time sets it."""
 P = ParamSpec("P")
@@ -124,11 +97,7 @@ class Lines:
         return self
 
     def __next__(self) -> str:
-        """Return the next line; a row in quotes may have several.
-
-        Raises:
-            InputError: the row is too long.
-        """
+        """Return the next line; a row in quotes may have several."""
         line = self._stream.readline(LINE + 1)
         self._taken += len(line)
         if self._taken > LINE:

@@ -1,13 +1,15 @@
 """Reading TOML into checked sections, with one clear line for whatever is wrong."""
 
 import difflib
+import inspect
 import json
+import re
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
 from pydantic.fields import FieldInfo
@@ -27,10 +29,25 @@ Vector3 = tuple[Number, Number, Number]
 class Section(BaseModel):
     """One section of a file: immutable, finite numbers only, unknown keys refused.
 
-    The description of a field says what is valid; it completes "it must be ...".
+    The description of a field says what is valid; it completes "it must be ...". It is in the
+    class's docstring, as "key: description | example in TOML", with the `WORDS` of the class.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    WORDS: ClassVar[Mapping[str, str]] = {}
+
+    @classmethod
+    def __pydantic_init_subclass__(cls, **kwargs: Any) -> None:
+        """Take what the docstring says of the keys."""
+        for entry in re.split(r"\n(?=\w+: )", inspect.cleandoc(cls.__doc__ or "")):
+            key, _, words = " ".join(entry.split()).partition(": ")
+            if key in cls.__annotations__ and key in cls.model_fields:
+                description, _, example = words.partition(" | ")
+                for name, phrase in cls.WORDS.items():
+                    description = description.replace(name, phrase)
+                field = cls.model_fields[key]
+                field.description = description
+                field.examples = [tomllib.loads(f"x = {example}")["x"]] if example else None
 
 
 S = TypeVar("S", bound=Section)
@@ -46,11 +63,7 @@ def load_section(path: Path, section: type[S]) -> S:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Read a TOML file as a dictionary.
-
-    Raises:
-        InputError: unreadable file, not UTF-8, or a syntax error (names the line).
-    """
+    """Read a TOML file as a dictionary."""
     try:
         text = limits.read_text(path, limits.SETTINGS)
     except FileNotFoundError:
@@ -80,11 +93,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def _check_whole(data: dict[str, Any], where: str) -> None:
-    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones.
-
-    Raises:
-        InputError: one of more than 64 bits.
-    """
+    """Refuse whole numbers that TOML does not have; Python reads them from hexadecimal ones."""
     pending: list[Any] = [data]
     while pending:
         inner = pending.pop()

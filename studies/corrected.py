@@ -32,7 +32,7 @@ from hilcal.cli.calibrating import CalibrationOperator
 from hilcal.cli.options import Json, OneJob, Scheduler, one_by_default
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.config.loads import CellLoad
+from hilcal.config.sections import CellLoad
 from hilcal.drivers.simulated.rehearsal import as_told
 from hilcal.effects.catalogue import installed
 from hilcal.engine.engine import open_engine

@@ -10,8 +10,7 @@ from hilcal.cli.terminal import terminal
 from hilcal.engine.engine import open_engine
 from hilcal.present.progress import counting
 from hilcal.readings.whitening import SCALINGS
-from hilcal.study.scaling import check, experiments, scaling_study
-from hilcal.study.scaling_table import table
+from hilcal.study.scaling import check, experiments, scaling_study, table
 from studies.records import Figure, Keep, keep
 
 

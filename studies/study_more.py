@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.config.loads import CellLoad
+from hilcal.config.sections import CellLoad
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
 from hilcal.diagnosis.diagnosis import Diagnosis

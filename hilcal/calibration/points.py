@@ -43,11 +43,11 @@ from hilcal.tables.columns import (
 )
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable
-from hilcal.tables.guessing.proposal import GUESSED
-from hilcal.tables.guessing.propose import Proposed, propose
-from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import mapped_table
 from hilcal.tables.mapping import FileFormat, PointMapping
+from hilcal.tables.proposal import GUESSED
+from hilcal.tables.propose import Proposed, propose
+from hilcal.tables.sniff import sniff
 from hilcal.tables.units import LENGTHS
 from hilcal.types import Floats
 

@@ -125,8 +125,7 @@ def _version(asked: bool) -> None:
 
 def _top(
     version: Annotated[
-        bool,
-        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     """Calibrate a robot arm: fit, see where the model fails, name and add what is missing."""
@@ -198,37 +197,40 @@ def _run(
     except KeyboardInterrupt:
         return failures.tell(None, "interrupted", _INTERRUPTED)
     except Exception as error:
-        # Usage errors are of the command-line library, which one depends on its version.
         if type(error).__name__ == "NoArgsIsHelpError":
             print(error, file=sys.stderr)
             return _USAGE
-        told = getattr(error, "format_message", None)
-        if told is not None:
-            where = getattr(getattr(error, "ctx", None), "command_path", name)
-            what = str(told()).rstrip(".")
-            hint = f" See {where} -h" if what.endswith("?") else f"; see {where} -h"
-            return failures.tell(error, what + hint, _USAGE)
-        if type(error).__name__ == "Abort":
-            return failures.tell(error, "interrupted", _INTERRUPTED)
-        if isinstance(error, OSError) and error.errno in _FULL:  # output, or a library's cache
-            words = f"{error.filename or 'a file'} cannot be written ({os.strerror(error.errno)})"
-            hint = "make room on the disks of output, program and temporary files"
-            return failures.tell(error, f"{words}: {hint}", DeviceError.exit_code)
-        if isinstance(error, ImportError) and (lacks := _LIBRARY.match(str(error))):
-            package = " (libgomp1 on Debian)" if lacks[1] == "libgomp.so.1" else ""
-            words = f"the system library {lacks[1]} is missing: install its package{package}"
-            return failures.tell(error, words, _USAGE)
-        if words := lacking(error):
-            return failures.tell(error, words, _USAGE)
-        from hilcal.effects.from_file import failure_of  # loads numpy, which takes a while
-
-        if failed := failure_of(error):
-            return failures.tell(error, str(failed), failed.exit_code)
-        words = " ".join(str(error).split())
-        report = (
-            f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)"
-        )
-        return failures.tell(error, report, 1)
+        return failures.tell(error, *_explained(error, name))
     if result == _INTERRUPTED:
         return failures.tell(None, "interrupted", _INTERRUPTED)
     return result if isinstance(result, int) else 0
+
+
+def _explained(error: Exception, name: str) -> tuple[str, int]:
+    """Return what a person should know of an error that is not the program's own, and its code."""
+    # Usage errors are of the command-line library, which one depends on its version.
+    if (message := getattr(error, "format_message", None)) is not None:
+        where = getattr(getattr(error, "ctx", None), "command_path", name)
+        what = str(message()).rstrip(".")
+        return what + (f" See {where} -h" if what.endswith("?") else f"; see {where} -h"), _USAGE
+    if type(error).__name__ == "Abort":
+        return "interrupted", _INTERRUPTED
+    if isinstance(error, OSError) and error.errno in _FULL:  # output, or a library's cache
+        words = f"{error.filename or 'a file'} cannot be written ({os.strerror(error.errno)})"
+        hint = "make room on the disks of output, program and temporary files"
+        return f"{words}: {hint}", DeviceError.exit_code
+    if isinstance(error, ImportError) and (lacks := _LIBRARY.match(str(error))):
+        package = " (libgomp1 on Debian)" if lacks[1] == "libgomp.so.1" else ""
+        words = f"the system library {lacks[1]} is missing: install its package{package}"
+        return words, _USAGE
+    if words := lacking(error):
+        return words, _USAGE
+    from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
+
+    if failed := failure_of(error):
+        return str(failed), failed.exit_code
+    words = " ".join(str(error).split())
+    return (
+        f"unexpected {type(error).__name__}: {words}; please report it ({DEBUG}=1 shows more)",
+        1,
+    )

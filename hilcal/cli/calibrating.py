@@ -5,24 +5,14 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fits import PriorOptions
-from hilcal.cli.options import (
-    POSES,
-    CellFile,
-    EffectsFrom,
-    Json,
-    Prior,
-    View,
-    catalogue_with,
-    option,
-)
+from hilcal.cli.fitting import PriorOptions
+from hilcal.cli.options import POSES, catalogue_with, command
 from hilcal.cli.planning import answers_of, read_cell, refuse_unready
 from hilcal.cli.refining import chapter_of, rows_of
-from hilcal.cli.rehearsing import lasting_cell, to_the_end
-from hilcal.cli.running import measure
+from hilcal.cli.running import lasting_cell, measure, to_the_end
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
 from hilcal.config import CellConfig
@@ -53,11 +43,9 @@ from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
-from hilcal.procedure.decision import Decision
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode
-from hilcal.refinement import Refinement
 from hilcal.store.campaign_file import CampaignFile, may_write
 from hilcal.store.procedure_log import ProcedureLog
 from hilcal.store.run_log import RunLog
@@ -65,104 +53,103 @@ from hilcal.tables.units import parse_duration, parse_length
 
 VALIDATION = 20
 """Poses of a validation campaign; a choice: their mean error is known to a tenth of itself."""
-FITTED_LATER = ("plan", "measure", "refine", "decide")
-"""Steps that a fit may follow."""
-LONGEST = "2 h"
-"""How long measuring may last; a choice."""
+FITTED_LATER = ("plan", "measure", "refine", "decide")  # Steps that a fit may follow
+LONGEST = "2 h"  # How long measuring may last; a choice
 
 
+@dataclass(frozen=True, slots=True)
+class CalibrationOptions:
+    """What is wanted of a calibration."""
+
+    goal: str | None = None
+    limit: str | None = None
+    max_time: str | None = None
+    poses: int | None = None
+    validation: int | None = None
+    prior: Path | None = None
+
+    def settings(self) -> dict[str, Any]:
+        """Return the settings of the procedure that are given."""
+        for name, count in (("--poses", self.poses), ("--validation", self.validation)):
+            if count is not None and count < 1:
+                raise InputError(f"{name} {count}; valid: a whole number from 1")
+        asked = {
+            "goal_m": None if self.goal is None else parse_length(self.goal, "--goal"),
+            "limit_m": None if self.limit is None else parse_length(self.limit, "--limit"),
+            "max_time_s": None
+            if self.max_time is None
+            else parse_duration(self.max_time, "--max-time"),
+            "poses": self.poses,
+            "validation": self.validation,
+            "prior": self.prior and str(self.prior.absolute()),
+        }
+        return {key: value for key, value in asked.items() if value is not None}
+
+
+AS_USUAL = CalibrationOptions()
+
+
+@command(
+    f"""
+    output | -o --output RUN.hilcal | The campaign file; RUN.validation.hilcal and
+        RUN.corrected.hilcal go beside it.
+    resume | --resume | Go on with what RUN.hilcal holds, after any stop.
+    goal | --goal LENGTH | The error of the position that is wanted, e.g. "0.1 mm"; of absolute
+        readings: it is measured on until 95 % of points are predicted to be within it after
+        compensation, as far as that can be had.
+    limit | --limit LENGTH | The largest error allowed at the corrected targets, as measured; exit 5
+        where it is not kept.
+    max_time | --max-time TIME | The longest that measuring to fit may take in all, "{LONGEST}"
+        unless given.
+    poses | --poses | Size of the plan, {POSES} unless given.
+    validation | --validation | Poses of the validation campaign, {VALIDATION} unless given.
+    rehearse | --rehearse | In one simulated cell, from the first to the last.
+    yes | --yes -y | Do not ask before the arm moves; for scripts.
+    """
+)
 def calibrate(
-    cell: CellFile,
-    output: Annotated[
-        Path,
-        option(
-            "-o --output RUN.hilcal",
-            "The campaign file; RUN.validation.hilcal and RUN.corrected.hilcal go beside it.",
-        ),
-    ],
-    resume: Annotated[
-        bool, option("--resume", "Go on with what RUN.hilcal holds, after any stop.")
-    ] = False,
-    goal: Annotated[
-        str | None,
-        option(
-            "--goal LENGTH",
-            'The error of the position that is wanted, e.g. "0.1 mm"; of absolute readings: it '
-            "is measured on until 95 % of points are predicted to be within it after "
-            "compensation, as far as that can be had.",
-        ),
-    ] = None,
-    limit: Annotated[
-        str | None,
-        option(
-            "--limit LENGTH",
-            "The largest error allowed at the corrected targets, as measured; exit 5 where it "
-            "is not kept.",
-        ),
-    ] = None,
-    max_time: Annotated[
-        str | None,
-        option(
-            "--max-time TIME",
-            f'The longest that measuring to fit may take in all, "{LONGEST}" unless given.',
-        ),
-    ] = None,
-    poses: Annotated[
-        int | None, option("--poses", f"Size of the plan, {POSES} unless given.")
-    ] = None,
-    validation: Annotated[
-        int | None,
-        option("--validation", f"Poses of the validation campaign, {VALIDATION} unless given."),
-    ] = None,
-    prior: Prior = None,
-    rehearse: Annotated[
-        bool, option("--rehearse", "In one simulated cell, from the first to the last.")
-    ] = False,
-    yes: Annotated[
-        bool, option("--yes -y", "Do not ask before the arm moves; for scripts.")
-    ] = False,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    output: Path,
+    resume: bool = False,
+    asked: CalibrationOptions = AS_USUAL,
+    rehearse: bool = False,
+    yes: bool = False,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
-    asked = _asked(goal, limit, max_time, poses, validation)
+    settings = asked.settings()
     if config.limits.accuracy_m is not None and not resume:
-        asked.setdefault("limit_m", config.limits.accuracy_m)
-    if prior is not None:
-        asked["prior"] = str(prior.absolute())
+        settings.setdefault("limit_m", config.limits.accuracy_m)
     on = ["hilcal", "calibrate", str(cell), "-o", str(output)]
     more = ["--rehearse"] * rehearse + ["--yes"] * yes + ["--view"] * view
-    if prior is not None:
-        more += ["--prior", str(prior)]
-    for path in effects_from or ():
-        more += ["--effects-from", str(path)]
-    told = _Continuation(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
-    p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, asked, told)
+    more += [] if asked.prior is None else ["--prior", str(asked.prior)]
+    more += [word for path in effects_from or () for word in ("--effects-from", str(path))]
+    go_on = _Continuation(t, shlex.join([*on, "--resume", *more]), shlex.join([*on, *more]))
+    p = _procedure(cell, output, resume, rehearse, config, numbers, catalogue, settings, go_on)
     kept = p.settings.prior
-    if kept is not None and prior is None and Path(kept).parent != output.absolute().parent:
+    if kept is not None and asked.prior is None and Path(kept).parent != output.absolute().parent:
         raise InputError(
             f"{output}: its prior is {kept!r}, and no file elsewhere is read because a campaign "
             f"names it; give it yourself: --prior {quoted(kept)}"
         )
-    if p.settings.prior is not None and p.next().kind in FITTED_LATER:
-        known = PriorOptions(Path(p.settings.prior), "arm", None).load(catalogue)
-        p = replace(p, known=known)
+    if kept is not None and p.next().kind in FITTED_LATER:
+        p = replace(p, known=PriorOptions(Path(kept)).load(catalogue))
     if not (yes or rehearse or somebody_there(t)) and p.next().kind != "done":
         raise InputError(
             "nobody can be asked before the arm moves; give --yes, or run it at a terminal"
         )
-    with told.how_to_go_on(p), ExitStack() as stack:
+    with go_on.told(p), ExitStack() as stack:
         live = stack.enter_context(followed(t, view, output))
         CalibrationOperator(t, p, stack, rehearse, yes, live).to_the_end()
         with working(t.progress) as say:
             found = p.compare(say)
-    limit_m = p.settings.limit_m
+    limit_m, files = p.settings.limit_m, p.files
     t.show(step_heading(ProcedureStep("compare", output)))
     t.show(improvement_report(found, limit_m))
-    files = p.files
     t.show(
         f"\nThe calibration is in {output}, its test in {files.validation.name} and "
         f"{files.corrected.name}. Correct your points and programs with:"
@@ -178,26 +165,6 @@ def calibrate(
     t.document({**_document(p), "improvement": found.to_dict(), "limit_m": limit_m}, failed)
 
 
-def _asked(
-    goal: str | None,
-    limit: str | None,
-    max_time: str | None,
-    poses: int | None,
-    validation: int | None,
-) -> dict[str, Any]:
-    for name, count in (("--poses", poses), ("--validation", validation)):
-        if count is not None and count < 1:
-            raise InputError(f"{name} {count}; valid: a whole number from 1")
-    asked = {
-        "goal_m": None if goal is None else parse_length(goal, "--goal"),
-        "limit_m": None if limit is None else parse_length(limit, "--limit"),
-        "max_time_s": None if max_time is None else parse_duration(max_time, "--max-time"),
-        "poses": poses,
-        "validation": validation,
-    }
-    return {key: value for key, value in asked.items() if value is not None}
-
-
 @dataclass(frozen=True, slots=True)
 class _Continuation:
     """How an interrupted calibration is continued, for people."""
@@ -207,7 +174,7 @@ class _Continuation:
     again: str  # the command that begins
 
     @contextmanager
-    def how_to_go_on(self, p: Procedure) -> Iterator[None]:
+    def told(self, p: Procedure) -> Iterator[None]:
         """Let whatever ends the command early say what is safe, and the line that goes on."""
 
         def safe() -> str:
@@ -236,7 +203,7 @@ def _procedure(
     cell: Cell,
     catalogue: Catalogue,
     asked: dict[str, Any],
-    told: _Continuation,
+    go_on: _Continuation,
 ) -> Procedure:
     """Begin a calibration, or take it up from its file."""
     hide = (config.simulation.hide or NOTHING) if rehearse else None
@@ -248,7 +215,7 @@ def _procedure(
         may_write(output, False)
         check_effects(cell, config, catalogue)
         if resume:
-            told.t.notice(f"{output} is not there yet: the calibration begins")
+            go_on.t.notice(f"{output} is not there yet: the calibration begins")
         _refuse_goal(config.fitted, asked, path)
         seed = config.simulation.seed
         usual = Settings(POSES, VALIDATION, parse_duration(LONGEST, "--max-time"), seed=seed)
@@ -261,14 +228,13 @@ def _procedure(
         what = "no rehearsal; leave --rehearse out" if rehearse else "a rehearsal; give --rehearse"
         raise InputError(f"{output}: its calibration is {what}")
     if not resume:
-        raise InputError(
-            f"{output}: a calibration is there already, {standing(p.next())}; go on with: {told.on}"
-        )
+        there = f"{output}: a calibration is there already, {standing(p.next())}"
+        raise InputError(f"{there}; go on with: {go_on.on}")
     _refuse_goal(p.settings.readings, asked, path)
     p = replace(p, settings=replace(p.settings, **asked))
     with CampaignFile.open(output) as campaign:
         p.resume(campaign)
-    told.t.notice(f"{output}: a calibration, {standing(p.next())}")
+    go_on.t.notice(f"{output}: a calibration, {standing(p.next())}")
     return p
 
 
@@ -301,116 +267,92 @@ def _document(p: Procedure) -> dict[str, object]:
     }
 
 
+@dataclass(slots=True)
 class CalibrationOperator:
     """Does one step after the other, and asks before the arm moves."""
 
-    def __init__(
-        self,
-        t: Terminal,
-        p: Procedure,
-        stack: ExitStack,
-        rehearse: bool,
-        yes: bool,
-        viewer: LiveViewer | None = None,
-    ) -> None:
-        """Nothing is connected yet."""
-        self._viewer = viewer
-        self._t, self._p, self._stack = t, p, stack
-        self._rehearse, self._yes = rehearse, yes
-        self._clock = p.config.simulation.clock if rehearse else 1.0
-        self._simulated: CellConfig | None = None
-        self._ready = False
+    t: Terminal
+    p: Procedure
+    stack: ExitStack
+    rehearse: bool
+    yes: bool
+    viewer: LiveViewer | None = None
+    simulated: CellConfig | None = None  # of simulated devices, once they are there
+    ready: bool = False  # whether every device has said so
+
+    @property
+    def clock(self) -> float:
+        """How much faster than real time the cell goes."""
+        return self.p.config.simulation.clock if self.rehearse else 1.0
 
     def to_the_end(self) -> None:
-        """Do all steps that are left but the comparison.
-
-        Raises:
-            StoppedError: somebody does not want the arm to move.
-        """
-        while (step := self._p.next()).kind not in ("done", "compare"):
-            self._t.show(step_heading(step, self._clock))
+        """Do all steps that are left but the comparison."""
+        while (step := self.p.next()).kind not in ("done", "compare"):
+            self.t.show(step_heading(step, self.clock))
             if step.moves:
                 self._moving(step)
             else:
                 self._computing(step)
 
     def _moving(self, step: ProcedureStep) -> None:
-        self._check()
-        if not self._yes and somebody_there(self._t):
-            what = "The simulated arm will move." if self._rehearse else "The arm will move."
-            if not agreed(self._t, f"Measure now? {what}"):
+        if not self.ready and not self.rehearse:  # every device is asked once
+            answers = with_kinematics(answers_of(self.t, self.p.config), self.p.cell)
+            for a in answers:
+                name = "no answer" if a.report is None else a.report.name
+                self.t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
+            refuse_unready(answers)
+            self.ready = True
+        if not self.yes and somebody_there(self.t):
+            what = "The simulated arm will move." if self.rehearse else "The arm will move."
+            if not agreed(self.t, f"Measure now? {what}"):
                 raise StoppedError("not measured, nothing has moved")
         config = self._config()
 
         def work(campaign: CampaignFile, epoch: float | None) -> None:
-            measure(self._t, config, self._p.cell, campaign, epoch=epoch, viewer=self._viewer)
+            measure(self.t, config, self.p.cell, campaign, epoch=epoch, viewer=self.viewer)
 
-        def whole() -> None:
-            self._p.measure(step, work)
-
-        if self._rehearse:
-            to_the_end(self._t, whole, lambda: _count(step.path))
+        if self.rehearse:
+            to_the_end(self.t, lambda: self.p.measure(step, work), lambda: _count(step.path))
         else:
-            whole()
+            self.p.measure(step, work)
 
     def _config(self) -> CellConfig:
         """Return the configuration that leads to the devices; starts simulated ones."""
-        if not self._rehearse:
-            return self._p.config
-        if self._simulated is None:
-            with working(self._t.progress) as say:
+        if not self.rehearse:
+            return self.p.config
+        if self.simulated is None:
+            with working(self.t.progress) as say:
                 say("starting the simulated devices")
-                self._simulated = self._stack.enter_context(lasting_cell(self._p))
-        return self._simulated
-
-    def _check(self) -> None:
-        """Ask every device once whether it is ready; nothing moves."""
-        if self._ready or self._rehearse:
-            return
-        answers = with_kinematics(answers_of(self._t, self._p.config), self._p.cell)
-        for a in answers:
-            name = "no answer" if a.report is None else a.report.name
-            self._t.show(f"{a.device}: {name}, {'; '.join(a.problems) or 'ready'}")
-        refuse_unready(answers)
-        self._ready = True
+                self.simulated = self.stack.enter_context(lasting_cell(self.p))
+        return self.simulated
 
     def _computing(self, step: ProcedureStep) -> None:
         """Do a step in which nothing moves, and say what came of it."""
-        p, t = self._p, self._t
+        p, t, viewer = self.p, self.t, self.viewer
         if step.kind == "plan":
             with working(t.progress) as say:
                 made = p.plan(say)
             t.show(plan_facts(made.summary))
             p.begin(made.plan, p.config)
             return
-        viewer = self._viewer
+        found: Any
         with working(t.progress) as say:
             if step.kind == "refine" and viewer is not None:
-                found: object = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
+                found = p.refine(say, lambda n, s: viewer.revised(chapter_of(n, s)))
             else:
                 found = p.compute(step, say)
-        self._say(step.kind, found)
-
-    def _say(self, kind: str, found: Any) -> None:
-        t = self._t
-        if kind == "refine":
-            _say_refined(t, self._p, found)
-        elif kind == "decide":
-            decided: Decision = found
-            of = self._p.settings
-            report = decision_report(decided, of.goal_m, of.readings, self._clock)
-            t.show(report)
-        elif kind == "validate":
+        if step.kind == "refine":
+            with CampaignFile.open(p.run, read_only=True) as campaign:
+                refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
+            rows = rows_of(refined["revisions"], found.steps)
+            t.show(revisions_table([r.shown for r in rows]))
+            t.show([key(found.fit.readings), verdict_line(found.diagnosis), ""])
+            t.show(prior_lines(found.fit))
+        elif step.kind == "decide":
+            of = p.settings
+            t.show(decision_report(found, of.goal_m, of.readings, self.clock))
+        elif step.kind == "validate":
             t.show(validation_lines(found))
-
-
-def _say_refined(t: Terminal, p: Procedure, found: Refinement) -> None:
-    with CampaignFile.open(p.run, read_only=True) as campaign:
-        refined = ProcedureLog(campaign).last(REFINED) or {"revisions": []}
-    rows = rows_of(refined["revisions"], found.steps)
-    t.show(revisions_table([r.shown for r in rows]))
-    t.show([key(found.fit.readings), verdict_line(found.diagnosis), ""])
-    t.show(prior_lines(found.fit))
 
 
 def _count(path: Path) -> int:

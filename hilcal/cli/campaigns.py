@@ -1,31 +1,201 @@
-"""`info`, `accept`, `repair` and `fleet`: what campaigns hold, and which revisions are used."""
+"""`import`, `info`, `accept`, `repair`, `fleet`: campaign files, and which revision is used."""
 
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import Any
+
+import numpy as np
 
 from hilcal.campaign.campaign import estimated_noise
-from hilcal.cell import cell_from_config
-from hilcal.cli.options import Json, Record, Run, Scheduler, Workers, argument, option
-from hilcal.cli.terminal import terminal
-from hilcal.errors import InputError
+from hilcal.cell import Cell, cell_from_config
+from hilcal.cli.options import check_new, command
+from hilcal.cli.terminal import Terminal, terminal
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.full_covariance import covariance_parts
+from hilcal.identification.misdescription import examine, other_arm
+from hilcal.identification.registration import Registration, register
+from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
+from hilcal.import_campaign import import_campaign
 from hilcal.names import quoted
 from hilcal.present.campaign import info_report
-from hilcal.present.fit import model_name
-from hilcal.present.progress import counting
-from hilcal.present.registration import covariance_words, torque_lines
+from hilcal.present.document import Words, heading
+from hilcal.present.fit import model_name, target_words
+from hilcal.present.preparing import import_preview
+from hilcal.present.progress import counting, working
+from hilcal.present.registration import (
+    covariance_words,
+    observed_words,
+    other_arm_line,
+    registration_lines,
+    torque_lines,
+)
 from hilcal.readings.covariance import COVERS
+from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.robot_file import ROBOT_FILE
+from hilcal.tables.proposal import Proposal
+from hilcal.whole_file import replace_file
 
 
-def info(run: Run, as_json: Json = False) -> None:
+@command(
+    """
+    table | TABLE | What was measured.
+    config | --config CELL.toml | The cell it was measured in.
+    output | -o --output RUN.hilcal | The campaign file to make; with --preview, the mapping file.
+    kind | --format FORMAT | table, ipa-ur10, a mapping that comes with the program, or a mapping
+        file.
+    second | --second TABLE | The second file, e.g. of the joints.
+    preview | --preview | Show how the table could be read; make no campaign.
+    """
+)
+def import_(
+    table: Path,
+    config: Path | None = None,
+    output: Path | None = None,
+    kind: str = "table",
+    second: Path | None = None,
+    preview: bool = False,
+    force: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Make a campaign file from a table of readings."""
+    t = terminal(as_json)
+    if preview:
+        if kind != "table":
+            raise InputError(f"--preview proposes a mapping; leave out --format {kind}")
+        show_preview(t, table, second, config, output, force)
+        return
+    if config is None or output is None:
+        what = "--config CELL.toml" if config is None else "-o RUN.hilcal"
+        raise InputError(f"{what} is missing; without it only --preview is possible")
+    with working(t.progress) as say:
+        found = import_campaign(table, config, output, kind, second, overwrite=force, say=say)
+    readings, settings, cell, noise = found.readings, found.config, found.cell, found.noise
+    notes = (*found.notes, covariance_words(found.parts, noise), *cell.arm.notes)
+    loads = [readings.load_names[k] for k in np.unique(readings.load)]
+    poses = len(np.unique(readings.pose))
+    t.show(heading(f"{len(readings)} readings of {poses} poses"))
+    t.show(f"  robot {settings.robot.model}; {_kind(readings)}\n  loads: {', '.join(loads)}")
+    targets = _targets(cell, readings)
+    if targets:
+        t.show("  targets: " + "; ".join(target_words(**x) for x in targets))
+    t.show(Words(note, indent=2) for note in notes)
+    torques = check_torques(cell, readings)
+    t.show(Words(line, indent=2) for line in torque_lines(torques))
+    registered = _registered(cell, readings)
+    wrong = None if registered is None else examine(registered, readings)
+    if registered is not None and not (wrong is not None and wrong.refused):
+        t.show(Words(line, indent=2) for line in registration_lines(registered))
+    refused = wrong is not None and wrong.refused
+    other = None if registered is None or refused else other_arm(registered, readings)
+    if other is not None:
+        t.show(Words(f"Note: {other_arm_line(other)}", indent=2))
+    if wrong is not None:
+        said = wrong.words(cell, readings)
+        begin = "Nothing can be fitted yet" if wrong.refused else "Note"
+        t.show(Words(f"{begin}: {said}.", indent=2))
+    t.document(
+        {
+            "campaign": str(output),
+            "robot": settings.robot.model,
+            "n_readings": len(readings),
+            "n_poses": poses,
+            "elements": readings.m,
+            "loads": loads,
+            "targets": targets,
+            "observers": [str(name) for name in readings.observers],
+            "covariance": found.parts,
+            "noise": None if noise is None else asdict(noise),
+            "notes": list(notes),
+            "description": None if wrong is None else wrong.to_json(cell, readings),
+            "other_arm": None if other is None else other.to_json(),
+            "torques": None if torques is None else torques.to_json(),
+            "frames": None if registered is None else registered.to_json(),
+        }
+    )
+
+
+def _kind(readings: Readings) -> str:
+    if readings.observers:
+        return observed_words(readings)
+    return f"each reading is a position{'' if readings.m == 3 else ' and an orientation'}"
+
+
+def _registered(cell: Cell, readings: Readings) -> Registration | None:
+    """Return the registration; None where the readings do not determine it."""
+    try:
+        return register(cell, readings)
+    except CannotAnswerError:
+        return None
+
+
+def _targets(cell: Cell, readings: Readings) -> list[dict[str, Any]]:
+    """Name, number of readings and whether the offset is known, of several targets."""
+    if readings.states.target is None:
+        return []
+    count = np.bincount(readings.target, minlength=len(readings.target_names))
+    known = cell.known_targets
+    return [
+        {"name": name, "n_readings": int(count[k]), "known": known[k]}
+        for k, name in enumerate(readings.target_names)
+    ]
+
+
+def show_preview(
+    t: Terminal, table: Path, second: Path | None, config: Path | None, output: Path | None,
+    force: bool,
+) -> None:  # fmt: skip
+    """Print what a table seems to hold; write the mapping file where one is asked for."""
+    if output is not None and output.suffix != ".toml":
+        raise InputError(f"-o {output}: --preview writes a mapping file; name it like mapping.toml")
+    if output is not None:
+        check_new(output, force)
+    found = preview_table(table, None if config is None else Cell.load(config), second)
+    proposal, outcome = found.proposal, found.outcome
+    t.show(import_preview(proposal, found.rows, table.name))
+    if outcome:
+        t.show(heading("with this mapping:"))
+        t.show(Words(words, indent=2) for words in outcome)
+    if output is not None:
+        if second is not None:
+            _relative_second(proposal, output)
+        replace_file(output, proposal.to_toml(table.name))
+        t.notice(f"{output}: the mapping; import with --format {output}")
+    else:
+        t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
+    t.document(
+        {
+            "mapping": proposal.sections,
+            "understood": [
+                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+                for u in proposal.understood
+            ],
+            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
+            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
+            "missing": proposal.lacking,
+            "outcome": outcome,
+            "written": None if output is None else str(output),
+        }
+    )
+
+
+def _relative_second(proposal: Proposal, output: Path) -> None:
+    """Write the second file's path relative to the mapping file."""
+    section = proposal.sections["second_file"]
+    section["path"] = str(Path(section["path"]).absolute())
+    here = output.absolute().parent
+    if Path(section["path"]).is_relative_to(here):
+        section["path"] = str(Path(section["path"]).relative_to(here))
+
+
+@command()
+def info(run: Path, as_json: bool = False) -> None:
     """Say what a campaign holds: readings, instruments, drift, events, revisions."""
     t = terminal(as_json)
     with CampaignFile.open(run, read_only=True) as file:
@@ -40,15 +210,14 @@ def info(run: Run, as_json: Json = False) -> None:
     t.document({**to_json(found, str(run), parts), **more})
 
 
+@command(
+    """
+    number | N | The revision; the latest one if left out.
+    release | --release | Accept none: the latest one is used again.
+    """
+)
 def accept(
-    run: Run,
-    number: Annotated[
-        int | None, argument("N", "The revision; the latest one if left out.")
-    ] = None,
-    release: Annotated[
-        bool, option("--release", "Accept none: the latest one is used again.")
-    ] = False,
-    as_json: Json = False,
+    run: Path, number: int | None = None, release: bool = False, as_json: bool = False
 ) -> None:
     """Choose the revision that every command uses from now on, whatever is added later."""
     t = terminal(as_json)
@@ -77,16 +246,12 @@ def accept(
     )
 
 
-def repair(
-    run: Run,
-    robot: Annotated[
-        Path | None,
-        option(
-            "--robot FILE", "URDF or DH table of its robot, for a campaign that does not hold it."
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
+    """
+)
+def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
     done = repaired(run)
@@ -112,18 +277,25 @@ def _named(record: RevisionRecord) -> str:
     return f"revision {record.number} ({model_name(record.effects)})"
 
 
+@command(
+    """
+    directory | DIR | With campaign files, in folders below as well.
+    out | -o PRIOR.json | What to expect of another arm.
+    report | --report F.html | Write it as one HTML page.
+    """
+)
 def fleet(
-    directory: Annotated[Path, argument("DIR", "With campaign files, in folders below as well.")],
-    out: Annotated[Path, option("-o PRIOR.json", "What to expect of another arm.")],
-    report: Annotated[Path | None, option("--report F.html", "Write it as one HTML page.")] = None,
-    record: Record = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
+    directory: Path,
+    out: Path,
+    report: Path | None = None,
+    record: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: bool = False,
 ) -> None:
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # loads all that is fitted and shown
-    from hilcal.cli.fits import check_record
+    from hilcal.cli.fitting import check_record
     from hilcal.cli.showing import opening
     from hilcal.engine.engine import open_engine
     from hilcal.identification.posterior_document import write

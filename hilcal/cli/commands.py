@@ -7,6 +7,62 @@ from typing import Any
 
 from typer.core import TyperGroup
 
+_LISTED = """
+Try it:
+demo | demo | Rehearse the whole story on a simulated cell, through real drivers and wires.
+simulate | running
+    | Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.
+All in one:
+calibrate | calibrating
+    | Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain.
+Prepare:
+init | preparing | Write a commented CELL.toml: asks at a terminal, else takes the options.
+config | looking_up | Explain the sections and keys of CELL.toml: unit, default, example.
+check | planning | Connect to every device and report its state; nothing moves without --factory.
+plan | planning
+    | Choose poses, loads and their order, with a proof of how near to the best they are.
+Measure:
+run | running
+    | Measure a campaign: every step of the plan, each reading stored before the next motion.
+import | campaigns | Make a campaign file from a table of readings.
+info | campaigns | Say what a campaign holds: readings, instruments, drift, events, revisions.
+repair | campaigns
+    | Open a campaign again that a bad revision closes: it is set aside, no reading is.
+Fit, and find what is missing:
+identify | fitting | Fit a model to the readings, and keep it as a revision.
+compare | comparing
+    | Show where the model fails; with a later campaign, what has changed on the arm.
+diagnose | refining | Say which effect the model lacks.
+add | refining | Add an effect to the model: error before and after.
+remove | refining | Take an effect out of the model: error before and after.
+refine | refining | Diagnose and add until the model is adequate.
+discover | refining | Search a law for what no effect explains, and write it as an effect.
+next | planning
+    | Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.
+bootstrap | fitting
+    | Draw the poses again, refit, and compare the scatter with the stated uncertainties.
+workbench | showing
+    | Compare, add, remove, change the cell, measure next on one page of this machine alone.
+Many arms:
+fleet | campaigns | Pool many campaigns: a prior for other arms, arms unlike their type, drift.
+Use the result:
+validate | comparing | Predict readings of another campaign with the model.
+compensate | compensating
+    | Find the joint values that put the tool where it was asked to be, under a load.
+accept | campaigns
+    | Choose the revision that every command uses from now on, whatever is added later.
+report | showing
+    | Write the whole story as one HTML page, a certificate first; it prints on six pages.
+view | showing | Tell the story of the revisions in rerun.
+export | exporting | Hand over: readings, parameters, calibration, URDF, DH, frames.
+Look up:
+effects | looking_up | List the effects that a model can have; `new` begins one of your own.
+study | | Studies of the program's own mathematics.
+doctor | preparing
+    | Look at packages, ports, permissions, network, clock and disk of this computer.
+"""
+"""Name, module and summary of each command, in the order of the work."""
+
 
 @dataclass(frozen=True, slots=True)
 class Command:
@@ -25,126 +81,29 @@ def load(place: str) -> Callable[..., Any]:
     return found
 
 
-SECTIONS = {
-    "Try it": ("demo", "simulate"),
-    "All in one": ("calibrate",),
-    "Prepare": ("init", "config", "check", "plan"),
-    "Measure": ("run", "import", "info", "repair"),
-    "Fit, and find what is missing": (
-        *("identify", "compare", "diagnose", "add", "remove", "refine", "discover", "next"),
-        *("bootstrap", "workbench"),
-    ),
-    "Many arms": ("fleet",),
-    "Use the result": ("validate", "compensate", "accept", "report", "view", "export"),
-    "Look up": ("effects", "study", "doctor"),
-}
-"""The commands in the order of the work, as `hilcal --help` lists them."""
-
-COMMANDS = {
-    "demo": Command(
-        "demo:demo", "Rehearse the whole story on a simulated cell, through real drivers and wires."
-    ),
-    "calibrate": Command(
-        "calibrating:calibrate",
-        "Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain.",
-    ),
-    "simulate": Command(
-        "rehearsing:simulate",
-        "Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to.",
-    ),
-    "init": Command(
-        "init:init", "Write a commented CELL.toml: asks at a terminal, else takes the options."
-    ),
-    "config": Command(
-        "looking_up:config", "Explain the sections and keys of CELL.toml: unit, default, example."
-    ),
-    "check": Command(
-        "planning:check",
-        "Connect to every device and report its state; nothing moves without --factory.",
-    ),
-    "plan": Command(
-        "planning:plan",
-        "Choose poses, loads and their order, with a proof of how near to the best they are.",
-    ),
-    "run": Command(
-        "running:run",
-        "Measure a campaign: every step of the plan, each reading stored before the next motion.",
-    ),
-    "import": Command("tables:import_", "Make a campaign file from a table of readings."),
-    "info": Command(
-        "campaigns:info",
-        "Say what a campaign holds: readings, instruments, drift, events, revisions.",
-    ),
-    "repair": Command(
-        "campaigns:repair",
-        "Open a campaign again that a bad revision closes: it is set aside, no reading is.",
-    ),
-    "identify": Command(
-        "fitting:identify", "Fit a model to the readings, and keep it as a revision."
-    ),
-    "compare": Command(
-        "comparing:compare",
-        "Show where the model fails; with a later campaign, what has changed on the arm.",
-    ),
-    "diagnose": Command("refining:diagnose", "Say which effect the model lacks."),
-    "add": Command("refining:add", "Add an effect to the model: error before and after."),
-    "remove": Command(
-        "refining:remove", "Take an effect out of the model: error before and after."
-    ),
-    "refine": Command("refining:refine", "Diagnose and add until the model is adequate."),
-    "discover": Command(
-        "discovering:discover",
-        "Search a law for what no effect explains, and write it as an effect.",
-    ),
-    "next": Command(
-        "planning:next_",
-        "Plan the measurements that separate the leading suspects; exit 4 where none are in doubt.",
-    ),
-    "bootstrap": Command(
-        "fitting:bootstrap",
-        "Draw the poses again, refit, and compare the scatter with the stated uncertainties.",
-    ),
-    "fleet": Command(
-        "campaigns:fleet",
-        "Pool many campaigns: a prior for other arms, arms unlike their type, drift.",
-    ),
-    "validate": Command(
-        "comparing:validate", "Predict readings of another campaign with the model."
-    ),
-    "compensate": Command(
-        "compensating:compensate",
-        "Find the joint values that put the tool where it was asked to be, under a load.",
-    ),
-    "accept": Command(
-        "campaigns:accept",
-        "Choose the revision that every command uses from now on, whatever is added later.",
-    ),
-    "report": Command(
-        "showing:report",
-        "Write the whole story as one HTML page, a certificate first; it prints on six pages.",
-    ),
-    "view": Command("showing:view", "Tell the story of the revisions in rerun."),
-    "workbench": Command(
-        "showing:workbench",
-        "Compare, add, remove, change the cell, measure next on one page of this machine alone.",
-    ),
-    "export": Command(
-        "exporting:export", "Hand over: readings, parameters, calibration, URDF, DH, frames."
-    ),
-    "effects": Command(
-        "looking_up:effects",
-        "List the effects that a model can have; `new` begins one of your own.",
-        (("new", "looking_up:new"),),
-    ),
-    "doctor": Command(
-        "doctor:doctor",
-        "Look at packages, ports, permissions, network, clock and disk of this computer.",
-    ),
-    "study": Command(
-        "", "Studies of the program's own mathematics.", (("scaling", "looking_up:scaling"),)
-    ),
+_SUBCOMMANDS = {
+    "effects": (("new", "looking_up:new"),),
+    "study": (("scaling", "looking_up:scaling"),),
 }
 
+
+def _read() -> tuple[dict[str, Command], dict[str, tuple[str, ...]]]:
+    """Return the commands by name, and their names by section."""
+    commands: dict[str, Command] = {}
+    sections: dict[str, tuple[str, ...]] = {}
+    for line in _LISTED.replace("\n    |", " |").strip().splitlines():
+        if line.endswith(":"):
+            section = line[:-1]
+            continue
+        name, module, summary = (part.strip() for part in line.split(" |"))
+        function = {"import": "import_", "next": "next_"}.get(name, name)
+        place = f"{module}:{function}" if module else ""
+        commands[name] = Command(place, summary, _SUBCOMMANDS.get(name, ()))
+        sections[section] = (*sections.get(section, ()), name)
+    return commands, sections
+
+
+COMMANDS, SECTIONS = _read()
 
 EXIT_CODES = (
     "Exit codes: 0 done; 2 wrong input; 3 a device failed; 4 the data cannot answer the question; "
@@ -167,20 +126,19 @@ class CommandGroup(TyperGroup):
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the commands, under headings where there are any."""
         names = self.list_commands(ctx)
-        listed = {name for section in self.sections.values() for name in section}
-        rest = tuple(name for name in names if name not in listed)
+        rest = tuple(set(names).difference(*self.sections.values()))
         widest = max(map(len, names))
-        for title, section in {**self.sections, "Commands": rest}.items():
-            rows = [
-                (name.ljust(widest), self._summary(ctx, name)) for name in section if name in names
-            ]
-            if rows:
+        for title, section in {**self.sections, "Commands": sorted(rest)}.items():
+            known = [(name, self.get_command(ctx, name)) for name in section if name in names]
+            summaries = [str(getattr(c, "help", None) or "").strip() for _, c in known]
+            if known:
                 with formatter.section(title):
-                    formatter.write_dl(rows)
-
-    def _summary(self, ctx: Any, name: str) -> str:
-        command = self.get_command(ctx, name)
-        return str(getattr(command, "help", None) or "").strip().split("\n\n")[0]
+                    formatter.write_dl(
+                        [
+                            (name.ljust(widest), words.split("\n\n")[0])
+                            for (name, _), words in zip(known, summaries, strict=True)
+                        ]
+                    )
 
 
 class InOrderOfWork(CommandGroup):

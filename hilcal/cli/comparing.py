@@ -2,11 +2,10 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.fits import called, finish, fit_of, record_of, titles
-from hilcal.cli.options import EffectsFrom, Json, Revision, Run, argument, catalogue_with, option
+from hilcal.cli.fitting import called, finish, fit_of, record_of, titles
+from hilcal.cli.options import catalogue_with, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.effects.catalogue import Catalogue
@@ -26,37 +25,27 @@ from hilcal.present.fit import (
     worst_table,
 )
 from hilcal.present.progress import working
-from hilcal.present.validation import (
-    opening,
-    shares_report,
-    validation_failure,
-    validation_report,
-)
+from hilcal.present.validation import opening, shares_report, validation_failure, validation_report
 from hilcal.tables.units import parse_length
 from hilcal.transfer.compare import compare as compare_campaigns
 from hilcal.validation import validate as validate_campaign
 
 
+@command(
+    """
+    later | [LATER.hilcal] | A later campaign of the same arm, of 15 readings or more: what has
+        changed?
+    same_setup | --same-setup | With LATER: tracker and base stand as they did; else the tracker's
+        place is estimated from the later readings.
+    """
+)
 def compare(
-    run: Run,
-    later: Annotated[
-        Path | None,
-        argument(
-            "[LATER.hilcal]",
-            "A later campaign of the same arm, of 15 readings or more: what has changed?",
-        ),
-    ] = None,
-    same_setup: Annotated[
-        bool,
-        option(
-            "--same-setup",
-            "With LATER: tracker and base stand as they did; else the tracker's place is "
-            "estimated from the later readings.",
-        ),
-    ] = False,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    later: Path | None = None,
+    same_setup: bool = False,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Show where the model fails; with a later campaign, what has changed on the arm."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -122,22 +111,22 @@ OVER = 5.0
 """Errors in units of the noise from which another place of the tracker is suspected; a guess."""
 
 
+@command(
+    """
+    other | OTHER.hilcal | A campaign that was never fitted.
+    register | --register | The tracker was set up anew: fit its place first.
+    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it
+        is not kept.
+    """
+)
 def validate(
-    run: Run,
-    other: Annotated[Path, argument("OTHER.hilcal", "A campaign that was never fitted.")],
-    register: Annotated[
-        bool, option("--register", "The tracker was set up anew: fit its place first.")
-    ] = False,
-    limit: Annotated[
-        str | None,
-        option(
-            "--limit LENGTH",
-            'The largest 3-D position error allowed, e.g. "0.1 mm"; exit 5 where it is not kept.',
-        ),
-    ] = None,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    other: Path,
+    register: bool = False,
+    limit: str | None = None,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Predict readings of another campaign with the model."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -15,34 +14,15 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compensated import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
-from hilcal.calibration.urscript import (
-    JOINTS,
-    Waypoint,
-    movej_program,
-    program_points,
-    with_joints,
-)
+from hilcal.calibration.urscript import JOINTS, Waypoint, movej_program, program_points, with_joints
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    Revision,
-    argument,
-    catalogue_with,
-    check_new,
-    option,
-)
-from hilcal.cli.terminal import Terminal, terminal
+from hilcal.cli.options import catalogue_with, check_new, command
+from hilcal.cli.terminal import terminal
 from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit_document import plain
 from hilcal.names import csv_text
-from hilcal.present.calibration import (
-    compensation_report,
-    fates,
-    refusals,
-    waypoints_table,
-)
+from hilcal.present.calibration import compensation_report, fates, refusals, waypoints_table
 from hilcal.present.progress import working
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
@@ -53,8 +33,7 @@ from hilcal.whole_file import replace_file
 
 PROGRAMS = (".script", ".urscript")
 WRITTEN = (".csv", ".json", *PROGRAMS)
-NAMED = 5
-"""Refused points that an error names."""
+NAMED = 5  # Refused points that an error names
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,67 +44,60 @@ class _Task:
     tool: Floats | None  # (4, 4) T_flange_tool; the tracked target where None
     program: str | None = None  # text of the program that the points are of
     waypoints: tuple[Waypoint, ...] = ()  # of that program, those that are left too
-    other: UnderstoodProgram | None = None
-    """A program of another maker than UR, in place of the two."""
+    other: UnderstoodProgram | None = None  # of another maker than UR, in place of the two
+
+    @property
+    def corrected(self) -> list[Waypoint]:
+        """The waypoints that are not left as they are."""
+        return [w for w in self.waypoints if not w.left]
 
 
+@dataclass(frozen=True, slots=True)
+class CompensationOptions:
+    """Options of what acts at the points, and how they are reached."""
+
+    load: str | None = None
+    wrench: str | None = None
+    tool: str | None = None
+    near: str | None = None
+    frames: Path | None = None
+    outside: bool = False
+    leave: bool = False
+
+
+AS_USUAL = CompensationOptions()
+
+
+@command(
+    """
+    model | RUN.hilcal | A campaign with a revision, or a calibration (JSON).
+    points | POINTS | Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB
+        .mod, FANUC .ls, Yaskawa .jbi.
+    output | -o --output F | Write CSV, JSON or a program; repeatable.
+    load | --load NAME | The load at every point, of [[loads]].
+    wrench | --wrench "FX FY FZ MX MY MZ" | Force and moment at the load point, base axes, N and
+        N·m.
+    tool | --tool "X Y Z RX RY RZ" | The tool on the flange, m and rad; the tracked target unless
+        given.
+    near | --near "Q1 Q2 .. QN" | Joint values near the first pose, degrees; m of slides.
+    frames | --frames F | The controller's tools and bases, for programs of other makers than UR:
+        TOML, $config.dat or a RAPID module.
+    outside | --allow-outside | Also points outside of what was measured.
+    leave | --leave | Keep waypoints of a program that cannot be corrected as they are.
+    kind | --format FORMAT | table, or a mapping, as for import.
+    force | --force | Replace existing files.
+    """
+)
 def compensate(
-    model: Annotated[
-        Path, argument("RUN.hilcal", "A campaign with a revision, or a calibration (JSON).")
-    ],
-    points: Annotated[
-        Path,
-        argument(
-            "POINTS",
-            "Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB .mod, "
-            "FANUC .ls, Yaskawa .jbi.",
-        ),
-    ],
-    output: Annotated[
-        list[Path] | None, option("-o --output F", "Write CSV, JSON or a program; repeatable.")
-    ] = None,
-    load: Annotated[
-        str | None, option("--load NAME", "The load at every point, of [[loads]].")
-    ] = None,
-    wrench: Annotated[
-        str | None,
-        option(
-            '--wrench "FX FY FZ MX MY MZ"',
-            "Force and moment at the load point, base axes, N and N·m.",
-        ),
-    ] = None,
-    tool: Annotated[
-        str | None,
-        option(
-            '--tool "X Y Z RX RY RZ"',
-            "The tool on the flange, m and rad; the tracked target unless given.",
-        ),
-    ] = None,
-    near: Annotated[
-        str | None,
-        option('--near "Q1 Q2 .. QN"', "Joint values near the first pose, degrees; m of slides."),
-    ] = None,
-    frames: Annotated[
-        Path | None,
-        option(
-            "--frames F",
-            "The controller's tools and bases, for programs of other makers than UR: TOML, "
-            "$config.dat or a RAPID module.",
-        ),
-    ] = None,
-    outside: Annotated[
-        bool, option("--allow-outside", "Also points outside of what was measured.")
-    ] = False,
-    leave: Annotated[
-        bool, option("--leave", "Keep waypoints of a program that cannot be corrected as they are.")
-    ] = False,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    kind: Annotated[
-        str, option("--format FORMAT", "table, or a mapping, as for import.")
-    ] = "table",
-    force: Annotated[bool, option("--force", "Replace existing files.")] = False,
-    as_json: Json = False,
+    model: Path,
+    points: Path,
+    output: list[Path] | None = None,
+    asked: CompensationOptions = AS_USUAL,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    kind: str = "table",
+    force: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Find the joint values that put the tool where it was asked to be, under a load."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -135,36 +107,34 @@ def compensate(
         say(f"reading {model}")
         calibration = _calibration(model, catalogue, revision)
         arm = calibration.model.cell.arm
-        start = None if near is None else _numbers(near, arm.n, "--near")
+        start = None if asked.near is None else _numbers(asked.near, arm.n, "--near")
         start = None if start is None else np.where(arm.slides, start, np.radians(start))
-        task = _task(points, calibration, tool, frames, start, leave, kind)
+        task = _task(points, calibration, asked, start, kind)
+        of, other = task.points, task.other
         arm = calibration.controller if task.program else arm
-        for said in filter(None, (task.points.taken, *(task.other.said if task.other else ()))):
-            t.notice(f"{points}: {said}")
-        given = _wrench(task.points, calibration, load, wrench)
-        say(f"compensating {len(task.points.names)} points")
+        for words in filter(None, (of.taken, *(other.said if other else ()))):
+            t.notice(f"{points}: {words}")
+        given = _wrench(of, calibration, asked)
+        say(f"compensating {len(of.names)} points")
         on_flange = calibration.tool_pose(task.tool)
         begin = calibration.measured.middle(arm.n) if start is None and not task.program else start
-        q = on_branch(task.points, arm, on_flange, begin)
-        understood = [w for w in task.waypoints if not w.left]
-        uncertain = doubts(arm, on_flange, understood, q, start) or [""] * len(q)
-        sensed = task.points.sensed
-        acting = given if sensed is None else calibration.load_wrench(q, sensed)
+        q = on_branch(of, arm, on_flange, begin)
+        unclear = doubts(arm, on_flange, task.corrected, q, start) or [""] * len(q)
+        acting = given if of.sensed is None else calibration.load_wrench(q, of.sensed)
         wanted = _wanted(task, calibration, q, arm)
         found = calibration.compensate(
-            q, acting, tool=task.tool, wanted=wanted, recorded=task.points.recorded
+            q, acting, tool=task.tool, wanted=wanted, recorded=of.recorded
         )
-    slow = calibration.without_kernel(task.tool)
-    if slow:
+    if slow := calibration.without_kernel(task.tool):
         t.notice(
             f"note: {', '.join(slow)} has no compiled form: a point takes 25 to 60 ms, not 0.1 ms"
         )
-    refused = refusals(found, outside)
-    refused = ["; ".join(filter(None, both)) for both in zip(uncertain, refused, strict=True)]
-    become = fates(task.other.program.points if task.other else task.waypoints, refused)
+    both = zip(unclear, refusals(found, asked.outside), strict=True)
+    refused = ["; ".join(filter(None, pair)) for pair in both]
+    become = fates(other.program.points if other else task.waypoints, refused)
     kept = [k for k, why in enumerate(refused) if not why]
-    if not leave or not kept:
-        _refuse(points, task.points.names, refused, _unreachable(found) | np.array(uncertain, bool))
+    if not asked.leave or not kept:
+        _refuse(points, of.names, refused, _unreachable(found) | np.array(unclear, bool))
     elif any(refused):
         q, task = q[kept], _only(task, kept, refused)
         wanted = None if wanted is None else wanted[kept]
@@ -172,13 +142,13 @@ def compensate(
     document = found.to_dict(task.points.names)
     if become:
         document["waypoints"] = [asdict(fate) for fate in become]
-    written = [
-        made for path in output or () for made in _write(path, task, found, document, arm.units)
-    ]
+    files = [f for path in output or () for f in _write(path, task, found, document, arm.units)]
+    written = [str(path) for path in files]
     t.show(compensation_report(calibration, task.points.names, q, found))
     t.show(waypoints_table(become))
-    _say_written(t, written)
-    t.document({**document, "written": [str(path) for path in written]})
+    nothing = "Nothing is written; -o F.csv, F.json or F.script keeps the joint values."
+    t.show(f"\nWritten: {', '.join(written)}." if written else f"\n{nothing}")
+    t.document({**document, "written": written})
 
 
 def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Floats | None:
@@ -197,13 +167,6 @@ def _wanted(task: _Task, calibration: Calibration, q: Floats, arm: Arm) -> Float
     return np.where(told, poses, nominal)
 
 
-def _say_written(t: Terminal, paths: list[Path]) -> None:
-    if paths:
-        t.show(f"\nWritten: {', '.join(str(path) for path in paths)}.")
-    else:
-        t.show("\nNothing is written; -o F.csv, F.json or F.script keeps the joint values.")
-
-
 def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Calibration:
     if path.suffix == ".json":
         if revision is not None:
@@ -214,43 +177,34 @@ def _calibration(path: Path, catalogue: Catalogue, revision: int | None) -> Cali
 
 
 def _task(
-    path: Path,
-    calibration: Calibration,
-    tool: str | None,
-    frames: Path | None,
-    near: Floats | None,
-    leave: bool,
-    kind: str,
+    path: Path, calibration: Calibration, asked: CompensationOptions, near: Floats | None, kind: str
 ) -> _Task:
-    arm = calibration.model.cell.arm
-    given = None
-    if tool is not None:
-        six = _numbers(tool, 6, "--tool")
+    arm, given = calibration.model.cell.arm, None
+    if asked.tool is not None:
+        six = _numbers(asked.tool, 6, "--tool")
         given = se3.matrix(se3.rotation(six[3:]), six[:3])
     if path.suffix.lower() in READERS:
-        found = understood(path, arm, frames=frames, tool=given, near=near, leave=leave)
-        return _Task(found.points, found.tool, other=found)
-    if frames is not None:
+        other = understood(path, arm, frames=asked.frames, tool=given, near=near, leave=asked.leave)
+        return _Task(other.points, other.tool, other=other)
+    if asked.frames is not None:
         raise InputError(f"{path}: --frames is for programs: {', '.join(READERS)}")
-    if path.suffix in PROGRAMS:
-        if arm.n != JOINTS:
-            raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
-        program, every, points, own = program_points(path, leave)
-        if own is None and given is None and points.wanted is not None:
-            poses = np.isfinite(points.wanted[:, 0, 0])
-            if poses.any():
-                name = points.names[int(np.argmax(poses))]
-                raise InputError(
-                    f"{path}: {name} is a pose of a tool centre point that the program does not "
-                    'set; give --tool "X Y Z RX RY RZ" as the installation has it'
-                )
-        if own is not None and given is not None and not np.allclose(own, given, atol=1e-9):
-            raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
-        return _Task(points, given if own is None else own, program, every)
-    if leave:
-        raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
-    mapping = None if kind == "table" else find_mapping(kind, PointMapping)
-    return _Task(read_points(path, arm, calibration.loads, mapping), given)
+    if path.suffix not in PROGRAMS:
+        if asked.leave:
+            raise InputError(f"{path}: --leave is for waypoints of a program; valid: without it")
+        mapping = None if kind == "table" else find_mapping(kind, PointMapping)
+        return _Task(read_points(path, arm, calibration.loads, mapping), given)
+    if arm.n != JOINTS:
+        raise InputError(f"{path}: a UR program, and {arm.name} has {arm.n} joints")
+    program, every, points, own = program_points(path, asked.leave)
+    if own is None and given is None and points.wanted is not None:
+        for k in np.flatnonzero(np.isfinite(points.wanted[:, 0, 0]))[:1].tolist():
+            raise InputError(
+                f"{path}: {points.names[k]} is a pose of a tool centre point that the program does "
+                'not set; give --tool "X Y Z RX RY RZ" as the installation has it'
+            )
+    if own is not None and given is not None and not np.allclose(own, given, atol=1e-9):
+        raise InputError(f"{path}: set_tcp is another tool than --tool; leave out one of them")
+    return _Task(points, given if own is None else own, program, every)
 
 
 def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
@@ -269,21 +223,19 @@ def _only(task: _Task, kept: list[int], refused: list[str]) -> _Task:
     return replace(task, points=points, waypoints=waypoints)
 
 
-def _wrench(
-    points: Points, calibration: Calibration, load: str | None, wrench: str | None
-) -> Floats | None:
+def _wrench(points: Points, calibration: Calibration, asked: CompensationOptions) -> Floats | None:
     """(6,) or (N, 6) wrench at the points."""
-    given = [x for x in (load, wrench, points.wrench, points.sensed) if x is not None]
-    if len(given) > 1:
+    load, wrench = asked.load, asked.wrench
+    if sum(x is not None for x in (load, wrench, points.wrench, points.sensed)) > 1:
         raise InputError("the load is given twice; valid: one of --load, --wrench, columns")
     if wrench is not None:
         return _numbers(wrench, 6, "--wrench")
-    if load is not None and load != "none":
-        if load not in calibration.loads:
-            valid = ", ".join(("none", *calibration.loads))
-            raise InputError(f"--load {load}: no such load; valid: {valid}")
-        return calibration.loads[load]
-    return points.wrench
+    if load is None or load == "none":
+        return points.wrench
+    if load not in calibration.loads:
+        valid = ", ".join(("none", *calibration.loads))
+        raise InputError(f"--load {load}: no such load; valid: {valid}")
+    return calibration.loads[load]
 
 
 def _numbers(written: str, count: int, option: str) -> Floats:
@@ -326,11 +278,7 @@ def _check_output(path: Path, points: Path, force: bool) -> None:
 
 
 def _write(
-    path: Path,
-    task: _Task,
-    found: Compensation,
-    document: dict[str, object],
-    units: Sequence[str],
+    path: Path, task: _Task, found: Compensation, document: dict[str, object], units: Sequence[str]
 ) -> list[Path]:
     """Write the joint values as the file's name asks; returns the files."""
     names, n = task.points.names, found.q.shape[1]
@@ -349,7 +297,7 @@ def _write(
     elif task.program is None:
         content = movej_program(names, found.q)
     else:
-        content = with_joints(task.program, [w for w in task.waypoints if not w.left], found.q)
+        content = with_joints(task.program, task.corrected, found.q)
     replace_file(path, content)
     return [path]
 

@@ -6,7 +6,6 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
@@ -14,11 +13,11 @@ from hilcal import numbers
 from hilcal.calibration.improvement import Improvement
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.revisions import to_record
-from hilcal.cli.fits import check_record, finish, record_story
-from hilcal.cli.options import EffectsFrom, Json, Record, catalogue_with, check_seed, option
+from hilcal.cli.fitting import check_record, finish, record_story
+from hilcal.cli.options import catalogue_with, check_seed, command
 from hilcal.cli.planning import separates
 from hilcal.cli.refining import chapter_of, revisions_json, rows_of
-from hilcal.cli.rehearsing import (
+from hilcal.cli.running import (
     RehearsalSettings,
     RehearsedCampaign,
     first_plan,
@@ -81,18 +80,12 @@ from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
 from hilcal.store.records import content_hash
 
-STRENGTH = 4.0
-"""Of what is hidden, in units of the noise: clearly there in so few readings."""
-FIRST = 6
-"""Poses of the first campaign."""
-CANDIDATES = 60
-"""Poses that it is chosen from. A choice: planning takes a second."""
-ARMS = 4
-"""Arms that are drawn for one plan. A choice."""
-TRIES = 200
-"""Arms that are drawn at most. Of 10 seeds it took 1 to 32 and once 105, and 2 to 34 s."""
-DRAWS = 5
-"""Draws of the noise for which a rival has to be as good. A choice."""
+STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
+FIRST = 6  # Poses of the first campaign
+CANDIDATES = 60  # Poses that it is chosen from. A choice: planning takes a second
+ARMS = 4  # Arms that are drawn for one plan. A choice
+TRIES = 200  # Arms that are drawn at most. Of 10 seeds it took 1 to 32 and once 105, and 2 to 34 s
+DRAWS = 5  # Draws of the noise for which a rival has to be as good. A choice
 CAMPAIGNS = 3
 """First campaigns that are measured at most until one leaves a doubt. Without devices the first
 always does; of other draws of the noise four in five do (38 of 48)."""
@@ -206,39 +199,32 @@ def doubted(
 CELL = "demo_ur10e.toml"
 POSES = 20
 """Of the plan; a choice: with validation and corrected run it takes three and a half minutes."""
-VALIDATION = 10
-"""Poses of the validation campaign; a choice for the same reason."""
+VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
+@command(
+    """
+    hide | --hide EFFECT | An effect, random, nothing, or invented: a law that the catalogue lacks.
+    seed | --seed | Of everything random.
+    output | -o --output RUN.hilcal | The campaign file to make.
+    poses | --poses | See hilcal plan.
+    validation | --validation | Poses at which the corrected arm is measured.
+    without_devices | --without-devices | Draw the readings at once, through no wire.
+    ambiguous | --ambiguous | Measure little at first, so that the effect is in doubt; then what
+        settles it.
+    """
+)
 def demo(
-    hide: Annotated[
-        str | None,
-        option(
-            "--hide EFFECT",
-            "An effect, random, nothing, or invented: a law that the catalogue lacks.",
-        ),
-    ] = None,
-    seed: Annotated[int | None, option("--seed", "Of everything random.")] = None,
-    output: Annotated[Path, option("-o --output RUN.hilcal", "The campaign file to make.")] = Path(
-        "demo.hilcal"
-    ),
-    poses: Annotated[int, option("--poses", "See hilcal plan.")] = POSES,
-    validation: Annotated[
-        int, option("--validation", "Poses at which the corrected arm is measured.")
-    ] = VALIDATION,
-    without_devices: Annotated[
-        bool, option("--without-devices", "Draw the readings at once, through no wire.")
-    ] = False,
-    ambiguous: Annotated[
-        bool,
-        option(
-            "--ambiguous",
-            "Measure little at first, so that the effect is in doubt; then what settles it.",
-        ),
-    ] = False,
-    record: Record = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    hide: str | None = None,
+    seed: int | None = None,
+    output: Path = Path("demo.hilcal"),
+    poses: int = POSES,
+    validation: int = VALIDATION,
+    without_devices: bool = False,
+    ambiguous: bool = False,
+    record: Path | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

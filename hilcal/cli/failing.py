@@ -6,6 +6,7 @@ import shutil
 import sys
 import textwrap
 import traceback
+from dataclasses import dataclass
 from typing import Any, TextIO
 
 from hilcal.errors import (
@@ -20,11 +21,11 @@ from hilcal.names import escaped
 
 _COMMAND = re.compile(r"(.*:) (hilcal [^,;()]*)$")
 _KINDS = {
-    InputError: "input",
-    DeviceError: "device",
-    CannotAnswerError: "cannot_answer",
-    LimitError: "limit",
-    StoppedError: "interrupted",
+    InputError.exit_code: "input",
+    DeviceError.exit_code: "device",
+    CannotAnswerError.exit_code: "cannot_answer",
+    LimitError.exit_code: "limit",
+    StoppedError.exit_code: "interrupted",
 }
 
 
@@ -34,8 +35,7 @@ def error_document(error: HilcalError) -> dict[str, object]:
 
 
 def _document(line: str, code: int) -> dict[str, object]:
-    kinds = {kind.exit_code: name for kind, name in _KINDS.items()}
-    kind = kinds.get(code, "unexpected")
+    kind = _KINDS.get(code, "unexpected")
     return {"error": {"message": line, "kind": kind, "exit_code": code}}
 
 
@@ -57,21 +57,21 @@ class Watched:
         return getattr(self._stream, name)
 
 
+@dataclass(frozen=True, slots=True)
 class Failures:
     """Tells people, and with --json scripts, why a command failed."""
 
-    def __init__(self, as_json: bool, out: Watched, debug: bool) -> None:
-        """Remember where the document goes, and whether people want to know more."""
-        self.out = out
-        self._json, self._debug = as_json, debug
+    as_json: bool
+    out: Watched  # where the document goes
+    debug: bool  # whether people want to know more
 
     def tell(self, error: BaseException | None, message: str, code: int) -> int:
         """Say what failed in one line, and in one document; returns the exit code."""
-        if self._debug and error is not None:
+        if self.debug and error is not None:
             traceback.print_exception(error)
         line = escaped(" ".join(message.split()))
         print(_laid_out(f"error: {line}"), file=sys.stderr)
-        if self._json and not self.out.written:
+        if self.as_json and not self.out.written:
             self.out.write(json.dumps(_document(line, code), indent=2) + "\n")
             self.out.flush()
         return code
@@ -84,15 +84,10 @@ def _laid_out(line: str) -> str:
     """
     if not sys.stderr.isatty():
         return line
-    words, command = line, ""
-    if found := _COMMAND.match(line):
-        words, command = found.groups()
+    found = _COMMAND.match(line)
+    words, command = found.groups() if found else (line, "")
     width = shutil.get_terminal_size().columns
-    told = textwrap.wrap(
-        words,
-        width,
-        subsequent_indent="  ",
-        break_long_words=False,
-        break_on_hyphens=False,
+    wrap = textwrap.TextWrapper(
+        width, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
     )
-    return "\n".join((*told, *([f"  {command}"] if command else ())))
+    return "\n".join((*wrap.wrap(words), *([f"  {command}"] if command else ())))

@@ -1,100 +1,267 @@
-"""`identify` and `bootstrap`: fit a model to the readings, and draw them again."""
+"""`identify` and `bootstrap`; the fit in use, effects and their options, a prior, recordings."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
 from hilcal import numbers
 from hilcal.calibration.streamed import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
-from hilcal.cli.fits import (
-    PriorOptions,
-    check_options,
-    chosen,
-    finish,
-    fit_of,
-    mode_of_option,
-    scalings,
-    titles,
-    wanted_effects,
-)
-from hilcal.cli.options import (
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Prior,
-    PriorOf,
-    Readings,
-    Revision,
-    Run,
-    Scheduler,
-    Workers,
-    catalogue_with,
-    check_workers,
-    option,
-)
+from hilcal.cli.options import catalogue_with, check_folder, check_workers, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.options import Options
-from hilcal.effects.written import write_effect
+from hilcal.effects.written import chosen_options, read_effects_text, write_effect
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification.arm_scatter import with_prior_scatter
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.bootstrap import DRAWS, check_draws
 from hilcal.identification.bootstrap import bootstrap as draw_again
-from hilcal.identification.carried import CarriedPrior
+from hilcal.identification.carried import CarriedPrior, carried_prior
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
+from hilcal.model.model import Model
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
-from hilcal.present.progress import counting, working
+from hilcal.present.progress import Say, counting, working
 from hilcal.present.registration import covariance_words, other_arm_line, torque_lines
+from hilcal.present.story import Chapter, build_story
 from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
-from hilcal.readings.whitening import Scaling
+from hilcal.readings.readings import Readings
+from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release
+from hilcal.store.revision import RevisionRecord
 from hilcal.stream.fit import fit_stream
 from hilcal.stream.fit import to_json as stream_json
 from hilcal.tables.files import is_parquet
 from hilcal.tables.parquet_stream import open_stream
 
 
+def fit_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int | None, Fit]:
+    """Return number and fit of the revision in use; without any the baseline, which is not kept."""
+    _tell_accepted(t, run, revision)
+    number, found = run.fit_in_use(say, revision)
+    if number is None:
+        t.notice(f"no revision yet: taking the baseline {_what(found)}; hilcal identify keeps it")
+    return number, found
+
+
+def record_of(t: Terminal, run: Campaign, say: Say, revision: int | None) -> RevisionRecord:
+    """Return the revision in use as stored; without any that of the baseline, number 0."""
+    record = run.in_use(revision)
+    if record is None:
+        return run.record(fit_of(t, run, say, revision)[1])
+    _tell_accepted(t, run, revision)
+    return record
+
+
+def stored_fit(t: Terminal, run: Campaign, say: Say, revision: int | None) -> tuple[int, Fit]:
+    """Do the same for a command that makes a revision; the baseline becomes revision 1."""
+    _tell_accepted(t, run, revision)
+    number, found = run.fit_in_use(say, revision)
+    if number is None:
+        number = run.store(found)
+        t.notice(f"no revision yet: made the baseline, revision {number} {_what(found)}")
+    return number, found
+
+
+def _what(found: Fit) -> str:
+    return f"({model_name(found.model.named)}; {found.mode} readings)"
+
+
+def _tell_accepted(t: Terminal, run: Campaign, revision: int | None) -> None:
+    """Say that an accepted revision is used where there are later ones."""
+    accepted, latest = run.file.accepted(), run.latest()
+    if revision is None and latest is not None and accepted not in (None, latest.number):
+        t.notice(f"using revision {accepted}, which is accepted; the latest is {latest.number}")
+
+
+def starting_model(
+    o: Campaign,
+    mode: Mode,
+    effects: Mapping[str, Options] | None,
+    prior: CarriedPrior | None = None,
+) -> Model:
+    """Return a model of unknown frames and these effects; the baseline without any named."""
+    if effects is None:
+        return baseline(o.cell, o.readings, mode, o.catalogue, prior)
+    return with_effects(o.cell, o.readings, mode, effects, effects, o.catalogue, prior)
+
+
+def finish(found: Fit, say: Say) -> None:
+    """Compute what a fit's report and its document hold, while it is said what is done."""
+    say("predicting the poses left out")
+    _ = found.holdout
+    say("computing standard uncertainties")
+    _ = found.uncertainty
+
+
+def called(number: int | None) -> str:
+    """Return how a revision is called in a heading; None is the baseline that is not kept."""
+    return "Baseline, not kept" if number is None else f"Revision {number}"
+
+
+def mode_of_option(run: Campaign, asked: str | None) -> Mode:
+    """Kind of readings: as asked, else as in the latest revision, else what they allow."""
+    if asked is None:
+        return run.mode()
+    if asked not in MODES:
+        raise InputError(f"--readings {asked!r} is unknown; valid: {', '.join(MODES)}")
+    return asked
+
+
+def scalings(name: str) -> tuple[Scaling, ...]:
+    """Return the scalings that `--scaling` asks for; the one that is kept comes last."""
+    found = tuple(s for s in SCALINGS if name in (s, "all"))
+    if not found:
+        raise InputError(f"--scaling {name!r} is unknown; valid: {', '.join(SCALINGS)}, all")
+    return found
+
+
+def wanted_effects(given: str | None, catalogue: Catalogue) -> dict[str, dict[str, object]] | None:
+    """Read `--effects "a, b(option=value)"`: options by name, see `read_effects_text`."""
+    if given is None:
+        return None
+    wanted = read_effects_text(given, "--effects", catalogue)
+    if not wanted:
+        raise InputError("--effects is empty; give one name or several, separated by commas")
+    return wanted
+
+
+def effect_names(asked: str | None, catalogue: Catalogue) -> tuple[str, ...] | None:
+    """Read names of effects where they cannot have options; raises as `wanted_effects` does."""
+    wanted = wanted_effects(asked, catalogue)
+    for name, options in (wanted or {}).items():
+        if options:
+            raise InputError(f"--effects: {name} takes no options here; valid: {name}")
+    return None if wanted is None else tuple(wanted)
+
+
+def check_options(o: Campaign, wanted: Mapping[str, Options]) -> None:
+    """Refuse options of effects before any work is done."""
+    for name, options in wanted.items():
+        o.catalogue.make(name, o.cell, o.readings.states, options).prior_std()
+
+
+def chosen(found: Fit) -> dict[str, dict[str, object]]:
+    """Options of the effects of a fit that are not the usual ones, by name."""
+    return chosen_of(found.model, found.readings)
+
+
+def chosen_of(model: Model, readings: Readings) -> dict[str, dict[str, object]]:
+    """Options of the effects of a model that are not the usual ones for its readings, by name."""
+    named = (e for e in model.effects if e.name not in model.background)
+    options = {e.name: chosen_options(e, readings.states, readings.m) for e in named}
+    return {name: given for name, given in options.items() if given}
+
+
+def titles(model: Model, readings: Readings) -> tuple[str, ...]:
+    """Names of a model's effects, with the options that are not the usual ones."""
+    given = chosen_of(model, readings)
+    return tuple(write_effect(name, given.get(name, {})) for name in model.named)
+
+
+def check_record(path: Path | None) -> None:
+    """Refuse a recording that cannot be written before any work is done."""
+    if path is not None:
+        check_folder(path, f"--record {path}")
+
+
+def record_story(t: Terminal, chapters: list[Chapter], path: Path | None) -> None:
+    """Write a recording, where it is asked for."""
+    if path is None:
+        return
+    from hilcal.present.viewer import save  # loads the viewer's library, which takes a while
+
+    with working(t.progress) as say:
+        say(f"writing {path}")
+        save(build_story(chapters), path)
+    t.notice(f"recorded {path}; open it with: rerun {path}")
+
+
+@dataclass(frozen=True, slots=True)
+class PriorOptions:
+    """The options of a prior as they were given."""
+
+    prior: Path | None = None
+    prior_of: str = "arm"
+    drift: str | None = None
+
+    def load(self, catalogue: Catalogue) -> CarriedPrior | None:
+        """Return the prior; None where none is asked for."""
+        if self.prior is None:
+            if self.drift is not None:
+                raise InputError("--drift is of a prior; give --prior OTHER.hilcal as well")
+            return None
+        from hilcal.library import load_posterior  # imports all that a script can do
+
+        posterior = load_posterior(self.prior, catalogue)
+        try:
+            return carried_prior(posterior, self.prior_of, _drifts(self.drift), catalogue)
+        except InputError as error:
+            raise InputError(f"--prior {self.prior}: {error}") from None
+
+
+NO_PRIOR = PriorOptions()
+
+
+def fitted_with(prior: CarriedPrior, o: Campaign, found: Fit) -> Fit:
+    """Return a fit of the same effects and those of a prior, with it; nothing is stored."""
+    if found.model.prior is not None:
+        known = found.model.prior.posterior.source.campaign or "a posterior"
+        raise InputError(f"the revision has a prior already, {known}; leave out --prior")
+    learnt = [e.name for e in prior.posterior.effects]
+    more = [n for n in learnt if o.catalogue[n].computable(o.readings.states)]
+    names = dict.fromkeys((*found.model.names, *more))
+    model = with_effects(o.cell, o.readings, found.mode, names, chosen(found), o.catalogue, prior)
+    return with_serial_noise(fit(model, with_prior_scatter(model, found.readings), found.mode))
+
+
+def _drifts(text: str | None) -> dict[str, float]:
+    """Read "a=0.1,b=0.2"."""
+    found = {}
+    for part in (text or "").split(","):
+        name, equals, value = (w.strip() for w in part.partition("="))
+        if not part.strip():
+            continue
+        try:
+            found[name] = float(value) if equals else float("nan")
+        except ValueError:
+            raise InputError(f"--drift {part.strip()!r}; valid: EFFECT=NUMBER") from None
+    return found
+
+
+@command(
+    """
+    effects | --effects A,B | Effects to fit, besides unknown frames; with options:
+        creep(joints=each).
+    scaling | --scaling S | none, gu, gc or all, side by side.
+    fit_validation | --fit-validation | Release a validation campaign for fitting; its file says so
+        for good.
+    cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
+    out | -o F.json | Of a stream: write its calibration.
+    """
+)
 def identify(
-    run: Run,
-    effects: Annotated[
-        str | None,
-        option(
-            "--effects A,B",
-            "Effects to fit, besides unknown frames; with options: creep(joints=each).",
-        ),
-    ] = None,
-    scaling: Annotated[str, option("--scaling S", "none, gu, gc or all, side by side.")] = "gc",
-    readings: Readings = None,
-    fit_validation: Annotated[
-        bool,
-        option(
-            "--fit-validation",
-            "Release a validation campaign for fitting; its file says so for good.",
-        ),
-    ] = False,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    effects_from: EffectsFrom = None,
-    cell: Annotated[
-        Path | None, option("--cell CELL.toml", "The cell of a stream, READINGS.parquet as RUN.")
-    ] = None,
-    out: Annotated[Path | None, option("-o F.json", "Of a stream: write its calibration.")] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    details: Details = False,
-    as_json: Json = False,
+    run: Path,
+    effects: str | None = None,
+    scaling: str = "gc",
+    readings: str | None = None,
+    fit_validation: bool = False,
+    prior: PriorOptions = NO_PRIOR,
+    effects_from: list[Path] | None = None,
+    cell: Path | None = None,
+    out: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    details: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Fit a model to the readings, and keep it as a revision.
 
@@ -102,7 +269,7 @@ def identify(
     """
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted, named = scalings(scaling), wanted_effects(effects, catalogue)
-    known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    known = prior.load(catalogue)
     if run.suffix == ".parquet" or is_parquet(run):
         if scaling != "gc" or readings not in (None, "absolute") or fit_validation:
             raise InputError(
@@ -127,10 +294,7 @@ def identify(
         fits: dict[Scaling, Fit] = {}
         with working(t.progress) as say:
             say("registering")
-            if named is None:
-                model = baseline(o.cell, o.readings, mode, catalogue, known)
-            else:
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
+            model = starting_model(o, mode, named, known)
             fitted = with_prior_scatter(model, o.readings)
             for s in wanted:
                 say(f"fitting {model_name(titles(model, o.readings))}, scaling {s}")
@@ -149,27 +313,26 @@ def identify(
     other = other_arm_of(o.cell, o.readings)
     if other is not None:
         t.show(other_arm_line(other))
-    document = {"revision": number, **to_json(kept), "options": options_json(kept)}
-    document["covariance"] = o.covariance_parts
-    if torques is not None:
-        document["torques"] = torques.to_json()
-    document["other_arm"] = None if other is None else other.to_json()
+    document = {
+        "revision": number,
+        **to_json(kept),
+        "options": options_json(kept),
+        "covariance": o.covariance_parts,
+        **({} if torques is None else {"torques": torques.to_json()}),
+        "other_arm": None if other is None else other.to_json(),
+    }
     if len(fits) > 1:
         t.show(["", *scalings_table(fits)])
         document["scalings"] = {s: to_json(found) for s, found in fits.items()}
-    if number <= before:
-        t.show(f"\nRevision {number} of {run} is this fit already; nothing was stored.")
-    else:
-        t.show(f"\nStored as revision {number} of {run}.")
+    already = f"Revision {number} of {run} is this fit already; nothing was stored."
+    t.show(f"\n{already if number <= before else f'Stored as revision {number} of {run}.'}")
     t.document(document)
 
 
 def options_line(found: Fit) -> list[str]:
     """Return a line with the options that are not the usual ones; none where all are usual."""
-    given = chosen(found)
-    if not given:
-        return []
-    return [f"Options: {', '.join(write_effect(name, of) for name, of in given.items())}."]
+    given = [write_effect(name, options) for name, options in chosen(found).items()]
+    return [f"Options: {', '.join(given)}."] if given else []
 
 
 def options_json(found: Fit) -> dict[str, dict[str, object]]:
@@ -207,15 +370,21 @@ def identify_stream(
     t.document(document)
 
 
+@command(
+    """
+    draws | --draws N | Campaigns drawn.
+    seed | --seed | Of the draws.
+    """
+)
 def bootstrap(
-    run: Run,
-    revision: Revision = None,
-    draws: Annotated[int, option("--draws N", "Campaigns drawn.")] = DRAWS,
-    seed: Annotated[int, option("--seed", "Of the draws.")] = 0,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    revision: int | None = None,
+    draws: int = DRAWS,
+    seed: int = 0,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -4,22 +4,11 @@ import keyword
 import re
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
 
-from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    OneWorker,
-    Scheduler,
-    argument,
-    catalogue_with,
-    check_seed,
-    one_by_default,
-    option,
-)
+from hilcal.cli.options import catalogue_with, check_seed, command, one_by_default
 from hilcal.cli.terminal import terminal
 from hilcal.config import reference
 from hilcal.drivers.emscon import EmsconOptions as EmsconOptions
@@ -37,11 +26,7 @@ from hilcal.identification.fit_document import plain
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
 from hilcal.present.document import Table, note, table
-from hilcal.present.preparing import (
-    reference_page,
-    section_report,
-    sections_overview,
-)
+from hilcal.present.preparing import reference_page, section_report, sections_overview
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file
@@ -52,10 +37,9 @@ OPTIONS_NOTE = (
 )
 
 
+@command()
 def effects(
-    ctx: typer.Context,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    ctx: typer.Context, effects_from: list[Path] | None = None, as_json: bool = False
 ) -> None:
     """List the effects that a model can have; `new` begins one of your own."""
     if ctx.invoked_subcommand is not None:
@@ -138,17 +122,23 @@ def _source(kind: type[Effect], catalogue: Catalogue) -> str:
     return "built in" if kind in BUILT_IN else "installed"
 
 
-def new(
-    name: Annotated[str, argument("NAME", "Lower case, digits and _.")],
-    output: Annotated[
-        Path | None, option("-o --output FILE.py", "The file; NAME.py by default.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    name | NAME | Lower case, digits and _.
+    output | -o --output FILE.py | The file; NAME.py by default.
+    """
+)
+def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
     t = terminal(as_json)
     path = Path(f"{name}.py") if output is None else output
-    _check_name(name)
+    if not NAME.fullmatch(name) or keyword.iskeyword(name):
+        raise InputError(
+            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
+            "Python's own"
+        )
+    if name in installed().names:
+        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
     if path.suffix != ".py":
         raise InputError(f"{path}: effects are in a Python file; end its name in .py")
     replace_file(path, template_of(name), must_be_new=True)
@@ -158,16 +148,6 @@ def new(
         f"  hilcal diagnose RUN.hilcal --effects-from {quoted(path)}"
     )
     t.document({"written": str(path), "effect": name})
-
-
-def _check_name(name: str) -> None:
-    if not NAME.fullmatch(name) or keyword.iskeyword(name):
-        raise InputError(
-            f"NAME {name!r}; valid: lower-case letters, digits and _, a letter first, no word of "
-            "Python's own"
-        )
-    if name in installed().names:
-        raise InputError(f"NAME {name}: is in the catalogue already; choose another name")
 
 
 def template_of(name: str) -> str:
@@ -190,10 +170,12 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 """Keys of the drivers that come with the program, by section."""
 
 
-def config(
-    section: Annotated[str | None, argument("SECTION", "One of them, e.g. tracker.")] = None,
-    as_json: Json = False,
-) -> None:
+@command(
+    """
+    section | SECTION | One of them, e.g. tracker.
+    """
+)
+def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
     if section is None:
@@ -210,17 +192,23 @@ def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
 
 
+@command(
+    """
+    runs | --runs | Monte-Carlo runs.
+    seed | --seed | Of the random numbers.
+    workers | --workers N | Processes of this machine; 1 by default.
+    """
+)
 def scaling(
-    runs: Annotated[int, option("--runs", "Monte-Carlo runs.")] = 2000,
-    seed: Annotated[int, option("--seed", "Of the random numbers.")] = 1,
-    workers: OneWorker = None,
-    scheduler: Scheduler = None,
-    as_json: Json = False,
+    runs: int = 2000,
+    seed: int = 1,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: bool = False,
 ) -> None:
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine.engine import open_engine
-    from hilcal.study.scaling import check, experiments, scaling_study
-    from hilcal.study.scaling_table import table
+    from hilcal.study.scaling import check, experiments, scaling_study, table
 
     t = terminal(as_json)
     check(runs)

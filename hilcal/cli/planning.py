@@ -2,36 +2,22 @@
 
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
 from hilcal import numbers as words_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell, cell_from_config
-from hilcal.cli.fits import PriorOptions, check_record, effect_names, fit_of, fitted_with
-from hilcal.cli.options import (
-    POSES,
-    CellFile,
-    Csv,
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Output,
-    PlanFile,
-    Poses,
-    Prior,
-    PriorOf,
-    Quick,
-    Record,
-    Revision,
-    Run,
-    Seed,
-    catalogue_with,
-    check_seed,
-    option,
+from hilcal.cli.fitting import (
+    NO_PRIOR,
+    PriorOptions,
+    check_record,
+    effect_names,
+    fit_of,
+    fitted_with,
 )
+from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
 from hilcal.design.checked_plan import CheckedPlan, checked, refusal
@@ -82,51 +68,42 @@ def write(
             record_plan(cell, config, made.plan, made.summary, record, powers)
 
 
+@command(
+    f"""
+    readings | --readings | Or so many readings, repeats not counted, at as many poses and under
+        those loads that tell most.
+    criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
+    after | --after RUN.hilcal | Plan on from what it knows already.
+    unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a
+        drift costs more.
+    """
+)
 def plan(
-    cell: CellFile,
-    output: Output,
-    poses: Poses = POSES,
-    readings: Annotated[
-        int | None,
-        option(
-            "--readings",
-            "Or so many readings, repeats not counted, at as many poses and under those loads "
-            "that tell most.",
-        ),
-    ] = None,
-    criterion: Annotated[
-        str | None, option(f"--criterion {'|'.join(CRITERIA)}", "The optimality criterion.")
-    ] = None,
-    after: Annotated[
-        Path | None, option("--after RUN.hilcal", "Plan on from what it knows already.")
-    ] = None,
-    revision: Revision = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    seed: Seed = 0,
-    unloaded_first: Annotated[
-        bool,
-        option(
-            "--unloaded-first",
-            "All unloaded readings before the loads: for run --until; a drift costs more.",
-        ),
-    ] = False,
-    quick: Quick = False,
-    csv: Csv = None,
-    record: Record = None,
-    details: Details = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    output: Path,
+    poses: int = POSES,
+    readings: int | None = None,
+    criterion: str | None = None,
+    after: Path | None = None,
+    revision: int | None = None,
+    prior: PriorOptions = NO_PRIOR,
+    seed: int = 0,
+    unloaded_first: bool = False,
+    quick: bool = False,
+    csv: Path | None = None,
+    record: Path | None = None,
+    details: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
     if revision is not None and after is None:
         raise InputError("--revision is one of a campaign; give the campaign with --after")
-    if prior is not None and after is not None:
+    if prior.prior is not None and after is not None:
         raise InputError("--after has the prior of its revision; leave out --prior")
-    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
+    carried = prior.load(catalogue)
     config, numbers = read_cell(cell)
     unloaded: Literal["around", "first"] = "first" if unloaded_first else "around"
     if criterion is not None and canonical(criterion) not in CRITERIA:
@@ -151,29 +128,23 @@ def plan(
     t.document({**made.to_dict(), "plan": str(output)})
 
 
+@command(
+    """
+    save_calibration | --save-calibration F.toml | Write the kinematics that the arm's controller
+        holds, for [robot] calibration.
+    factory | --factory F.hilcal | Is the arm still what its factory measured? Measures a few
+        readings without a load into a new campaign, or takes those of one that is there.
+    yes | --yes -y | With --factory: do not ask before the arm moves.
+    """
+)
 def check(
-    cell: CellFile,
-    plan: PlanFile = None,
-    save_calibration: Annotated[
-        Path | None,
-        option(
-            "--save-calibration F.toml",
-            "Write the kinematics that the arm's controller holds, for [robot] calibration.",
-        ),
-    ] = None,
-    factory: Annotated[
-        Path | None,
-        option(
-            "--factory F.hilcal",
-            "Is the arm still what its factory measured? Measures a few readings without a load "
-            "into a new campaign, or takes those of one that is there.",
-        ),
-    ] = None,
-    yes: Annotated[
-        bool, option("--yes -y", "With --factory: do not ask before the arm moves.")
-    ] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    cell: Path,
+    plan: Path | None = None,
+    save_calibration: Path | None = None,
+    factory: Path | None = None,
+    yes: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -205,7 +176,7 @@ def check(
     failed: HilcalError | None = None
     judged = None
     if factory is not None and (factory.exists() or not any(a.problems for a in answers)):
-        from hilcal.cli.factory import factory_check  # which needs this file
+        from hilcal.cli.running import factory_check  # which needs this file
 
         judged = factory_check(t, config, numbers, catalogue, answers, factory, yes)
     if names := ", ".join(a.device for a in answers if a.problems):
@@ -290,48 +261,39 @@ def answer_json(answer: ConnectionResult) -> dict[str, object]:
 
 
 def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
-    """Refuse to run with devices that are not ready.
-
-    Raises:
-        DeviceError: lists all problems.
-    """
+    """Refuse to run with devices that are not ready."""
     if lines := [problem for answer in answers for problem in answer.problems]:
         raise DeviceError("; ".join(lines))
 
 
+@command(
+    """
+    poses | --poses | As many readings as so many poses take under every load, 20 unless given; new
+        poses, where a misfit depends on the pose alone.
+    suspects | --suspects A,B | Separate these, whatever is diagnosed.
+    cell | --cell CELL.toml | The cell, where it has other loads now.
+    """
+)
 def next_(
-    run: Run,
-    output: Output,
-    poses: Annotated[
-        int | None,
-        option(
-            "--poses",
-            "As many readings as so many poses take under every load, 20 unless given; new "
-            "poses, where a misfit depends on the pose alone.",
-        ),
-    ] = None,
-    suspects: Annotated[
-        str | None, option("--suspects A,B", "Separate these, whatever is diagnosed.")
-    ] = None,
-    cell: Annotated[
-        Path | None, option("--cell CELL.toml", "The cell, where it has other loads now.")
-    ] = None,
-    seed: Seed = 0,
-    quick: Quick = False,
-    csv: Csv = None,
-    revision: Revision = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    record: Record = None,
-    effects_from: EffectsFrom = None,
-    details: Details = False,
-    as_json: Json = False,
+    run: Path,
+    output: Path,
+    poses: int | None = None,
+    suspects: str | None = None,
+    cell: Path | None = None,
+    seed: int = 0,
+    quick: bool = False,
+    csv: Path | None = None,
+    revision: int | None = None,
+    prior: PriorOptions = NO_PRIOR,
+    record: Path | None = None,
+    effects_from: list[Path] | None = None,
+    details: bool = False,
+    as_json: bool = False,
 ) -> None:
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
-    carried = PriorOptions(prior, prior_of, drift).load(catalogue)
+    carried = prior.load(catalogue)
     rng = np.random.default_rng(check_seed(seed))
     if poses is not None and poses < 1:
         raise InputError(f"--poses {poses}; valid: a whole number from 1")
@@ -353,12 +315,7 @@ def next_(
         f"--plan {quoted(output)}"
     )
     t.document(
-        {
-            **made.to_dict(),
-            "plan": str(output),
-            "suspects": list(effects),
-            **separates(found),
-        }
+        {**made.to_dict(), "plan": str(output), "suspects": list(effects), **separates(found)}
     )
 
 

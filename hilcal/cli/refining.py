@@ -1,59 +1,53 @@
-"""`diagnose`, `add` and `refine`: which effect is missing, and what adding it does."""
+"""`diagnose`, `add`, `remove`, `refine`, `discover`: which effect is missing."""
 
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from hilcal import numbers
+from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import add_effect, remove_effect
-from hilcal.cli.fits import (
+from hilcal.cli.fitting import (
+    NO_PRIOR,
     PriorOptions,
     check_options,
     check_record,
     finish,
     fit_of,
     mode_of_option,
+    options_json,
+    options_line,
     record_story,
+    starting_model,
     stored_fit,
     wanted_effects,
 )
-from hilcal.cli.fitting import options_json, options_line
-from hilcal.cli.options import (
-    Details,
-    Drift,
-    EffectsFrom,
-    Json,
-    Prior,
-    PriorOf,
-    Readings,
-    Record,
-    Revision,
-    Run,
-    View,
-    argument,
-    catalogue_with,
-    option,
-)
+from hilcal.cli.options import catalogue_with, check_folder, command
 from hilcal.cli.showing import followed
 from hilcal.cli.terminal import terminal
 from hilcal.diagnosis.document import suspect_json, to_json
+from hilcal.diagnosis.serial_noise import with_serial_noise
 from hilcal.diagnosis.verdict import NOTHING
 from hilcal.diagnosis.verdict import diagnose as judge
-from hilcal.discovery.discovery import LawSearch, laws_json
+from hilcal.discovery.discovery import discover as search
+from hilcal.discovery.discovery import rival_sources
+from hilcal.discovery.document import discovery_json, laws_json
+from hilcal.discovery.proposal import LawSearch
 from hilcal.effects.catalogue import Catalogue
+from hilcal.effects.check import NAME
 from hilcal.effects.options import Options
+from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.effects.written import read_effects_text, write_effect
-from hilcal.errors import InputError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.fit import Fit
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.torques import check_torques
+from hilcal.names import quoted
 from hilcal.present.diagnosis import (
     addition_lines,
     curves,
@@ -64,8 +58,8 @@ from hilcal.present.diagnosis import (
     rose,
     verdict_line,
 )
-from hilcal.present.discovery import refined_laws
-from hilcal.present.fit import follows, prior_lines, set_aside
+from hilcal.present.discovery import discovery_report, refined_laws, silence
+from hilcal.present.fit import follows, model_name, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines
 from hilcal.present.story import Chapter
@@ -74,6 +68,7 @@ from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
 from hilcal.store.purpose import refuse_fitting
 from hilcal.store.revision import change
+from hilcal.whole_file import replace_file
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -101,11 +96,12 @@ def rows_of(numbers: Sequence[int], steps: Sequence[RefinementStep]) -> list[Rev
     ]
 
 
+@command()
 def diagnose(
-    run: Run,
-    revision: Revision = None,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Say which effect the model lacks."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -120,16 +116,19 @@ def diagnose(
     t.document({"revision": number, **to_json(d)})
 
 
+@command(
+    """
+    effect | EFFECT | See hilcal effects; with options: "creep(joints=each)".
+    """
+)
 def add(
-    run: Run,
-    effect: Annotated[
-        str, argument("EFFECT", 'See hilcal effects; with options: "creep(joints=each)".')
-    ],
-    revision: Revision = None,
-    record: Record = None,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effect: str,
+    revision: int | None = None,
+    record: Path | None = None,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
@@ -140,14 +139,19 @@ def add(
     _change(run, revision, name, record, view, as_json, catalogue, options)
 
 
+@command(
+    """
+    effect | EFFECT | One of the model.
+    """
+)
 def remove(
-    run: Run,
-    effect: Annotated[str, argument("EFFECT", "One of the model.")],
-    revision: Revision = None,
-    record: Record = None,
-    view: View = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effect: str,
+    revision: int | None = None,
+    record: Path | None = None,
+    view: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
@@ -207,50 +211,41 @@ def _change(
     )
 
 
+@command(
+    """
+    effects | --effects A,B | Effects to start from, as for identify.
+    from_latest | --from-latest | Start from the latest revision.
+    revision | --revision N | Start from this revision.
+    discover | --discover | Where no effect explains the misfit, search a law and add it; its effect
+        is written beside the campaign: found.py.
+    background | --background/--no-background | Where named effects leave more than noise, also fit
+        all others of the catalogue, as a background that predicts.
+    """
+)
 def refine(
-    run: Run,
-    effects: Annotated[
-        str | None, option("--effects A,B", "Effects to start from, as for identify.")
-    ] = None,
-    readings: Readings = None,
-    from_latest: Annotated[
-        bool, option("--from-latest", "Start from the latest revision.")
-    ] = False,
-    revision: Annotated[int | None, option("--revision N", "Start from this revision.")] = None,
-    prior: Prior = None,
-    prior_of: PriorOf = "arm",
-    drift: Drift = None,
-    discover: Annotated[
-        bool,
-        option(
-            "--discover",
-            "Where no effect explains the misfit, search a law and add it; its effect is "
-            "written beside the campaign: found.py.",
-        ),
-    ] = False,
-    background: Annotated[
-        bool,
-        option(
-            "--background/--no-background",
-            "Where named effects leave more than noise, also fit all others of the catalogue, "
-            "as a background that predicts.",
-        ),
-    ] = True,
-    record: Record = None,
-    view: View = False,
-    details: Details = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    effects: str | None = None,
+    readings: str | None = None,
+    from_latest: bool = False,
+    revision: int | None = None,
+    prior: PriorOptions = NO_PRIOR,
+    discover: bool = False,
+    background: bool = True,
+    record: Path | None = None,
+    view: bool = False,
+    details: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     named = wanted_effects(effects, catalogue)
     check_record(record)
     start = "--revision" if revision is not None else "--from-latest" if from_latest else ""
-    given = named is not None or readings is not None or prior is not None
+    given = named is not None or readings is not None or prior.prior is not None
     if start and (given or (from_latest and revision)):
         raise InputError(f"{start} keeps effects and readings; leave out the other options")
-    known = PriorOptions(prior, prior_of, drift).load(catalogue)
+    known = prior.load(catalogue)
     laws = LawSearch(run.absolute().parent) if discover else None
     with Campaign.open(run, catalogue) as o, followed(t, view, run) as live:
         refuse_fitting(o.file)
@@ -260,17 +255,13 @@ def refine(
         mode = mode_of_option(o, readings)
         check_options(o, named or {})
         with working(t.progress) as say:
-            fitted = o.readings
             if latest is not None:
                 say(f"restoring revision {latest.number}")
                 restored = o.restore(latest)
                 model, fitted = restored.model, restored.readings
-            elif named is None:
-                say("registering")
-                model = baseline(o.cell, o.readings, mode, catalogue, known)
             else:
                 say("registering")
-                model = with_effects(o.cell, o.readings, mode, named, named, catalogue, known)
+                model, fitted = starting_model(o, mode, named, known), o.readings
             how = NOTHING if latest is None else o.history(latest.number)
             numbers_to_be = itertools.count(len(o.file.revisions()) + 1)
             first = latest
@@ -308,8 +299,7 @@ def refine(
         other = other_arm_of(o.cell, o.readings) if latest is None else None
         if other is not None:
             t.show(other_arm_line(other))
-        weight = masses_note(found.fit)
-        if weight is not None:
+        if weight := masses_note(found.fit):
             t.show(numbers.sentence(weight))
         if found.rejected:
             t.show(
@@ -322,8 +312,7 @@ def refine(
         if last.verdict != "adequate" and not last.dependences:
             t.show(follows(last.misfit_breakdown))
         t.show([*curves(last.dependences, len(last.dependences) if details else 1)])
-        steps = zip(rows, found.steps, strict=True)
-        chapters = [chapter_of(r.number, s) for r, s in steps]
+        chapters = [chapter_of(n, s) for n, s in zip(numbered, found.steps, strict=True)]
         if live is not None:  # its verdict may have changed when others were tried
             live.revised(chapters[-1])
         record_story(t, chapters, record)
@@ -365,3 +354,82 @@ def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
         }
         for r in rows
     ]
+
+
+@command(
+    """
+    output | -o --output F.py | The effect, to be edited.
+    against | --against MODEL | Beside this model instead of the revision in use: effects A,B;
+        baseline; or the file of an exported calibration, whose effects are fitted to this run.
+    alternatives | --alternatives | Also write laws that these readings do not tell from it:
+        F_or_1.py; hilcal next plans what separates them.
+    """
+)
+def discover(
+    run: Path,
+    output: Path,
+    against: str | None = None,
+    alternatives: bool = False,
+    revision: int | None = None,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
+) -> None:
+    """Search a law for what no effect explains, and write it as an effect."""
+    t, catalogue = terminal(as_json), catalogue_with(effects_from)
+    wanted = _effects_against(against, catalogue)
+    name = output.stem
+    if output.suffix != ".py" or not NAME.fullmatch(name) or name in catalogue.names:
+        raise InputError(
+            f"-o {output}: the effect is called after its file; valid: lower-case letters, digits "
+            "and _, a letter first, .py at the end, and no name of the catalogue"
+        )
+    if wanted is not None and revision is not None:
+        raise InputError("--against and --revision: give one of them")
+    check_folder(output, f"-o {output}")
+    with Campaign.open(run, catalogue, read_only=True) as o, working(t.progress) as say:
+        number: int | None = None
+        if wanted is None:
+            number, found = fit_of(t, o, say, revision)
+        else:
+            check_options(o, wanted)
+            model = starting_model(o, o.mode(), wanted or None)
+            say(f"fitting {model_name(model.named)}")
+            found = with_serial_noise(fit(model, o.readings, o.mode()))
+        d = search(found, say, name)
+    document = {"revision": number, **discovery_json(d), "written": None}
+    t.show(discovery_report(d))
+    if not d.laws:
+        t.document(document, CannotAnswerError(silence(d)))
+    rivals = rival_sources(d) if alternatives else {}
+    written = {name: d.source, **rivals}
+    places = {own: output.with_name(f"{own}.py") for own in written}
+    for own, source in written.items():
+        replace_file(places[own], source)
+    t.show(
+        f"\n{output} has the first law as the effect {name}. Add it, and judge the model with it:"
+    )
+    t.command(f"hilcal add {quoted(run)} {name} --effects-from {quoted(output)}")
+    t.command(f"hilcal diagnose {quoted(run)} --effects-from {quoted(output)}")
+    if alternatives and not rivals:
+        t.show("No other law explains these readings as well.")
+    if rivals:
+        t.show("Plan the measurements that separate it from what explains these readings as well:")
+        files = " ".join(f"--effects-from {quoted(places[own])}" for own in written)
+        t.command(f"hilcal next {quoted(run)} -o PLAN.json --suspects {','.join(written)} {files}")
+    others = [{"name": own, "written": str(places[own])} for own in rivals]
+    t.document({**document, "written": str(output), "alternatives": others})
+
+
+def _effects_against(
+    model: str | None, catalogue: Catalogue
+) -> dict[str, dict[str, object]] | None:
+    """Read `--against`: options of effects by name; none of them for the baseline."""
+    if model == "baseline":
+        return {}
+    if model is None or not model.endswith(".json"):
+        return wanted_effects(model, catalogue)
+    return {
+        e.name: {key: value for key, value in e.options.items() if not key.startswith("prior_")}
+        for e in Calibration.load(model, catalogue).model.effects
+        if e.role not in FRAME_ROLES
+    }

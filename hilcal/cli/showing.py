@@ -9,20 +9,10 @@ import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Annotated
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.fits import check_record, record_story
-from hilcal.cli.options import (
-    EffectsFrom,
-    Json,
-    Record,
-    Revision,
-    Run,
-    argument,
-    catalogue_with,
-    option,
-)
+from hilcal.cli.fitting import check_record, record_story
+from hilcal.cli.options import catalogue_with, command
 from hilcal.cli.terminal import Terminal, terminal, told_to_end
 from hilcal.errors import InputError
 from hilcal.names import quoted
@@ -35,42 +25,30 @@ from hilcal.store.schema import is_campaign
 from hilcal.tables.units import parse_length
 
 
+@command(
+    """
+    later | [LATER.hilcal] | A later campaign of the same arm: compare the two.
+    output | -o --output F.html | The page; RUN.html unless given.
+    limit | --limit LENGTH | The largest 3-D position error allowed, e.g. "0.1 mm": the page says
+        passed or failed.
+    validation | --validation OTHER.hilcal | A campaign that was never fitted: how well is it
+        predicted?
+    operator | --operator NAME | Who answers for the measurement.
+    appendix | --appendix | Also what only another expert asks for: rejected suspects, each joint,
+        correlations, scalings, commands, hashes of revisions.
+    """
+)
 def report(
-    run: Run,
-    later: Annotated[
-        Path | None,
-        argument("[LATER.hilcal]", "A later campaign of the same arm: compare the two."),
-    ] = None,
-    output: Annotated[
-        Path | None, option("-o --output F.html", "The page; RUN.html unless given.")
-    ] = None,
-    limit: Annotated[
-        str | None,
-        option(
-            "--limit LENGTH",
-            'The largest 3-D position error allowed, e.g. "0.1 mm": the page says passed or '
-            "failed.",
-        ),
-    ] = None,
-    validation: Annotated[
-        Path | None,
-        option(
-            "--validation OTHER.hilcal",
-            "A campaign that was never fitted: how well is it predicted?",
-        ),
-    ] = None,
-    operator: Annotated[str, option("--operator NAME", "Who answers for the measurement.")] = "",
-    revision: Revision = None,
-    appendix: Annotated[
-        bool,
-        option(
-            "--appendix",
-            "Also what only another expert asks for: rejected suspects, each joint, "
-            "correlations, scalings, commands, hashes of revisions.",
-        ),
-    ] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    later: Path | None = None,
+    output: Path | None = None,
+    limit: str | None = None,
+    validation: Path | None = None,
+    operator: str = "",
+    revision: int | None = None,
+    appendix: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import Asked, write_report
@@ -103,17 +81,21 @@ def report(
     )
 
 
-ENDING = 5.0
-"""How long a server of a page or a story may delay the end, s."""
+ENDING = 5.0  # How long a server of a page or a story may delay the end, s
 
 
+@command(
+    """
+    port | --port | Port to serve viewers on.
+    """
+)
 def view(
-    run: Run,
-    revision: Revision = None,
-    record: Record = None,
-    port: Annotated[int, option("--port", "Port to serve viewers on.")] = PORT,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    revision: int | None = None,
+    record: Path | None = None,
+    port: int = PORT,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Tell the story of the revisions in rerun."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
@@ -131,10 +113,7 @@ def view(
         story = build_story(chapters)
     guard = _end_of_process()  # a viewer that does not answer may delay it; the campaign is closed
     try:
-        with (
-            told_to_end(signal.SIGINT, signal.SIGTERM) as wait,
-            serve(story, port=port) as served,
-        ):
+        with told_to_end(signal.SIGINT, signal.SIGTERM) as wait, serve(story, port=port) as served:
             t.show("Open the viewer with:")
             t.command(f"{viewer_command()} {served.url}")
             t.document({"url": served.url, "revisions": [c.number for c in chapters]})
@@ -162,7 +141,7 @@ def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]
     if not asked:
         yield None
         return
-    live = LiveViewer(live_recording(run), t.notice)
+    live = LiveViewer(run.with_name(f"{run.stem}.live.rrd"), t.notice)
     try:
         with working(t.progress) as say:
             say("starting the live viewer")
@@ -175,11 +154,6 @@ def followed(t: Terminal, asked: bool, run: Path) -> Iterator[LiveViewer | None]
         live.close()
         if live.record.exists():
             t.notice(f"recorded {live.record}; open it with: {opening(live.record)}")
-
-
-def live_recording(run: Path) -> Path:
-    """Return where the recording of a live viewer goes: beside the campaign."""
-    return run.with_name(f"{run.stem}.live.rrd")
 
 
 def opening(recording: Path) -> str:
@@ -195,26 +169,27 @@ def viewer_command() -> str:
     return "rerun"
 
 
+@command(
+    """
+    run | RUN.hilcal|TABLE | The campaign file, or a table.
+    config | --config CELL.toml | Begin with a table, measured in this cell.
+    kind | --format FORMAT | Of the table, as hilcal import takes it.
+    second | --second TABLE | The second file of a table.
+    output | -o --output RUN.hilcal | Of a table; TABLE.hilcal beside it else.
+    port | --port | Port on this machine; 8787, or a free one, unless given.
+    no_browser | --no-browser | Do not open the page, only print its address.
+    """
+)
 def workbench(
-    run: Annotated[Path, argument("RUN.hilcal|TABLE", "The campaign file, or a table.")],
-    config: Annotated[
-        Path | None, option("--config CELL.toml", "Begin with a table, measured in this cell.")
-    ] = None,
-    kind: Annotated[
-        str, option("--format FORMAT", "Of the table, as hilcal import takes it.")
-    ] = "table",
-    second: Annotated[Path | None, option("--second TABLE", "The second file of a table.")] = None,
-    output: Annotated[
-        Path | None, option("-o --output RUN.hilcal", "Of a table; TABLE.hilcal beside it else.")
-    ] = None,
-    port: Annotated[
-        int | None, option("--port", "Port on this machine; 8787, or a free one, unless given.")
-    ] = None,
-    no_browser: Annotated[
-        bool, option("--no-browser", "Do not open the page, only print its address.")
-    ] = False,
-    effects_from: EffectsFrom = None,
-    as_json: Json = False,
+    run: Path,
+    config: Path | None = None,
+    kind: str = "table",
+    second: Path | None = None,
+    output: Path | None = None,
+    port: int | None = None,
+    no_browser: bool = False,
+    effects_from: list[Path] | None = None,
+    as_json: bool = False,
 ) -> None:
     """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)

@@ -119,8 +119,7 @@ def agreed(t: Terminal, question: str) -> bool:
         t.notice(f"{answer!r} is no answer. Type y or n, and press Enter.")
 
 
-POLL = 0.2
-"""How long a plea to end may stay unheard where a signal does not wake the sleeper, s."""
+POLL = 0.2  # How long a plea to end may stay unheard where a signal does not wake the sleeper, s
 
 
 @contextmanager

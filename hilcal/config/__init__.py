@@ -11,9 +11,17 @@ from hilcal.config.cell import (
     Tracker,
     load_config,
 )
-from hilcal.config.loads import CellLoad, Limits
-from hilcal.config.planning import Obstacle, Planning, Sight
-from hilcal.config.rig import Acquire, ForceSensor, Motion, Operator
+from hilcal.config.sections import (
+    Acquire,
+    CellLoad,
+    ForceSensor,
+    Limits,
+    Motion,
+    Obstacle,
+    Operator,
+    Planning,
+    Sight,
+)
 
 __all__ = [
     "STANDARD_GRAVITY_M_S2",

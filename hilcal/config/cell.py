@@ -6,95 +6,62 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, Strict, model_validator
 
-from hilcal.config.joints import Conventions
-from hilcal.config.loads import CellLoad, Limits
-from hilcal.config.observers import Gauge, Point
-from hilcal.config.planning import Obstacle, Planning, Sight
-from hilcal.config.rig import (
-    HOST,
-    OPTIONS,
-    PORT,
-    ROTVEC,
-    VECTOR_M,
+from hilcal.config.sections import (
     Acquire,
+    CellLoad,
+    CellSection,
+    Conventions,
     ForceSensor,
+    Gauge,
+    Limits,
     Motion,
+    Obstacle,
     Operator,
+    Planning,
+    Point,
+    Sight,
     Whole,
 )
 from hilcal.errors import InputError
-from hilcal.toml import (
-    NonNegative,
-    Positive,
-    Section,
-    Vector3,
-    check_json,
-    load_section,
-    suggest,
-)
+from hilcal.toml import NonNegative, Positive, Vector3, check_json, load_section, suggest
 from hilcal.types import Floats
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 
 
-def _std(what: str) -> str:
-    return f"the standard deviation {what}"
-
-
 class Robot(Conventions):
-    """[robot]: which arm, how its controller counts the joints, and how it stands in gravity."""
+    """[robot]: which arm, how its controller counts the joints, and how it stands in gravity.
 
-    model: str = Field(
-        min_length=1,
-        description='a catalogue name, e.g. "ur10e", or the path of a .urdf file or of a .toml '
-        "file with DH rows",
-        examples=["ur10e"],
-    )
-    gravity_m_s2: Vector3 = Field(
-        (0.0, 0.0, -STANDARD_GRAVITY_M_S2),
-        description="gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]",
-    )
-    repeatability_m: Positive | None = Field(
-        None,
-        description="the pose repeatability of ISO 9283 that the maker states, in m, more than 0; "
-        "that of the arm's file if absent",
-        examples=[5e-5],
-    )
-    driver: str | None = Field(
-        None, min_length=1, description='the name of an arm\'s driver, e.g. "ur"', examples=["ur"]
-    )
-    host: str | None = Field(
-        None,
-        min_length=1,
-        description='the controller\'s address, e.g. "192.168.56.101"',
-        examples=["192.168.56.101"],
-    )
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
-    torques: Literal["modelled", "measured"] = Field(
-        "modelled",
-        description='"modelled" or "measured": the joint torques that twist the drives, those of '
-        "the described masses and loads, or the columns tau1_Nm, ... of the readings",
-    )
-    kinematics: Literal["nominal", "factory"] = Field(
-        "nominal",
-        description='"nominal" (the arm as its maker designed it) or "factory" (as calibration has '
-        "it): what corrections are counted from",
-        examples=["factory"],
-    )
-    calibration: str | None = Field(
-        None,
-        min_length=1,
-        description="the path of a file with the factory's kinematics of this one arm of Universal "
-        "Robots: calibration.conf, a .yaml of ur_calibration, or a .toml of "
-        "check --save-calibration",
-        examples=["calibration.conf"],
-    )
-    base_link: str | None = Field(
-        None, description="the name of a link of the URDF", examples=["base_link"]
-    )
-    tip_link: str | None = Field(
-        None, description="the name of a link of the URDF", examples=["tool0"]
-    )
+    model: a catalogue name, e.g. "ur10e", or the path of a .urdf file or of a .toml file with DH
+        rows | "ur10e"
+    gravity_m_s2: gravity in base axes: three finite numbers in m/s², e.g. [0.0, 0.0, -9.80665]
+    repeatability_m: the pose repeatability of ISO 9283 that the maker states, in m, more than 0;
+        that of the arm's file if absent | 5e-05
+    driver: the name of an arm's driver, e.g. "ur" | "ur"
+    host: the controller's address, e.g. "192.168.56.101" | "192.168.56.101"
+    options: $OPTIONS | {}
+    torques: "modelled" or "measured": the joint torques that twist the drives, those of the
+        described masses and loads, or the columns tau1_Nm, ... of the readings
+    kinematics: "nominal" (the arm as its maker designed it) or "factory" (as calibration has it):
+        what corrections are counted from | "factory"
+    calibration: the path of a file with the factory's kinematics of this one arm of Universal
+        Robots: calibration.conf, a .yaml of ur_calibration, or a .toml of check --save-calibration
+        | "calibration.conf"
+    base_link: the name of a link of the URDF | "base_link"
+    tip_link: the name of a link of the URDF | "tool0"
+    """
+
+    model: str = Field(min_length=1)
+    gravity_m_s2: Vector3 = (0.0, 0.0, -STANDARD_GRAVITY_M_S2)
+    repeatability_m: Positive | None = None
+    driver: str | None = Field(None, min_length=1)
+    host: str | None = Field(None, min_length=1)
+    options: dict[str, Any] = Field(default_factory=dict)
+    torques: Literal["modelled", "measured"] = "modelled"
+    kinematics: Literal["nominal", "factory"] = "nominal"
+    calibration: str | None = Field(None, min_length=1)
+    base_link: str | None = None
+    tip_link: str | None = None
 
     @model_validator(mode="after")
     def _has_calibration(self) -> "Robot":
@@ -115,23 +82,20 @@ class Robot(Conventions):
         return self
 
 
-class Target(Section):
-    """[[tool.targets]]: one of several targets that the tool carries (flange axes)."""
+class Target(CellSection):
+    """[[tool.targets]]: one of several targets that the tool carries (flange axes).
 
-    name: str = Field(min_length=1, description='the name of a target, e.g. "R1"', examples=["R1"])
-    target_m: Vector3 | None = Field(
-        None,
-        description=VECTOR_M + ": the target, flange axes; leave it out to have it estimated",
-        examples=[[0.06, 0.02, 0.12]],
-    )
-    target_rotvec_rad: Vector3 | None = Field(
-        None, description=ROTVEC + ": the target's axes in flange axes", examples=[[0.0, 0.0, 1.57]]
-    )
-    estimate: bool = Field(
-        False,
-        description="true or false: whether target_m is rough, and the offset estimated",
-        examples=[True],
-    )
+    name: the name of a target, e.g. "R1" | "R1"
+    target_m: $VECTOR_M: the target, flange axes; leave it out to have it estimated | [0.06, 0.02,
+        0.12]
+    target_rotvec_rad: $ROTVEC: the target's axes in flange axes | [0.0, 0.0, 1.57]
+    estimate: true or false: whether target_m is rough, and the offset estimated | true
+    """
+
+    name: str = Field(min_length=1)
+    target_m: Vector3 | None = None
+    target_rotvec_rad: Vector3 | None = None
+    estimate: bool = False
 
     @model_validator(mode="after")
     def _sound(self) -> "Target":
@@ -148,33 +112,25 @@ def _check_target(xyz: tuple[float, ...] | None, rotvec: tuple[float, ...] | Non
         raise ValueError("target_rotvec_rad without target_m; give both or neither")
 
 
-class Tool(Section):
-    """[tool]: what the flange carries, where the target sits and the load acts (flange axes)."""
+class Tool(CellSection):
+    """[tool]: what the flange carries, where the target sits and the load acts (flange axes).
 
-    target_m: Vector3 | None = Field(
-        None,
-        description=VECTOR_M + ": the target, flange axes; leave it out to have it estimated",
-        examples=[[0.06, 0.02, 0.12]],
-    )
-    target_rotvec_rad: Vector3 | None = Field(
-        None, description=ROTVEC + ": the target's axes in flange axes", examples=[[0.0, 0.0, 1.57]]
-    )
-    targets: tuple[Target, ...] = Field(
-        (),
-        description="sections [[tool.targets]], one per target, in the order of measurement",
-        examples=[[{"name": "R1", "target_m": [0.06, 0.02, 0.12]}]],
-    )
-    load_point_m: Vector3 = Field(
-        (0.0, 0.0, 0.0),
-        description=VECTOR_M + ": where loads act, flange axes",
-        examples=[[0.1, 0.0, 0.15]],
-    )
-    mass_kg: NonNegative = Field(0.0, description="a mass in kg, 0 or more", examples=[0.8])
-    com_m: Vector3 = Field(
-        (0.0, 0.0, 0.0),
-        description=VECTOR_M + ": the tool's centre of mass, flange axes",
-        examples=[[0.01, 0.0, 0.06]],
-    )
+    target_m: $VECTOR_M: the target, flange axes; leave it out to have it estimated | [0.06, 0.02,
+        0.12]
+    target_rotvec_rad: $ROTVEC: the target's axes in flange axes | [0.0, 0.0, 1.57]
+    targets: sections [[tool.targets]], one per target, in the order of measurement | [{ name =
+        "R1", target_m = [0.06, 0.02, 0.12] }]
+    load_point_m: $VECTOR_M: where loads act, flange axes | [0.1, 0.0, 0.15]
+    mass_kg: a mass in kg, 0 or more | 0.8
+    com_m: $VECTOR_M: the tool's centre of mass, flange axes | [0.01, 0.0, 0.06]
+    """
+
+    target_m: Vector3 | None = None
+    target_rotvec_rad: Vector3 | None = None
+    targets: tuple[Target, ...] = ()
+    load_point_m: Vector3 = (0.0, 0.0, 0.0)
+    mass_kg: NonNegative = 0.0
+    com_m: Vector3 = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
     def _metres(self) -> "Tool":
@@ -199,63 +155,50 @@ class Tool(Section):
         return self
 
 
-class Tracker(Section):
+class Tracker(CellSection):
     """[tracker]: the frame of the readings, its registration, and the tracker's noise.
 
     The noise of a point at the distance d is sqrt(range² + transverse²) with standard
     deviations `std + std_per_m * d` along and across the beam. Defaults: half of the maximum
     permissible errors of a Leica AT500 (range 10 µm + 0.3 µm/m, transverse 15 µm + 6 µm/m),
     and half of 0.01° for orientations.
+
+    driver: the name of a tracker's driver, e.g. "geocom" or "emscon" | "geocom"
+    port: $PORT | "/dev/serial/by-id/usb-FTDI_..."
+    baud: the line's rate in Bd; the driver's own if absent | 115200
+    host: $HOST | "192.168.0.1"
+    options: $OPTIONS | {}
+    frame: "tracker" or "base": the axes in which positions are given
+    observes: "position", "distance" (from all [points.NAME]) or "height" (of all [gauges.NAME]):
+        what readings are planned; devices read positions
+    base_xyz_m: $VECTOR_M: the arm's base in the tracker frame | [3.0, 0.5, -0.9]
+    base_rotvec_rad: $ROTVEC | [0.0, 0.0, 1.57]
+    station_m: $VECTOR_M: the tracker's position in base axes | [3.0, 0.5, 0.9]
+    range_std_m: the standard deviation along the beam in m, more than 0, e.g. 5e-6
+    range_std_per_m: the standard deviation along the beam per metre of distance, 0 or more, e.g.
+        0.15e-6
+    transverse_std_m: the standard deviation across the beam in m, more than 0, e.g. 7.5e-6
+    transverse_std_per_m: the standard deviation across the beam per metre of distance, 0 or more,
+        e.g. 3e-6
+    orientation_std_rad: the standard deviation of a target's orientation in rad, more than 0, e.g.
+        8.7e-5
     """
 
-    driver: str | None = Field(
-        None,
-        min_length=1,
-        description='the name of a tracker\'s driver, e.g. "geocom" or "emscon"',
-        examples=["geocom"],
-    )
-    port: str | None = Field(
-        None, min_length=1, description=PORT, examples=["/dev/serial/by-id/usb-FTDI_..."]
-    )
-    baud: Whole | None = Field(
-        None, description="the line's rate in Bd; the driver's own if absent", examples=[115200]
-    )
-    host: str | None = Field(None, min_length=1, description=HOST, examples=["192.168.0.1"])
-    options: dict[str, Any] = Field(default_factory=dict, description=OPTIONS, examples=[{}])
-    frame: Literal["tracker", "base"] = Field(
-        "tracker", description='"tracker" or "base": the axes in which positions are given'
-    )
-    observes: Literal["position", "distance", "height"] = Field(
-        "position",
-        description='"position", "distance" (from all [points.NAME]) or "height" (of all '
-        "[gauges.NAME]): what readings are planned; devices read positions",
-    )
-    base_xyz_m: Vector3 | None = Field(
-        None,
-        description=VECTOR_M + ": the arm's base in the tracker frame",
-        examples=[[3.0, 0.5, -0.9]],
-    )
-    base_rotvec_rad: Vector3 | None = Field(None, description=ROTVEC, examples=[[0.0, 0.0, 1.57]])
-    station_m: Vector3 | None = Field(
-        None,
-        description=VECTOR_M + ": the tracker's position in base axes",
-        examples=[[3.0, 0.5, 0.9]],
-    )
-    range_std_m: Positive = Field(
-        5e-6, description=_std("along the beam in m, more than 0, e.g. 5e-6")
-    )
-    range_std_per_m: NonNegative = Field(
-        0.15e-6, description=_std("along the beam per metre of distance, 0 or more, e.g. 0.15e-6")
-    )
-    transverse_std_m: Positive = Field(
-        7.5e-6, description=_std("across the beam in m, more than 0, e.g. 7.5e-6")
-    )
-    transverse_std_per_m: NonNegative = Field(
-        3e-6, description=_std("across the beam per metre of distance, 0 or more, e.g. 3e-6")
-    )
-    orientation_std_rad: Positive = Field(
-        8.7e-5, description=_std("of a target's orientation in rad, more than 0, e.g. 8.7e-5")
-    )
+    driver: str | None = Field(None, min_length=1)
+    port: str | None = Field(None, min_length=1)
+    baud: Whole | None = None
+    host: str | None = Field(None, min_length=1)
+    options: dict[str, Any] = Field(default_factory=dict)
+    frame: Literal["tracker", "base"] = "tracker"
+    observes: Literal["position", "distance", "height"] = "position"
+    base_xyz_m: Vector3 | None = None
+    base_rotvec_rad: Vector3 | None = None
+    station_m: Vector3 | None = None
+    range_std_m: Positive = 5e-6
+    range_std_per_m: NonNegative = 0.15e-6
+    transverse_std_m: Positive = 7.5e-6
+    transverse_std_per_m: NonNegative = 3e-6
+    orientation_std_rad: Positive = 8.7e-5
 
     @property
     def states_noise(self) -> bool:
@@ -291,26 +234,18 @@ class Tracker(Section):
         return self
 
 
-class Repeatability(Section):
-    """[repeatability]: scatter of the joints from one arrival to the next."""
+class Repeatability(CellSection):
+    """[repeatability]: scatter of the joints from one arrival to the next.
 
-    joint_std_rad: NonNegative | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = Field(
-        0.0,
-        description="one standard deviation in rad, 0 or more, or one per joint",
-        examples=[1e-5],
-    )
-    in_tables: bool = Field(
-        False,
-        description="true where the covariances of imported tables include the arm's scatter",
-        examples=[True],
-    )
+    joint_std_rad: one standard deviation in rad, 0 or more, or one per joint | 1e-05
+    in_tables: true where the covariances of imported tables include the arm's scatter | true
+    """
+
+    joint_std_rad: NonNegative | Annotated[tuple[NonNegative, ...], Field(min_length=1)] = 0.0
+    in_tables: bool = False
 
     def per_joint(self, n: int) -> Floats:
-        """Return (n,) standard deviations, rad.
-
-        Raises:
-            InputError: the number of values is not the arm's number of joints.
-        """
+        """Return (n,) standard deviations, rad."""
         values = np.asarray(self.joint_std_rad, dtype=np.float64)
         if values.ndim == 1 and len(values) != n:
             raise InputError(
@@ -320,77 +255,69 @@ class Repeatability(Section):
         return np.broadcast_to(values, n).copy()
 
 
-class Simulation(Section):
-    """[simulation]: what a simulated cell hides."""
+class Simulation(CellSection):
+    """[simulation]: what a simulated cell hides.
 
-    seed: Annotated[int, Strict(), Field(ge=0)] = Field(
-        0, description="the seed of the random numbers, a whole number, 0 or more", examples=[4]
-    )
-    hide: str | None = Field(
-        None, description='the name of an effect to hide, or "random"', examples=["creep"]
-    )
-    strength_sigma: Positive = Field(
-        3.0, description="the RMS strength of the hidden effect in sigmas of a reading, more than 0"
-    )
-    clock: Annotated[float, Strict(), Field(ge=1, le=200)] = Field(
-        1.0,
-        description="how much faster than real time the simulated world goes, 1 to 200",
-        examples=[20.0],
-    )
-    controller_version: str = Field(
-        "5.11.6.1010327",
-        pattern=r"^\d+\.\d+\.\d+\.\d+$",
-        description="the software of the simulated arm's controller, four numbers with dots "
-        "between; from 10 on it is PolyScope X",
-        examples=["10.14.0.0"],
-    )
+    seed: the seed of the random numbers, a whole number, 0 or more | 4
+    hide: the name of an effect to hide, or "random" | "creep"
+    strength_sigma: the RMS strength of the hidden effect in sigmas of a reading, more than 0
+    clock: how much faster than real time the simulated world goes, 1 to 200 | 20.0
+    controller_version: the software of the simulated arm's controller, four numbers with dots
+        between; from 10 on it is PolyScope X | "10.14.0.0"
+    """
+
+    seed: Annotated[int, Strict(), Field(ge=0)] = 0
+    hide: str | None = None
+    strength_sigma: Positive = 3.0
+    clock: Annotated[float, Strict(), Field(ge=1, le=200)] = 1.0
+    controller_version: str = Field("5.11.6.1010327", pattern=r"^\d+\.\d+\.\d+\.\d+$")
 
 
-class CellConfig(Section):
-    """The whole of CELL.toml."""
+class CellConfig(CellSection):
+    """The whole of CELL.toml.
 
-    robot: Robot = Field(description='a section [robot] with model = "ur10e" or the like')
-    tool: Tool = Field(default_factory=Tool, description="a section [tool]")
-    tracker: Tracker = Field(default_factory=Tracker, description="a section [tracker]")
-    repeatability: Repeatability = Field(
-        default_factory=Repeatability, description="a section [repeatability]"
-    )
-    loads: tuple[CellLoad, ...] = Field((), description="sections [[loads]], one per load")
-    force_sensor: ForceSensor | None = Field(
-        None, description='a section [force_sensor] with driver = "ft300" and port or the like'
-    )
-    operator: Operator = Field(default_factory=Operator, description="a section [operator]")
-    motion: Motion = Field(default_factory=Motion, description="a section [motion]")
-    acquire: Acquire = Field(default_factory=Acquire, description="a section [acquire]")
-    limits: Limits = Field(default_factory=Limits, description="a section [limits]")
-    planning: Planning = Field(default_factory=Planning, description="a section [planning]")
-    obstacles: tuple[Obstacle, ...] = Field(
-        (), description="sections [[obstacles]], one per thing that stands in the arm's way"
-    )
-    sight: Sight = Field(default_factory=Sight, description="a section [sight]")
-    points: dict[str, Point] = Field(
-        default_factory=dict,
-        description="sections [points.NAME], one per point that distances are measured from",
-        examples=[{"P1": {"position_m": [1.2, 0.4, 0.0]}}],
-    )
-    gauges: dict[str, Gauge] = Field(
-        default_factory=dict,
-        description="sections [gauges.NAME], one per dial gauge or plane that is touched",
-        examples=[{"G1": {"direction": [0.0, 0.0, 1.0]}}],
-    )
-    simulation: Simulation = Field(default_factory=Simulation, description="a section [simulation]")
-    ordinary: dict[str, Positive] = Field(
-        default_factory=dict,
-        description="a section [ordinary]: how many times as large as on other arms an effect is "
-        "expected, by its name, e.g. transmission_error = 0.1 of precise gears",
-        examples=[{"transmission_error": 0.1}],
-    )
-    plausible: dict[str, Positive] = Field(
-        default_factory=dict,
-        description="a section [plausible]: how many times as large as stated an effect may be, "
-        "by its name, e.g. link_geometry = 4.0",
-        examples=[{"link_geometry": 4.0}],
-    )
+    robot: a section [robot] with model = "ur10e" or the like
+    tool: a section [tool]
+    tracker: a section [tracker]
+    repeatability: a section [repeatability]
+    loads: sections [[loads]], one per load
+    force_sensor: a section [force_sensor] with driver = "ft300" and port or the like
+    operator: a section [operator]
+    motion: a section [motion]
+    acquire: a section [acquire]
+    limits: a section [limits]
+    planning: a section [planning]
+    obstacles: sections [[obstacles]], one per thing that stands in the arm's way
+    sight: a section [sight]
+    points: sections [points.NAME], one per point that distances are measured from | { P1 = {
+        position_m = [1.2, 0.4, 0.0] } }
+    gauges: sections [gauges.NAME], one per dial gauge or plane that is touched | { G1 = { direction
+        = [0.0, 0.0, 1.0] } }
+    simulation: a section [simulation]
+    ordinary: a section [ordinary]: how many times as large as on other arms an effect is expected,
+        by its name, e.g. transmission_error = 0.1 of precise gears | { transmission_error = 0.1 }
+    plausible: a section [plausible]: how many times as large as stated an effect may be, by its
+        name, e.g. link_geometry = 4.0 | { link_geometry = 4.0 }
+    """
+
+    robot: Robot
+    tool: Tool = Field(default_factory=Tool)
+    tracker: Tracker = Field(default_factory=Tracker)
+    repeatability: Repeatability = Field(default_factory=Repeatability)
+    loads: tuple[CellLoad, ...] = ()
+    force_sensor: ForceSensor | None = None
+    operator: Operator = Field(default_factory=Operator)
+    motion: Motion = Field(default_factory=Motion)
+    acquire: Acquire = Field(default_factory=Acquire)
+    limits: Limits = Field(default_factory=Limits)
+    planning: Planning = Field(default_factory=Planning)
+    obstacles: tuple[Obstacle, ...] = ()
+    sight: Sight = Field(default_factory=Sight)
+    points: dict[str, Point] = Field(default_factory=dict)
+    gauges: dict[str, Gauge] = Field(default_factory=dict)
+    simulation: Simulation = Field(default_factory=Simulation)
+    ordinary: dict[str, Positive] = Field(default_factory=dict)
+    plausible: dict[str, Positive] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _distinct_names(self) -> "CellConfig":

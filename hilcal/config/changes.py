@@ -13,8 +13,7 @@ from hilcal.config.cell import CellConfig
 from hilcal.errors import InputError
 from hilcal.toml import check_section, section_of, suggest
 
-Changes = Mapping[str, Mapping[str, Any]]
-"""Values by key, by section."""
+Changes = Mapping[str, Mapping[str, Any]]  # Values by key, by section
 
 INSTRUMENT_NOISE = (
     "range_std_m",
@@ -27,10 +26,7 @@ INSTRUMENT_NOISE = (
 CHANGEABLE: Mapping[str, tuple[str, ...]] = {
     "tracker": (*INSTRUMENT_NOISE, "base_xyz_m", "base_rotvec_rad", "station_m"),
     "repeatability": ("joint_std_rad",),
-    "tool": (
-        *("target_m", "target_rotvec_rad", "targets", "load_point_m"),
-        *("mass_kg", "com_m"),
-    ),
+    "tool": (*("target_m", "target_rotvec_rad", "targets", "load_point_m"), *("mass_kg", "com_m")),
 }
 """Keys that can be changed, by section."""
 _WHERE = "the cell"

@@ -1,6 +1,8 @@
-"""Every key of CELL.toml with unit, default and example, read off the sections themselves."""
+"""Every key of CELL.toml with unit, default and example; a commented CELL.toml to begin with."""
 
-from collections.abc import Iterator, Mapping
+import re
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -9,70 +11,41 @@ from pydantic.fields import FieldInfo
 
 from hilcal.config.cell import CellConfig
 from hilcal.errors import InputError
+from hilcal.names import escaped
 from hilcal.toml import Section, section_of, suggest
 
-_UNITS = (
-    ("_m_s2", "m/s²"),
-    ("_rad_s2", "rad/s²"),
-    ("_rad_s", "rad/s"),
-    ("_std_per_m", "m/m"),
-    ("_std_m", "m"),
-    ("_m", "m"),
-    ("_rad", "rad"),
-    ("_deg", "deg"),
-    ("_kg", "kg"),
-    ("_Nm", "N·m"),
-    ("_N", "N"),
-    ("_s", "s"),
-    ("_hz", "Hz"),
-    ("_sigma", "σ"),
-    ("_share", "1"),
-    ("baud", "Bd"),
-    ("samples", "readings"),
-    ("frames", "frames"),
-    ("web_port", "TCP"),
-    ("candidates", "poses"),
-    ("clock", "times real time"),
-    ("singularity", "1"),
-    ("factor", "1"),
-    ("direction", "1"),
+_UNITS = dict(
+    re.findall(
+        r"(\S+)=(.+?)(?:; |$)",
+        "_m_s2=m/s²; _rad_s2=rad/s²; _rad_s=rad/s; _std_per_m=m/m; _std_m=m; _m=m; _rad=rad; "
+        "_deg=deg; _kg=kg; _Nm=N·m; _N=N; _s=s; _hz=Hz; _sigma=σ; _share=1; baud=Bd; "
+        "samples=readings; frames=frames; web_port=TCP; candidates=poses; clock=times real time; "
+        "singularity=1; factor=1; direction=1",
+    )
 )
-"""Units by the end of a key's name."""
+"""Units by the end of a key's name; the first that fits."""
 REQUIRED = "required"
 NOT_SET = "not set"
 
 
 @dataclass(frozen=True, slots=True)
 class Key:
-    """One key.
-
-    Attributes:
-        unit: of its value; "" for texts, choices and tables.
-        default: as it is written in TOML, `REQUIRED` or `NOT_SET`.
-        valid: what its value must be.
-        example: a line of TOML.
-    """
+    """One key."""
 
     name: str
-    unit: str
-    default: str
-    valid: str
-    example: str
+    unit: str  # of its value; "" for texts, choices and tables
+    default: str  # as it is written in TOML, `REQUIRED` or `NOT_SET`
+    valid: str  # what its value must be
+    example: str  # a line of TOML
 
 
 @dataclass(frozen=True, slots=True)
 class KeyTable:
-    """One section of CELL.toml.
+    """One section of CELL.toml."""
 
-    Attributes:
-        name: e.g. "tracker".
-        header: as it is written, e.g. "[tracker]" or "[[loads]]".
-        about: what it is for, one line.
-    """
-
-    name: str
-    header: str
-    about: str
+    name: str  # e.g. "tracker"
+    header: str  # as it is written, e.g. "[tracker]" or "[[loads]]"
+    about: str  # what it is for, one line
     keys: tuple[Key, ...]
 
 
@@ -138,7 +111,7 @@ def _by_name(name: str, field: FieldInfo) -> KeyTable:
 
 
 def _key(name: str, field: FieldInfo) -> Key:
-    unit = next((unit for end, unit in _UNITS if name.endswith(end)), "")
+    unit = next((unit for end, unit in _UNITS.items() if name.endswith(end)), "")
     default, value = _default(field), example(field)
     return Key(name, unit, default, field.description or "", f"{name} = {inline(value)}")
 
@@ -171,3 +144,62 @@ def inline(value: Any) -> str:
 
 def _is_list(field: FieldInfo) -> bool:
     return getattr(field.annotation, "__origin__", None) is tuple
+
+
+SHOWN = {
+    "robot": ("model", "repeatability_m", "driver", "host"),
+    "tool": ("target_m", "load_point_m", "mass_kg", "com_m"),
+    "tracker": (
+        *("driver", "port", "frame", "range_std_m", "range_std_per_m"),
+        *("transverse_std_m", "transverse_std_per_m"),
+    ),
+    "force_sensor": ("driver", "port", "origin_m"),
+    "repeatability": ("joint_std_rad",),
+    "loads": ("name", "mass_kg", "force_N", "moment_Nm"),
+    "limits": ("workspace_min_m", "workspace_max_m"),
+    "sight": ("tracker_m", "target_normal"),
+    "planning": ("model", "readings", "criterion", "work_min_m", "work_max_m", "candidates"),
+    "simulation": ("hide", "clock"),
+}
+"""Keys that are in the file, as values or as examples; `hilcal config` explains all."""
+_HEAD = """\
+# {title}
+# Written by hilcal init; SI units. A line that begins with # and a key is an example: take the #
+# away to use it. hilcal config SECTION explains every key of a section.
+"""
+
+
+def cell_text(data: Mapping[str, Any], title: str) -> str:
+    """Return a CELL.toml with the sections and keys that have values, as TOML has them."""
+    lines, known = [_HEAD.format(title=escaped(title))], tables()
+    for name, keys in SHOWN.items():
+        lines += [*_section(table(name, known), keys, data.get(name)), ""]
+    return "\n".join(lines)
+
+
+def _section(t: KeyTable, keys: Sequence[str], given: Any) -> Iterator[str]:
+    yield from _comment(t.about)
+    if t.header.startswith("[[") or (not given and REQUIRED in [k.default for k in t.keys]):
+        if not given:
+            yield f"#{t.header}"
+            yield from (f"#{k.example}" for k in t.keys if k.name in keys)
+        for one in given or ():
+            yield t.header
+            yield from (f"{key} = {inline(value)}" for key, value in one.items())
+        return
+    values, by_name = dict(given or {}), {k.name: k for k in t.keys}
+    yield t.header
+    for name in dict.fromkeys((*keys, *values)):
+        key = by_name[name]
+        default = "" if key.default in (REQUIRED, NOT_SET) else f"; {key.default} if left out"
+        yield from _comment(f"{key.valid}{default}")
+        yield f"{name} = {inline(values[name])}" if name in values else f"#{key.example}"
+
+
+def _comment(words: str) -> list[str]:
+    return [f"# {line}" for line in textwrap.wrap(words, 98)]
+
+
+def to_toml(config: CellConfig) -> str:
+    """Return CELL.toml's text; `load_config` reads back the same configuration."""
+    return tomli_w.dumps(config.model_dump(exclude_none=True, exclude_defaults=True, mode="json"))

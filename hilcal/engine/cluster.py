@@ -13,17 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hilcal.engine.tasks import ClusterError, Task, deadly
+from hilcal.engine.processes import ClusterError, Task, deadly
 from hilcal.errors import InputError
 from hilcal.optional import needed_by
 
 if TYPE_CHECKING:  # takes half a second to import
     from distributed import Client
 
-ANSWER_S = 10.0
-"""How long a cluster's scheduler may take to answer; a choice."""
-WORKERS_S = 10.0
-"""How long a cluster may have no worker at the start; a choice."""
+ANSWER_S = 10.0  # How long a cluster's scheduler may take to answer; a choice
+WORKERS_S = 10.0  # How long a cluster may have no worker at the start; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,12 +63,7 @@ class Cluster:
 
 @contextmanager
 def cluster(address: str) -> Iterator[Cluster]:
-    """Yield a connection to a cluster.
-
-    Raises:
-        InputError: an address that is none; certificates that are not there.
-        ClusterError: nothing answers at the address.
-    """
+    """Yield a connection to a cluster."""
     with _quiet():
         from distributed import Client
 

@@ -20,8 +20,7 @@ from typing import TypeVar
 import numpy as np
 
 from hilcal.engine.cluster import Cluster, cluster
-from hilcal.engine.processes import Processes, processes
-from hilcal.engine.tasks import Task, compute, versions
+from hilcal.engine.processes import Processes, Task, compute, processes, versions
 from hilcal.errors import InputError
 
 Item = TypeVar("Item")
@@ -42,19 +41,7 @@ class Engine:
         seed: int | None = None,
         advance: Advance | None = None,
     ) -> tuple[Result, ...]:
-        """Return function(item) of every item, in order of the items.
-
-        Args:
-            function: of a module, which workers find by its name, or a `partial` of one. It must
-                depend on its arguments alone.
-            items: what it is called with.
-            seed: with a seed the function is called with a generator of its own as well:
-                function(item, generator).
-            advance: told 1 for each item that is done.
-
-        Raises:
-            ClusterError: the cluster is gone, or an item ended every worker that computed it.
-        """
+        """Return function(item) of every item, in order of the items."""
         found: dict[int, Result] = {}
         for k, result in self.results(function, items, seed):
             found[k] = result
@@ -63,10 +50,7 @@ class Engine:
         return tuple(found[k] for k in range(len(items)))
 
     def results(
-        self,
-        function: Callable[..., Result],
-        items: Sequence[Item],
-        seed: int | None = None,
+        self, function: Callable[..., Result], items: Sequence[Item], seed: int | None = None
     ) -> Iterator[tuple[int, Result]]:
         """Yield (number of the item, result) as they are done, in no order; see `map`."""
         count = len(items)
@@ -78,8 +62,7 @@ class Engine:
         yield from self.workers.results(Task(function, versions()), items, seeds)
 
 
-ALONE = Engine(None)
-"""Computes in this process; BLAS has as many threads as it had."""
+ALONE = Engine(None)  # Computes in this process; BLAS has as many threads as it had
 
 
 @contextmanager

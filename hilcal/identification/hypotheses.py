@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config.joints import Conventions
+from hilcal.config.sections import Conventions
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, other_arms

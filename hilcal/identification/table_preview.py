@@ -28,8 +28,10 @@ from hilcal.identification.rigid_frames import nearest_rotation, rotation_of_att
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
-from hilcal.tables.guessing.guess_values import BY_VALUES, RIVALS
-from hilcal.tables.guessing.proposal import (
+from hilcal.tables.guess_values import BY_VALUES, RIVALS
+from hilcal.tables.importing import import_readings
+from hilcal.tables.mapping import Mapping
+from hilcal.tables.proposal import (
     FAR,
     GUESSED,
     SIDE_BY_SIDE,
@@ -37,11 +39,8 @@ from hilcal.tables.guessing.proposal import (
     Proposal,
     UnderstoodColumn,
 )
-from hilcal.tables.guessing.propose import Proposed, propose
-from hilcal.tables.importing import import_readings
-from hilcal.tables.mapping import Mapping
-from hilcal.tables.orientation import CONVENTIONS, NUMBERS, rotations
-from hilcal.tables.units import ANGLES, LENGTHS
+from hilcal.tables.propose import Proposed, propose
+from hilcal.tables.units import ANGLES, CONVENTIONS, LENGTHS, NUMBERS, rotations
 from hilcal.toml import check_section
 from hilcal.types import Floats
 

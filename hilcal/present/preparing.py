@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, KeyTable
 from hilcal.doctor.computer import Finding
 from hilcal.present.document import Block, Words, heading, pairs, table
-from hilcal.tables.guessing.proposal import Proposal
+from hilcal.tables.proposal import Proposal
 
 _HEAD = """\
 # Keys of CELL.toml

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hilcal.config.joints import Conventions
+from hilcal.config.sections import Conventions
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm

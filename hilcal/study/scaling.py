@@ -12,6 +12,9 @@ from dataclasses import asdict, dataclass
 from functools import partial
 
 import numpy as np
+from rich import box
+from rich.table import Table
+from rich.text import Text
 from scipy import stats
 from scipy.linalg import solve_triangular
 
@@ -39,34 +42,25 @@ class StudyCell:
     """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
 
     Attributes:
-        scaling: "none", "gu" or "gc".
-        correlation: share ρ of each element's variance that is common to the elements.
-        unit: units that the deflections were written in.
-        shared_unloaded: whether the loads of a pose share one unloaded reading.
         error_over_bound: root mean square over runs and parameters of the error of a parameter
             in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
-        error_over_bound_mc: of it.
-        coverage: share of the stated 95 % intervals that hold the true parameter.
-        coverage_mc: of it.
         variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
             no meaning.
-        parameter_error_over_bound: (n,) the same per parameter.
-        parameter_coverage: (n,) the same per parameter.
         unit_shift: largest change of any estimate in any run against the first unit, in
             units of the bound.
     """
 
-    scaling: Scaling
-    correlation: float
-    unit: str
-    shared_unloaded: bool
+    scaling: Scaling  # "none", "gu" or "gc"
+    correlation: float  # share ρ of each element's variance that is common to the elements
+    unit: str  # units that the deflections were written in
+    shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
     error_over_bound: float
-    error_over_bound_mc: float
-    coverage: float
-    coverage_mc: float
+    error_over_bound_mc: float  # of it
+    coverage: float  # share of the stated 95 % intervals that hold the true parameter
+    coverage_mc: float  # of it
     variance_factor: float | None
-    parameter_error_over_bound: tuple[float, ...]
-    parameter_coverage: tuple[float, ...]
+    parameter_error_over_bound: tuple[float, ...]  # (n,) the same per parameter
+    parameter_coverage: tuple[float, ...]  # (n,) the same per parameter
     unit_shift: float
 
 
@@ -75,19 +69,15 @@ class ScalingStudy:
     """The study's cells and what they were made of.
 
     Attributes:
-        arm: name of the arm.
-        runs: Monte-Carlo runs per cell.
-        poses: number of poses.
-        loads: wrenches per pose.
         typical_correlation: the ρ whose mean square correlation is that of the arm and the
             tracker as specified.
         cells: every scaling, correlation, unit and way of sharing the unloaded reading.
     """
 
-    arm: str
-    runs: int
-    poses: int
-    loads: int
+    arm: str  # name of the arm
+    runs: int  # Monte-Carlo runs per cell
+    poses: int  # number of poses
+    loads: int  # wrenches per pose
     typical_correlation: float
     cells: tuple[StudyCell, ...]
 
@@ -237,8 +227,6 @@ def _fit(w: Whitening, blocks: Floats, noise: Floats) -> _Fit:
     """Least squares of the scaled regression for all runs at once.
 
     Args:
-        w: the scaling, D measurements of 6 elements.
-        blocks: (D, 6, n) observation matrix.
         noise: (D, 6, R) errors of the deflections.
     """
     a = w.whiten(blocks).reshape(-1, blocks.shape[-1])
@@ -287,3 +275,79 @@ def _off_diagonal(correlation: Floats) -> float:
     k = correlation.shape[-1]
     off = correlation[..., ~np.eye(k, dtype=bool)]
     return float(np.sqrt(np.mean(off**2)))
+
+
+BOUND_TOLERANCE = 0.03
+COVERAGE_BAND = (0.94, 0.96)
+# What is shown: the units matter to `none` alone.
+CURVES: tuple[tuple[Scaling, str], ...] = (
+    *(("none", unit) for unit, _, _ in UNITS),
+    ("gu", UNITS[0][0]),
+    ("gc", UNITS[0][0]),
+)
+UNLOADED = {False: "own", True: "shared"}
+
+
+def title(study: ScalingStudy) -> str:
+    """One line that says what was simulated."""
+    return (
+        f"Joint compliances of a {study.arm}: {study.poses} poses x {study.loads} loads, "
+        f"{study.runs} Monte-Carlo runs"
+    )
+
+
+def largest_shift(study: ScalingStudy, *scalings: Scaling) -> float:
+    """Largest change of an estimate with the units, in units of the bound."""
+    return max(c.unit_shift for c in study.cells if c.scaling in scalings)
+
+
+def table(study: ScalingStudy) -> Table:
+    """Error over bound and coverage per scaling: one row per correlation."""
+    out = Table(
+        title=title(study), caption=_caption(study), box=box.SIMPLE_HEAD, caption_justify="left"
+    )
+    out.add_column("unloaded\nreading")
+    out.add_column("corr.\nrho", justify="right")
+    for scaling, unit in CURVES:
+        out.add_column(f"{scaling}\n{unit if scaling == 'none' else 'any unit'}", justify="right")
+    for shared, word in UNLOADED.items():
+        curves = [study.of(scaling, unit, shared) for scaling, unit in CURVES]
+        for k, row in enumerate(zip(*curves, strict=True)):
+            out.add_row(
+                word if k == 0 else "",
+                f"{row[0].correlation:g}",
+                *(_entry(cell) for cell in row),
+                end_section=k == len(curves[0]) - 1,
+            )
+    return out
+
+
+def _entry(cell: StudyCell) -> Text:
+    """Error and coverage, green where they are as they should be."""
+    low, high = COVERAGE_BAND
+    fits = abs(cell.error_over_bound - 1) <= BOUND_TOLERANCE
+    covers = low <= cell.coverage <= high
+    return Text.assemble(
+        (f"{cell.error_over_bound:.2f}x", "green" if fits else "red"),
+        " ",
+        (f"{100 * cell.coverage:.1f}%", "green" if covers else "red"),
+    )
+
+
+def _caption(study: ScalingStudy) -> str:
+    """How to read the table."""
+    error = max(c.error_over_bound_mc / c.error_over_bound for c in study.cells)
+    coverage = max(c.coverage_mc for c in study.cells)
+    return (
+        "Each entry: error of the estimated compliances, as a multiple of the smallest that is "
+        "possible (Cramér–Rao bound), and the share of the stated 95 % intervals that hold the "
+        "true value. It should say 1.00x 95.0%.\n"
+        "corr.: share of the noise variance that the six elements of a reading have in common; "
+        f"{study.typical_correlation:.2f} is what the arm's repeatability and the tracker specify. "
+        "own: each load has its own unloaded reading; shared: the loads of a pose share one, so "
+        "that their deflections are correlated as well.\n"
+        f"Changing units moves an estimate by up to {largest_shift(study, 'none'):.0f} standard "
+        f"uncertainties with none, and by {largest_shift(study, 'gu', 'gc'):.0e} with gu and gc. "
+        f"Monte-Carlo standard uncertainty: below {100 * error:.1f} % of an error, "
+        f"{100 * coverage:.1f} % in coverage."
+    )

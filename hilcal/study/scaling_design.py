@@ -41,21 +41,16 @@ class StudyDesign:
     """P poses with L wrenches each; SI units.
 
     Attributes:
-        q: (P, n) joint angles, rad.
-        wrenches: (L, 6) at the target, base axes, N and N·m.
-        observation: (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m).
         std: (P, 6) standard deviations of the elements of one reading: tracker and arm, m, rad.
-        specified: (P, 6, 6) correlations of one reading, as tracker and arm give them.
-        common: (P, 6, 6) correlations of the arm's own repeatability J Σ_q Jᵀ.
     """
 
     arm: Arm
-    q: Floats
-    wrenches: Floats
-    observation: Floats
+    q: Floats  # (P, n) joint angles, rad
+    wrenches: Floats  # (L, 6) at the target, base axes, N and N·m
+    observation: Floats  # (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m)
     std: Floats
-    specified: Floats
-    common: Floats
+    specified: Floats  # (P, 6, 6) correlations of one reading, as tracker and arm give them
+    common: Floats  # (P, 6, 6) correlations of the arm's own repeatability J Σ_q Jᵀ
 
     def covariance(self, correlation: float) -> Floats:
         """Covariance (P, 6, 6) of one reading: V = D ((1 - ρ) I + ρ C) D.
@@ -72,9 +67,6 @@ def make_design(rng: np.random.Generator, arm: Arm, poses: int) -> StudyDesign:
 
     Feasible: joints within limits, joint centres above the floor, target off the base axis,
     no singularity, and static torques under weight and every wrench within the limits.
-
-    Raises:
-        CannotAnswerError: the arm has fewer feasible poses among the candidates than asked for.
     """
     low, high = arm.usual_range
     q = low + (high - low) * rng.random((_CANDIDATES, arm.n))
@@ -106,10 +98,7 @@ def make_readings(design: StudyDesign, covariance: Floats, shared: bool) -> Read
     """Readings (values left at zero) of the design: unloaded and loaded, pose by pose.
 
     Args:
-        design: P poses, L wrenches.
         covariance: (P, 6, 6) of one reading at each pose.
-        shared: whether the L loads of a pose share one unloaded reading; else each load is a
-            cycle with an unloaded reading of its own.
     """
     poses, loads = design.observation.shape[:2]
     load = np.arange(loads + 1) if shared else np.stack([np.zeros(loads), np.arange(loads) + 1], 1)

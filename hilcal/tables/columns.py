@@ -1,7 +1,6 @@
 """Columns of the exchange table: names, what a wrong header lacks, joints that mimic others."""
 
 import re
-from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
@@ -16,34 +15,37 @@ POSITION = ("x_m", "y_m", "z_m")
 ROTATION = ("rx_rad", "ry_rad", "rz_rad")
 WRENCH = ("fx_N", "fy_N", "fz_N", "mx_Nm", "my_Nm", "mz_Nm")
 TEXT = ("pose", "load")
-TARGET = "target"
+TARGET, COVERS, STATION = "target", "covers", "station"
 PREVIEW = "hilcal import TABLE --preview proposes a mapping for --format"
-COVERS = "covers"
-STATION = "station"
 ONE = {"point": ("distance_m", "from", "cov_d_d"), "gauge": ("gauge_m", "gauge", "cov_g_g")}
 """Columns of a reading that is one number, by kind of observer: value, observer, variance."""
 OWN_PREFIX = "x_"
 AGREES = 2e-3
 """How far a stated value may be from what the arm's description says, rad: a tenth of a degree, to
 which tables round. A choice."""
-_JOINT = re.compile(r"qa?[0-9]+_(rad|m)")
-_TORQUE = re.compile(r"tau[0-9]+_Nm?")
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
-
 
 Units = int | Sequence[str]
 """Units of the joints' values, "rad" or "m" (`Arm.units`); or how many joints there are, in rad."""
 
 
+def _numbered(units: Units) -> list[tuple[int, str]]:
+    return list(enumerate(("rad",) * units if isinstance(units, int) else units, start=1))
+
+
 def joint_columns(units: Units) -> tuple[str, ...]:
     """Columns of the commanded joints, rad; of a joint that slides m."""
-    units = ("rad",) * units if isinstance(units, int) else units
-    return tuple(f"q{i}_{unit}" for i, unit in enumerate(units, start=1))
+    return tuple(f"q{i}_{unit}" for i, unit in _numbered(units))
 
 
 def actual_columns(units: Units) -> tuple[str, ...]:
     """Columns of the joints that the encoders reported, rad; of a joint that slides m."""
-    return tuple(f"qa{name[1:]}" for name in joint_columns(units))
+    return tuple(f"qa{i}_{unit}" for i, unit in _numbered(units))
+
+
+def torque_columns(units: Units) -> tuple[str, ...]:
+    """Columns of the static torques that drives exert, as measured, N·m; of slides forces, N."""
+    return tuple(f"tau{i}_{'N' if unit == 'm' else 'Nm'}" for i, unit in _numbered(units))
 
 
 def temperature_columns(n: int) -> tuple[str, ...]:
@@ -54,12 +56,6 @@ def temperature_columns(n: int) -> tuple[str, ...]:
 def approach_columns(n: int) -> tuple[str, ...]:
     """Columns of the side from which each joint arrived, -1 or +1."""
     return tuple(f"approach{i}" for i in range(1, n + 1))
-
-
-def torque_columns(units: Units) -> tuple[str, ...]:
-    """Columns of the static torques that drives exert, as measured, N·m; of slides forces, N."""
-    of = {"q": "tau", "_rad": "_Nm", "_m": "_N"}
-    return tuple(re.sub("q|_rad|_m", lambda m: of[m[0]], name) for name in joint_columns(units))
 
 
 def covariance_columns(m: int) -> tuple[str, ...]:
@@ -73,20 +69,17 @@ def required_columns(units: Units) -> tuple[str, ...]:
 
 
 def sparse_columns(header: Collection[str]) -> tuple[str, ...]:
-    """Columns of numbers that rows may leave empty.
-
-    Joint torques, and readings where a table has several kinds.
-    """
-    torques = tuple(c for c in header if _TORQUE.fullmatch(c))
-    one = [c for kind in ONE.values() for c in (kind[0], kind[2])]
-    if not any(kind[0] in header for kind in ONE.values()):
+    """Columns of numbers that rows may leave empty: torques; readings, where there are kinds."""
+    torques = tuple(c for c in header if re.fullmatch(r"tau[0-9]+_Nm?", c))
+    if not any(value in header for value, _, _ in ONE.values()):
         return torques
+    one = [c for value, _, variance in ONE.values() for c in (value, variance)]
     return (*POSITION, *ROTATION, *covariance_columns(6), *one, *torques)
 
 
 def groups(units: Units) -> tuple[tuple[str, ...], ...]:
     """Optional columns of which a table has all or none."""
-    n = len(joint_columns(units))
+    n = len(_numbered(units))
     of_joints = temperature_columns(n), approach_columns(n)
     return ROTATION, *of_joints, actual_columns(units), torque_columns(units)
 
@@ -94,24 +87,17 @@ def groups(units: Units) -> tuple[tuple[str, ...], ...]:
 def known_columns(units: Units) -> tuple[str, ...]:
     """All columns that have a meaning for an arm."""
     return (
-        *required_columns(units),
-        TARGET,
-        COVERS,
-        STATION,
+        *(*required_columns(units), TARGET, COVERS, STATION),
         *(name for kind in ONE.values() for name in kind),
-        *covariance_columns(6),
-        *WRENCH,
-        *("cycle", "time_s", "load_time_s", "air_degC"),
+        *(*covariance_columns(6), *WRENCH, "cycle", "time_s", "load_time_s", "air_degC"),
         *(name for group in groups(units) for name in group),
     )
 
 
 def _closest(name: str, valid: Iterable[str]) -> str | None:
     by_lower = {v.lower(): v for v in valid}
-    if name.lower() in by_lower:
-        return by_lower[name.lower()]
-    found = get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.5)
-    return by_lower[found[0]] if found else None
+    close = get_close_matches(name.lower(), list(by_lower), n=1, cutoff=0.5)
+    return by_lower.get(name.lower()) or (by_lower[close[0]] if close else None)
 
 
 def check_header(
@@ -123,47 +109,42 @@ def check_header(
         InputError: a column is unnamed, duplicated, unknown or missing, or a group of columns
             is incomplete; names the column and the closest valid name.
     """
-    if "" in header:
-        raise InputError(f"{path}: column {header.index('') + 1} has no name in row 1")
     for k, name in enumerate(header, start=1):
-        if len(name) > 80:
-            raise InputError(f"{path}: column {k} has no proper name in row 1: {name[:40]!r}")
-    for name, count in Counter(header).items():
-        if count > 1:
-            raise InputError(f"{path}: column '{name}' appears {count} times; keep one")
-    known, n = known_columns(units), len(joint_columns(units))
-    needed = required_columns(units)
+        if not 0 < len(name) <= 80:
+            raise InputError(f"{path}: column {k} has no name, or a long one, in row 1")
+        if header.count(name) > 1:
+            raise InputError(
+                f"{path}: column '{name}' appears {header.count(name)} times; keep one"
+            )
+    known, needed = known_columns(units), required_columns(units)
     if any(name in header for kind in ONE.values() for name in kind):
         _check_one(path, header)
-    if POSITION[0] in sparse_columns(header):
-        needed = needed if POSITION[0] in header else needed[:-3]
+    if POSITION[0] in sparse_columns(header) and POSITION[0] not in header:
+        needed = needed[:-3]
     missing = [c for c in needed if c not in header and c not in spare]
     for name in header:
         if name not in known and not name.startswith(OWN_PREFIX):
             form = f"; for a table of another form: {PREVIEW}" if missing else ""
-            advice = _advice(name, known, header, n)
+            advice = _advice(name, known, header, len(_numbered(units)))
             raise InputError(f"{path}: unknown column '{name}'{advice}{form}")
     if missing:
-        raise InputError(
-            f"{path}: column '{missing[0]}' is missing{_hint(missing, header, units, arm)}"
-        )
+        hint = _hint(missing, header, units, arm)
+        raise InputError(f"{path}: column '{missing[0]}' is missing{hint}")
     for group in groups(units):
         lacking = [c for c in group if c not in header and c not in spare]
         if lacking and any(c in header for c in group):
             raise InputError(
-                f"{path}: column '{lacking[0]}' is missing; give all of "
-                f"{', '.join(group)} or none of them"
+                f"{path}: column '{lacking[0]}' is missing; give all of {', '.join(group)} or none "
+                "of them"
             )
 
 
 def _check_one(path: str, header: Sequence[str]) -> None:
     """Refuse distances and heights without the name of what they are of, or beside orientations."""
-    for value, name, variance in ONE.values():
-        for other in (name, variance):
-            if other in header and value not in header:
-                raise InputError(f"{path}: column '{other}' without column '{value}'")
-        if value in header and name not in header:
-            raise InputError(f"{path}: column '{name}' is missing; it names what '{value}' is of")
+    for value, of, variance in ONE.values():
+        for name, needed in ((of, value), (variance, value), (value, of)):
+            if name in header and needed not in header:
+                raise InputError(f"{path}: column '{name}' without column '{needed}'; give both")
     if ROTATION[0] in header:
         raise InputError(
             f"{path}: column '{ROTATION[0]}': a table of distances or heights has positions beside "
@@ -173,13 +154,13 @@ def _check_one(path: str, header: Sequence[str]) -> None:
 
 def _advice(name: str, known: Sequence[str], header: Sequence[str], n: int) -> str:
     """Return what to do about an unknown column."""
-    parts = name.split("_")
-    if len(parts) == 3 and parts[0] == "cov" and f"cov_{parts[2]}_{parts[1]}" in known:
-        return f"; give the upper triangle only: 'cov_{parts[2]}_{parts[1]}'"
-    if _JOINT.fullmatch(name):
-        own = next((c for c in known if c.startswith(f"{parts[0]}_")), None)
-        if own is not None:
-            return f"; this joint {'slides' if own.endswith('_m') else 'turns'}: '{own}'"
+    first, _, last = name.partition("_")
+    i, _, j = last.partition("_")
+    if first == "cov" and f"cov_{j}_{i}" in known:
+        return f"; give the upper triangle only: 'cov_{j}_{i}'"
+    own = next((c for c in known if c.startswith(f"{first}_")), None)
+    if own is not None and re.fullmatch(r"qa?[0-9]+_(rad|m)", name):
+        return f"; this joint {'slides' if own.endswith('_m') else 'turns'}: '{own}'"
     close = _closest(name, (c for c in known if c not in header)) or _closest(name, known)
     own = f"columns of your own start with '{OWN_PREFIX}'"
     joints = f" (the arm has {n} joints)" if any(ch.isdigit() for ch in close or "") else ""
@@ -234,29 +215,22 @@ def own_columns(names: tuple[str, ...], count: int, arm: Arm) -> tuple[str, ...]
 
 
 def with_following(table: ColumnTable, arm: Arm) -> ColumnTable:
-    """Return the table with the values of mimic joints as they follow from the others.
-
-    Raises:
-        InputError: a value is given and is another one.
-    """
-    if arm.own.all():
-        return table
+    """Return the table with the values of mimic joints as they follow; another one is refused."""
     number = dict(table.number)
     for names in (joint_columns(arm.units), actual_columns(arm.units)):
-        own = [name for name, is_own in zip(names, arm.own, strict=True) if is_own]
-        if not set(own) <= number.keys():
+        own = own_columns(names, int(arm.own.sum()), arm)
+        if arm.own.all() or not set(own) <= number.keys():
             continue
         nothing = np.full(len(number[own[0]]), np.nan)
         q = np.stack([number.get(name, nothing) for name in names], axis=1)
         full = arm.complete(q)
-        for k in np.flatnonzero(~arm.own).tolist():
-            off = np.abs(q[:, k] - full[:, k]) > AGREES  # False where there is no value
-            if off.any():
-                i = int(np.argmax(off))
-                raise InputError(
-                    f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
-                    f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
-                    "column out, or correct <mimic> in the URDF"
-                )
-            number[names[k]] = full[:, k]
+        off = (np.abs(q - full) > AGREES) & ~arm.own  # False where there is no value
+        if off.any():
+            i, k = divmod(int(np.argmax(off)), len(names))
+            raise InputError(
+                f"{table.at(i, names[k])}: {q[i, k]:g} {arm.unit(k)}, but by the arm's "
+                f"description {arm.joint_names[k]} follows to {full[i, k]:g}; leave the "
+                "column out, or correct <mimic> in the URDF"
+            )
+        number |= {names[k]: full[:, k] for k in np.flatnonzero(~arm.own).tolist()}
     return replace(table, number=number)

@@ -43,17 +43,7 @@ REFUSED = {
 def open_tables(
     path: str | Path, mapping: PointMapping, second: Path | None = None
 ) -> tuple[Grid, int]:
-    """Open the file or the two files that a mapping is for, as one table.
-
-    Args:
-        second: the second file, where the mapping does not name it.
-
-    Returns:
-        The table, and how many rows of the first file found no partner in the second.
-
-    Raises:
-        InputError: a file that cannot be read, or files that do not belong together.
-    """
+    """Open the file or the two files that a mapping is for, as one table."""
     first = open_grid(path, mapping.file)
     if mapping.second_file is None:
         if second is not None:
@@ -97,11 +87,7 @@ def open_grid(path: str | Path, how: FileFormat, check: Check | None = None) -> 
 
 
 def content_of(path: str | Path) -> bytes:
-    """Read a file.
-
-    Raises:
-        InputError: no such file, or it cannot be read.
-    """
+    """Read a file."""
     try:
         return limits.read_bytes(Path(path), limits.TABLE)
     except FileNotFoundError as e:
@@ -111,11 +97,7 @@ def content_of(path: str | Path) -> bytes:
 
 
 def kind_of(path: str, content: bytes) -> str:
-    """Return the kind of a file by its first bytes: one of `READ`, else "text".
-
-    Raises:
-        InputError: it is empty, or of a kind that is not read.
-    """
+    """Return the kind of a file by its first bytes: one of `READ`, else "text"."""
     if not content.strip(b"\xef\xbb\xbf \t\r\n"):
         raise InputError(f"{path}: the file is empty; expected a table of readings")
     for magic, what in REFUSED.items():
@@ -150,11 +132,7 @@ def _short(error: Exception) -> str:
 
 
 def package(path: str | Path, name: str, what: str) -> Any:
-    """Import a package that a kind of file needs.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Import a package that a kind of file needs."""
     with needed_by(f"{path}: {what}"):
         return import_module(name)
 
@@ -230,11 +208,7 @@ def _check_xml(path: str, name: str, stream: IO[bytes]) -> None:
 
 
 def sheet_names(path: str, content: bytes) -> list[str]:
-    """Names of the sheets of an XLSX file.
-
-    Raises:
-        InputError: no XLSX file, or openpyxl is not installed.
-    """
+    """Names of the sheets of an XLSX file."""
     with _undamaged(path, "an XLSX file"):
         names = list(_book(path, content).sheetnames)
     if len(names) > limits.SHEETS:
@@ -245,11 +219,7 @@ def sheet_names(path: str, content: bytes) -> list[str]:
 def sheet_rows(
     path: str, content: bytes, sheet: str, comment: str | None
 ) -> list[tuple[int, list[Cell]]]:
-    """Rows of a sheet that are neither empty nor comments, with their numbers from 1.
-
-    Raises:
-        InputError: damaged, or more rows or cells than a table may have.
-    """
+    """Rows of a sheet that are neither empty nor comments, with their numbers from 1."""
     found: list[tuple[int, list[Cell]]] = []
     cells = 0
     with _undamaged(path, "an XLSX file"):
@@ -366,37 +336,21 @@ def _mat(path: str, how: FileFormat, check: Check | None) -> Grid:
             f"written by writetable as CSV"
         )
     rows = max(lengths, key=lambda k: (lengths.count(k), k))
-    named = [
-        part for name, values in blocks if len(values) == rows for part in _split(name, values)
-    ]
+    named = []
+    for name, values in blocks:
+        for k in range(values.shape[1] if len(values) == rows else 0):
+            title = name if values.shape[1] == 1 else f"{name}({k + 1})"
+            named.append((title, [_cell(v) for v in values[:, k].tolist()]))
     return _columns(path, named, how, check)
 
 
-def _split(name: str, values: np.ndarray) -> Iterator[tuple[str, list[Cell]]]:
-    count = values.shape[1]
-    for k in range(count):
-        yield (
-            (name if count == 1 else f"{name}({k + 1})"),
-            [_cell(v) for v in values[:, k].tolist()],
-        )
+SEPARATORS = {"tab": "\t", "blanks": " "}  # Separators that have a name in a mapping file
 
-
-SEPARATORS = {"tab": "\t", "blanks": " "}
-"""Separators that have a name in a mapping file."""
-
-BYTE_ORDER_MARKS = {
-    b"\xef\xbb\xbf": "utf-8-sig",
-    b"\xff\xfe": "utf-16",
-    b"\xfe\xff": "utf-16",
-}
+BYTE_ORDER_MARKS = {b"\xef\xbb\xbf": "utf-8-sig", b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16"}
 
 
 def decoded(path: str, content: bytes, encoding: str | None) -> str:
-    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1.
-
-    Raises:
-        InputError: binary data, or not text in the encoding that is stated.
-    """
+    """Text of a file: by its byte order mark, else as stated, else UTF-8, else Latin-1."""
     marks = (name for mark, name in BYTE_ORDER_MARKS.items() if content.startswith(mark))
     wanted = next(marks, encoding)
     try:
@@ -424,31 +378,23 @@ def read_text(path: str, content: bytes, how: FileFormat, check: Check | None = 
 
 
 def records(path: str, text: str, how: FileFormat) -> Iterator[tuple[int, list[str]]]:
-    """Rows of cells that are neither blank nor comments, with their numbers from 1.
-
-    Raises:
-        InputError: quotes that are not closed.
-    """
+    """Rows of cells that are neither blank nor comments, with their numbers from 1."""
     separator = SEPARATORS.get(how.separator or ",", how.separator or ",")
-    if how.separator == "blanks":
-        text = text.replace("\t", " ")
+    blanks = how.separator == "blanks"
+    text = text.replace("\t", " ") if blanks else text
     if how.comment is not None and how.header_row:
         text = _header_uncommented(text, how.header_row, how.comment)
     lines = limits.Lines(path, io.StringIO(text, newline=None))
-    reader = csv.reader(
-        lines, delimiter=separator, skipinitialspace=how.separator == "blanks", strict=True
-    )
+    reader = csv.reader(lines, delimiter=separator, skipinitialspace=blanks, strict=True)
     try:
         begun = 1
         for cells in reader:
             row, begun = begun, reader.line_num + 1
             lines.row(len(cells))
-            stripped = [c.strip() for c in cells]
-            while how.separator == "blanks" and stripped and not stripped[-1]:
-                stripped.pop()
-            comment = how.comment is not None and bool(stripped)
-            if any(stripped) and not (comment and stripped[0].startswith(how.comment or "")):
-                yield row, stripped
+            plain = [c.strip() for c in cells]
+            plain = plain[: length_of(plain)] if blanks else plain
+            if any(plain) and not (how.comment and plain[0].startswith(how.comment)):
+                yield row, plain
     except csv.Error as e:
         raise InputError(f"{path}: row {reader.line_num}: not delimited text ({e})") from e
 
@@ -470,9 +416,6 @@ def grid_of_rows(
     """Make a grid of rows of cells: header (which is checked), units, and rows of one length.
 
     Cells that a row has beyond the header must be empty, as trailing separators leave them.
-
-    Raises:
-        InputError: the header's row is not there, no readings, a row of another length.
     """
     by_row = dict(found)
     if how.header_row and how.header_row not in by_row:
@@ -488,14 +431,14 @@ def grid_of_rows(
     body = [(row, c) for row, c in found if row > how.header_row and row not in skipped]
     if not body:
         raise InputError(f"{path}: no readings below row {how.header_row}")
-    width = len(header) or max(_length(c) for _, c in body)
-    while header and not header[-1] and all(_length(c) < width for _, c in body):
+    width = len(header) or max(length_of(c) for _, c in body)
+    while header and not header[-1] and all(length_of(c) < width for _, c in body):
         header.pop()
         width -= 1
     for row, cells in body:
-        if _length(cells) > width or (how.header_row and len(cells) < width):
+        if length_of(cells) > width or (how.header_row and len(cells) < width):
             raise InputError(
-                f"{path}: row {row} has {_length(cells)} cells, "
+                f"{path}: row {row} has {length_of(cells)} cells, "
                 f"{'the header' if header else 'others'} {width}; a mapping lists rows that are "
                 "no readings in [file] skip_rows, or has them begin with [file] comment"
             )
@@ -510,7 +453,11 @@ def grid_of_rows(
     return Grid(path, names, rows, columns, (how,) * len(names), units)
 
 
-def _length(cells: Sequence[Cell]) -> int:
+def filled(cell: Cell) -> bool:
+    """Whether a cell holds anything."""
+    return cell is not None and cell != ""
+
+
+def length_of(cells: Sequence[Cell]) -> int:
     """Cells up to the last one that is not empty."""
-    filled = [k for k, c in enumerate(cells, start=1) if c is not None and c != ""]
-    return filled[-1] if filled else 0
+    return max((k for k, cell in enumerate(cells, start=1) if filled(cell)), default=0)

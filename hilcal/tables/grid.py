@@ -4,6 +4,7 @@ Files become a `Grid` in `hilcal.tables.files`; what its columns mean is said by
 exchange table) or by a mapping, and makes a `ColumnTable` of numbers and texts of it.
 """
 
+import itertools
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -27,29 +28,19 @@ BLANK = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-", "--", "---")
 _PLAIN = str.maketrans({"\u2212": "-", "\u00a0": " ", "\u202f": " ", "\u2019": "'"})
 """Signs that programs write in place of minus, blank and apostrophe."""
 
-_SHOWN = 12
-"""Columns that a message lists; the rest are counted."""
+_SHOWN = 12  # Columns that a message lists; the rest are counted
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid:
-    """A table of cells.
+    """A table of cells."""
 
-    Attributes:
-        path: the file's name, for messages.
-        names: of the columns; "1", "2", ... where the file has no header.
-        rows: (N,) row of each record as an editor or a spreadsheet counts, from 1.
-        columns: N cells of each column.
-        formats: how the cells of each column are written.
-        units: cells of the row of units by column, where there is one.
-    """
-
-    path: str
-    names: tuple[str, ...]
-    rows: Ints
-    columns: tuple[Sequence[Cell], ...]
-    formats: tuple[FileFormat, ...]
-    units: dict[str, str] = field(default_factory=dict)
+    path: str  # the file's name, for messages
+    names: tuple[str, ...]  # of the columns; "1", "2", ... where the file has no header
+    rows: Ints  # (N,) row of each record as an editor or a spreadsheet counts, from 1
+    columns: tuple[Sequence[Cell], ...]  # N cells of each column
+    formats: tuple[FileFormat, ...]  # how the cells of each column are written
+    units: dict[str, str] = field(default_factory=dict)  # cells of the row of units, by column
 
     def __post_init__(self) -> None:
         """Refuse too many columns, and names of columns that no name may be."""
@@ -61,11 +52,7 @@ class Grid:
         return f"{self.path}: row {self.rows[index]}, column '{self.name(column)}'"
 
     def name(self, column: str | int) -> str:
-        """Return the name of a column that a mapping gives by name or by number, from 1.
-
-        Raises:
-            InputError: no such column; lists those that there are.
-        """
+        """Return the name of a column that a mapping gives by name or by number, from 1."""
         if isinstance(column, int):
             if column > len(self.names):
                 raise InputError(
@@ -83,32 +70,17 @@ class Grid:
         return column
 
     def cells(self, column: str | int) -> Sequence[Cell]:
-        """Return the cells of a column.
-
-        Raises:
-            InputError: no such column.
-        """
+        """Return the cells of a column."""
         return self.columns[self.names.index(self.name(column))]
 
     def text(self, column: str | int) -> list[str]:
-        """Cells as text; whole numbers without a decimal point, nothing for empty cells.
-
-        Raises:
-            InputError: no such column, or a text that no name may be.
-        """
+        """Cells as text; whole numbers without a decimal point, nothing for empty cells."""
         cells = (text_of(c) for c in self.cells(column))
         return [from_csv(check_name(c, self.at(k, column))) for k, c in enumerate(cells)]
 
     def numbers(self, column: str | int, *, complete: bool = False) -> Floats:
-        """(N,) numbers of a column, NaN where a value is missing.
-
-        Args:
-            complete: whether no value may be missing.
-
-        Raises:
-            InputError: no such column, or a cell that is neither a number nor missing.
-        """
-        cells, how = self.cells(column), self.formats[self.names.index(self.name(column))]
+        """(N,) numbers of a column, NaN where a value is missing, which `complete` refuses."""
+        cells, how = self.cells(column), self._format(column)
         values = np.fromiter((number(c, how) for c in cells), dtype=float, count=len(cells))
         bad = ~np.isfinite(values) if complete else np.isinf(values)
         if bad.any():
@@ -127,42 +99,30 @@ class Grid:
 
     def with_column(self, name: str, cells: Sequence[Cell], like: str | int) -> "Grid":
         """Return the table with a further column, written as another one is."""
-        how = self.formats[self.names.index(self.name(like))]
         names, columns = (*self.names, name), (*self.columns, cells)
-        return replace(self, names=names, columns=columns, formats=(*self.formats, how))
+        return replace(
+            self, names=names, columns=columns, formats=(*self.formats, self._format(like))
+        )
+
+    def _format(self, column: str | int) -> FileFormat:
+        return self.formats[self.names.index(self.name(column))]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ColumnTable:
-    """Columns that were understood, in SI units where they are numbers.
+    """Columns that were understood, in SI units where they are numbers."""
 
-    Attributes:
-        path: the file's name, for messages.
-        rows: (N,) row of each record as an editor or a spreadsheet counts.
-        text: text columns by name, N cells each, without blanks around.
-        number: (N,) number columns by name.
-        alias: what the file itself calls a column, where it is another name than here.
-    """
-
-    path: str
-    rows: Ints
-    text: dict[str, list[str]]
-    number: dict[str, Floats]
-    alias: dict[str, str] = field(default_factory=dict)
+    path: str  # the file's name, for messages
+    rows: Ints  # (N,) row of each record as an editor or a spreadsheet counts
+    text: dict[str, list[str]]  # text columns by name, N cells each, without blanks around
+    number: dict[str, Floats]  # (N,) number columns by name
+    alias: dict[str, str] = field(default_factory=dict)  # what the file itself calls a column
 
     @classmethod
     def of(
-        cls,
-        grid: Grid,
-        text: Sequence[str],
-        number: Sequence[str],
-        sparse: Collection[str] = (),
+        cls, grid: Grid, text: Sequence[str], number: Sequence[str], sparse: Collection[str] = ()
     ) -> "ColumnTable":
-        """Return the columns of these names; each of their cells has a value but for `sparse` ones.
-
-        Raises:
-            InputError: a cell that is no number; names row and column.
-        """
+        """Return the columns of these names; cells have a value but for `sparse` ones."""
         numbers = {name: grid.numbers(name, complete=name not in sparse) for name in number}
         return cls(grid.path, grid.rows, {name: grid.text(name) for name in text}, numbers)
 
@@ -210,10 +170,8 @@ def number(cell: Cell, how: FileFormat) -> float:
     """Return a cell's number; NaN where it is missing, infinite where it is no finite number."""
     if isinstance(cell, bool | datetime):
         return float("inf")
-    if cell is None:
-        return float("nan")
-    if not isinstance(cell, str):
-        return float(cell)
+    if cell is None or not isinstance(cell, str):
+        return float("nan") if cell is None else float(cell)
     plain = cell.translate(_PLAIN).strip()
     if plain.lower() in BLANK or plain in how.missing:
         return float("nan")
@@ -222,30 +180,25 @@ def number(cell: Cell, how: FileFormat) -> float:
         if not 0 < len(whole[0]) <= 3 or any(len(part) != 3 for part in whole[1:]):
             return float("inf")
         plain = plain.replace(how.thousands, "")
-    if how.decimal == ",":
-        if "." in plain:
-            return float("inf")
-        plain = plain.replace(",", ".")
+    if "_" in plain or (how.decimal == "," and "." in plain):
+        return float("inf")
     try:
-        value = float("inf") if "_" in plain else float(plain)
+        value = float(plain.replace(how.decimal, "."))
     except ValueError:
-        value = float("inf")
+        return float("inf")
     return value if np.isfinite(value) else float("inf")
 
 
 def _complaint(cell: Cell, how: FileFormat, complete: bool) -> str:
     shown = "" if cell is None else str(cell).strip()
     shown = shown if len(shown) <= 40 else shown[:37] + "..."
-    if not complete:
-        return (
-            f"'{shown}' is not a number with '{how.decimal}' as decimal mark; cells without a "
-            "value are left empty, or listed in [file] missing"
-        )
-    if not shown:
+    if complete and not shown:
         return "the cell is empty; expected a number"
-    finite = " finite" * (shown.lower().lstrip("+-") in ("nan", "inf", "infinity"))
-    mark = "" if how.decimal == "." else f" with '{how.decimal}' as decimal mark"
-    return f"'{shown}' is not a{finite} number{mark}"
+    mark = "" if complete and how.decimal == "." else f" with '{how.decimal}' as decimal mark"
+    if not complete:
+        mark += "; cells without a value are left empty, or listed in [file] missing"
+    finite = complete and shown.lower().lstrip("+-") in ("nan", "inf", "infinity")
+    return f"'{shown}' is not a{' finite' * finite} number{mark}"
 
 
 def unique(names: Sequence[str]) -> tuple[str, ...]:
@@ -254,15 +207,10 @@ def unique(names: Sequence[str]) -> tuple[str, ...]:
     A column without a name is called by its number.
     """
     out: dict[str, None] = {}
-    counts: dict[str, int] = {}
     for k, given in enumerate(names, start=1):
-        first = name = given or str(k)
-        count = counts.get(first, 1)
-        while name in out:
-            count += 1
-            name = f"{first} ({count})"
-        counts[first] = count
-        out[name] = None
+        first = given or str(k)
+        others = (f"{first} ({count})" for count in itertools.count(2))
+        out[next(name for name in itertools.chain((first,), others) if name not in out)] = None
     return tuple(out)
 
 
@@ -274,10 +222,6 @@ def joined(
     Rows belong together by number, or where a column of both holds the same text. Rows of the
     first table without a partner are left out; columns of a name that the first one has get
     "(2)" behind it.
-
-    Raises:
-        InputError: tables of different length, a name twice in the second table, no row with a
-            partner.
     """
     if match is None:
         if len(first.rows) != len(second.rows):
@@ -288,15 +232,13 @@ def joined(
             )
         at = np.arange(len(first.rows))
     else:
-        keys = second.text(match[1])
         where: dict[str, int] = {}
-        for k, key in enumerate(keys):
-            if key in where:
+        for k, key in enumerate(second.text(match[1])):
+            if where.setdefault(key, k) != k:
                 raise InputError(
-                    f"{second.at(k, second.name(match[1]))}: '{key}' is in row "
-                    f"{second.rows[where[key]]}, too; rows to match by must differ"
+                    f"{second.at(k, match[1])}: '{key}' is in row {second.rows[where[key]]}, too; "
+                    "rows to match by must differ"
                 )
-            where[key] = k
         at = np.array([where.get(key, -1) for key in first.text(match[0])], dtype=np.int64)
         if np.all(at < 0):
             raise InputError(

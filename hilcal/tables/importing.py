@@ -19,16 +19,11 @@ from hilcal.tables.uncertainty import rounding_variance
 from hilcal.toml import suggest
 from hilcal.types import Bools
 
-TABLE = "table"
-"""The exchange table: the format that is read without a mapping."""
+TABLE = "table"  # The exchange table: the format that is read without a mapping
 
 
 def import_readings(
-    path: Path,
-    form: str | Path | Mapping,
-    config: CellConfig,
-    arm: Arm,
-    second: Path | None = None,
+    path: Path, form: str | Path | Mapping, config: CellConfig, arm: Arm, second: Path | None = None
 ) -> ImportResult:
     """Read a table into a cell.
 

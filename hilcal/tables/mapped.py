@@ -1,9 +1,10 @@
 """Readings from a table of any kind, by a mapping that says what its columns hold."""
 
-from collections.abc import Callable, Iterator, Sequence
+import re
 from collections.abc import Mapping as Mapped
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from datetime import datetime
 from pathlib import Path
 from typing import Generic
 
@@ -17,7 +18,7 @@ from hilcal.robot.arm import Arm
 from hilcal.tables import columns, units
 from hilcal.tables.columns import own_columns
 from hilcal.tables.files import open_tables
-from hilcal.tables.grid import Cell, ColumnTable, Grid
+from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import (
     Column,
     Joints,
@@ -31,9 +32,9 @@ from hilcal.tables.mapping import (
     Std,
     Time,
 )
-from hilcal.tables.orientation import defect, rotations
 from hilcal.tables.table import ImportResult, readings_of
 from hilcal.tables.uncertainty import check_joint_rounding, mapped_covariance, rounding_variance
+from hilcal.tables.units import defect, rotations
 from hilcal.types import Bools, Floats, Ints
 
 MOST_LOST = 0.5
@@ -41,53 +42,35 @@ MOST_LOST = 0.5
 UNIT_LENGTH = 0.01
 """How far a quaternion's length may be from 1, and a matrix from orthogonal; rounding to three
 digits stays below."""
-MOST_TURN = 2 * np.pi + 1e-3
-"""rad; a larger angle of an orientation is in another unit."""
-MOVED = 0.01
-"""rad; a joint commanded by more is sent to another pose; a choice."""
-STILL = 1e-4
-"""rad; a joint commanded by less did not move far enough to arrive from another side."""
-SIGMAS = 4.0
-"""Standard deviations within which two readings are the same; a choice."""
-REPEATED = 2e-4
-"""rad; rows whose joints differ by less repeat a pose; a choice."""
+MOST_TURN = 2 * np.pi + 1e-3  # rad; a larger angle of an orientation is in another unit
+MOVED = 0.01  # rad; a joint commanded by more is sent to another pose; a choice
+STILL = 1e-4  # rad; a joint commanded by less did not move far enough to arrive from another side
+SIGMAS = 4.0  # Standard deviations within which two readings are the same; a choice
+REPEATED = 2e-4  # rad; rows whose joints differ by less repeat a pose; a choice
 REPEATS_TO = 4e-4
 """m; ten times what an arm repeats to: positions of one pose that differ by more are not all right.
 A choice."""
-TOOL = 0.5
-"""m; the longest tool, beside the arm's reach a lever of its joints; a choice."""
-GRAVITY = (0.0, 0.0, -9.80665)
-"""m/s², base axes, of an arm that stands upright."""
-EPOCH = 1e8
-"""s; times beyond three years are counted from an epoch, not from the campaign's start."""
+TOOL = 0.5  # m; the longest tool, beside the arm's reach a lever of its joints; a choice
+GRAVITY = (0.0, 0.0, -9.80665)  # m/s², base axes, of an arm that stands upright
+EPOCH = 1e8  # s; times beyond three years are counted from an epoch, not from the campaign's start
 TARGET = "target of [position]"
 _DAY = 86400.0
-_EXPECTED = {
-    "iso": "a date and time like 2024-05-31T12:00:00",
-    "excel": "days since 1899-12-30",
-}
+_EXPECTED = {"iso": "a date and time like 2024-05-31T12:00:00", "excel": "days since 1899-12-30"}
+_CELSIUS = {"degC": (1.0, 0.0), "degF": (1 / 1.8, 32.0), "K": (1.0, 273.15)}
+"""Size of a unit in °C, and where 0 °C is on its scale."""
 _LISTED = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MappedTable(Generic[M]):
-    """The rows of a table by their mapping, without what tells noise.
+    """The rows of a table by their mapping, without what tells noise."""
 
-    Attributes:
-        table: columns of the exchange table, SI.
-        grid: the rows as the file has them.
-        mapping: as it is used.
-        raw: (N,) number columns by the file's names, in its units.
-        angles: (N, k) numbers of the orientation, in the file's unit; None without.
-        notes: one sentence for each decision.
-    """
-
-    table: ColumnTable
-    grid: Grid
-    mapping: M
-    raw: dict[str, Floats]
-    angles: Floats | None
-    notes: list[str]
+    table: ColumnTable  # columns of the exchange table, SI
+    grid: Grid  # the rows as the file has them
+    mapping: M  # as it is used
+    raw: dict[str, Floats]  # (N,) number columns by the file's names, in its units
+    angles: Floats | None  # (N, k) numbers of the orientation, in the file's unit; None without
+    notes: list[str]  # one sentence for each decision
 
 
 def mapped_table(
@@ -112,14 +95,16 @@ def mapped_table(
             "last side, the first row counts as +1"
         )
     nowhere = _nowhere(grid, mapping.position, raw)
-    keep, left_out = _complete(grid, raw, _sparse(grid, mapping))
+    sparse: list[str] = []  # columns of readings, of which a row has one kind
+    if mapping.one:
+        position = () if mapping.position is None else mapping.position.columns
+        sparse = [grid.name(c) for c in (*position, *(s.column for s in mapping.one.values()))]
+    keep, left_out = _complete(grid, raw, sparse)
     notes += left_out + nowhere
     grid = grid.rows_with(keep)
     raw = {column: values[keep] for column, values in raw.items()}
     table = ColumnTable(grid.path, grid.rows, {}, {})
-    for names, named, convert in _quantities(mapping, arm):
-        for name, column in zip(names, named, strict=True):
-            _put(table, grid, name, column, convert(raw[grid.name(column)]))
+    _quantities(table, grid, mapping, raw, arm)
     _observers(table, grid, mapping, raw)
     if side is not None:
         table.number.update(zip(columns.approach_columns(arm.n), side[keep].T, strict=True))
@@ -129,9 +114,7 @@ def mapped_table(
             _put(table, grid, name, time.column, seconds(grid, time))
     wrench = _wrench(grid, mapping, np.asarray(gravity), table)
     table.text["load"] = _loads(grid, mapping, wrench)
-    q = None
-    if joints is not None:
-        q = _joint_units(joints, arm) * _block(raw, grid, joints.columns)
+    q = None if joints is None else _joint_units(joints, arm) * _block(raw, grid, joints.columns)
     table.text["pose"] = _poses(grid, mapping.pose, q)
     if joints is not None and q is not None and joints.reported:
         _as_commanded(table, q, arm)
@@ -154,20 +137,8 @@ def import_mapped(
     """Read a table, or two tables, by a mapping.
 
     Args:
-        path: text, XLSX, MAT or Parquet.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where neither table nor mapping state them.
         station: (3,) where the tracker's beam starts, m; the origin where None.
         gravity: (3,) base axes, m/s²: the direction in which a hung mass pulls.
-        second: the second file, where the mapping does not name it.
-        std: as of `readings_of`.
-
-    Returns:
-        The readings in the table's order, and what was decided on the way. Rows without a value
-        in a column that is used are left out and counted.
-
-    Raises:
-        InputError: anything that cannot be right, by file, row and column.
     """
     of = mapped_table(path, mapping, arm, gravity, second)
     mapping, grid, table, notes = of.mapping, of.grid, of.table, of.notes
@@ -207,14 +178,6 @@ def import_mapped(
     return ImportResult(readings, tuple(notes))
 
 
-def _sparse(grid: Grid, mapping: PointMapping) -> list[str]:
-    """Columns of readings, of which a row has one kind, where the table has several."""
-    if not mapping.one:
-        return []
-    position = () if mapping.position is None else mapping.position.columns
-    return [grid.name(c) for c in (*position, *(s.column for s in mapping.one.values()))]
-
-
 def _observers(
     table: ColumnTable, grid: Grid, mapping: PointMapping, raw: dict[str, Floats]
 ) -> None:
@@ -242,9 +205,6 @@ def one_target_per_row(grid: Grid, mapping: M) -> tuple[Grid, M]:
 
     Row i with the columns x1 y1 z1 x2 y2 z2 becomes two rows, in this order; all other cells are
     repeated. Nothing changes where the mapping has no `targets`.
-
-    Raises:
-        InputError: no such column.
     """
     rows = range(len(grid.rows))
     if mapping.position is None or not mapping.position.targets:
@@ -275,36 +235,35 @@ def _put(table: ColumnTable, grid: Grid, name: str, column: Column, values: Floa
 
 
 def _quantities(
-    mapping: PointMapping, arm: Arm
-) -> Iterator[tuple[Sequence[str], Sequence[Column], Callable[[Floats], Floats]]]:
-    """Columns of numbers: names in the exchange table, in the file, and what makes SI of them."""
+    table: ColumnTable, grid: Grid, m: PointMapping, raw: dict[str, Floats], arm: Arm
+) -> None:
+    """Add the columns of numbers in SI units."""
 
-    def times(size: float) -> Callable[[Floats], Floats]:
-        return lambda values: size * values
+    def put(
+        names: Sequence[str], given: Sequence[Column], size: float | Floats = 1.0, zero: float = 0.0
+    ) -> None:
+        sizes = np.broadcast_to(size, len(names)).tolist()
+        for name, column, one in zip(names, given, sizes, strict=True):
+            _put(table, grid, name, column, one * (raw[grid.name(column)] - zero))
 
-    m = mapping
     if m.position is not None:
-        yield columns.POSITION, m.position.columns, times(units.LENGTHS[m.position.unit])
+        put(columns.POSITION, m.position.columns, units.LENGTHS[m.position.unit])
     commanded, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
     for s, names in ((m.joints, commanded), (m.actual_joints, reported)):
         if s is not None:
-            own, sizes = own_columns(names, len(s.columns), arm), _joint_units(s, arm).tolist()
-            for name, column, size in zip(own, s.columns, sizes, strict=True):
-                yield (name,), (column,), times(size)
+            put(own_columns(names, len(s.columns), arm), s.columns, _joint_units(s, arm))
     if m.cycle is not None:
-        yield ("cycle",), (m.cycle.column,), times(1.0)
+        put(("cycle",), (m.cycle.column,))
     if m.approach is not None and m.approach.columns:
-        yield columns.approach_columns(arm.n), m.approach.columns, times(1.0)
+        put(columns.approach_columns(arm.n), m.approach.columns)
     if m.air is not None:
-        yield ("air_degC",), (m.air.column,), _celsius(m.air.unit)
+        put(("air_degC",), (m.air.column,), *_CELSIUS[m.air.unit])
     if (w := m.joint_temperatures) is not None:
-        yield columns.temperature_columns(arm.n), w.columns, _celsius(w.unit)
+        put(columns.temperature_columns(arm.n), w.columns, *_CELSIUS[w.unit])
     if (t := m.torques) is not None:
+        sizes = np.where(arm.slides, units.FORCES[t.slide_unit], units.MOMENTS[t.unit])
         sign = -1.0 if t.of == "load" else 1.0
-        sizes = np.where(arm.slides, units.FORCES[t.slide_unit], units.MOMENTS[t.unit]).tolist()
-        names = columns.torque_columns(arm.units)
-        for name, column, size in zip(names, t.columns, sizes, strict=True):
-            yield (name,), (column,), times(sign * size)
+        put(columns.torque_columns(arm.units), t.columns, sign * sizes)
 
 
 def _joint_units(section: Joints, arm: Arm) -> Floats:
@@ -312,13 +271,6 @@ def _joint_units(section: Joints, arm: Arm) -> Floats:
     names = own_columns(columns.joint_columns(arm.units), len(section.columns), arm)
     angle, length = units.ANGLES[section.unit], units.LENGTHS[section.slide_unit]
     return np.array([length if name.endswith("_m") else angle for name in names])
-
-
-def _celsius(unit: str) -> Callable[[Floats], Floats]:
-    """Return what makes °C of temperatures in °C, °F or K."""
-    if unit == "K":
-        return lambda value: value - 273.15
-    return lambda value: (value - 32) / 1.8 if unit == "degF" else value
 
 
 def _raw(grid: Grid, mapping: PointMapping, arm: Arm) -> dict[str, Floats]:
@@ -346,31 +298,23 @@ def _nowhere(grid: Grid, of: Position | None, raw: dict[str, Floats]) -> list[st
 
     Exactly 0, 0, 0, and numbers of nines that are a position three times over, as −9999.
     """
-    if of is None:
-        return []
-    names = [grid.name(column) for column in of.columns]
-    position, notes = _block(raw, grid, names), []
+    names = [] if of is None else [grid.name(column) for column in of.columns]
+    position, notes = _block(raw, grid, names) if names else np.zeros((0, 1)), []
     for value in (0.0, *nines(position)):
         bad = np.asarray((position == value).all(axis=1))
-        if not bad.any():
-            continue
-        for name in names:
-            raw[name][bad] = np.nan
-        listed = ", ".join([f"{value:g}"] * 3)
-        notes.append(
-            f"positions of exactly {listed} ({int(bad.sum())} of {len(bad)} rows) count as missing"
-        )
+        if bad.any():
+            for name in names:
+                raw[name][bad] = np.nan
+            listed = ", ".join([f"{value:g}"] * 3)
+            rows = f"{int(bad.sum())} of {len(bad)} rows"
+            notes.append(f"positions of exactly {listed} ({rows}) count as missing")
     return notes
 
 
 def nines(position: Floats) -> list[float]:
     """Return numbers of four nines or more, which stand for a missing value."""
-    found = set()
-    for v in np.unique(position[np.isfinite(position)]):
-        digits = f"{abs(v):.0f}"
-        if len(digits) >= 4 and set(digits) == {"9"} and float(digits) == abs(v):
-            found.add(float(v))
-    return sorted(found)
+    known = np.unique(position[np.isfinite(position)])
+    return [float(v) for v in known if re.fullmatch(r"-?9{4,}(\.0)?", repr(float(v)))]
 
 
 def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tuple[Bools, list[str]]:
@@ -382,21 +326,17 @@ def _complete(grid: Grid, raw: dict[str, Floats], sparse: Sequence[str]) -> tupl
     some = [k for k, name in enumerate(raw) if name in sparse]
     missing[:, some] = missing[:, some].all(axis=1, keepdims=True)
     bad: Bools = np.asarray(missing.any(axis=1))
-    count = int(bad.sum())
-    if not count:
-        return ~bad, []
-    first = int(np.argmax(bad))
-    column = list(raw)[int(np.argmax(missing[first]))]
+    count, first = int(bad.sum()), int(np.argmax(bad))
     if count > MOST_LOST * len(bad):
+        column = list(raw)[int(np.argmax(missing[first]))]
         raise InputError(
             f"{grid.at(first, column)}: no value, and {count} of {len(bad)} rows lack one in some "
             f"column that the mapping uses; choose other columns"
         )
     lacking = [c for c, lost in zip(raw, np.any(missing, axis=0), strict=True) if lost]
     named = ", ".join(lacking[:4]) + (", ..." if len(lacking) > 4 else "")
-    return ~bad, [
-        f"{count} of {len(bad)} rows left out ({_listed(grid.rows[bad])}): no value in {named}"
-    ]
+    rows = f"{count} of {len(bad)} rows left out ({_listed(grid.rows[bad])})"
+    return ~bad, [f"{rows}: no value in {named}"] * bool(count)
 
 
 def _stale(grid: Grid, position: Floats, q: Floats) -> list[str]:
@@ -471,10 +411,9 @@ def _loads(grid: Grid, mapping: PointMapping, wrench: Floats) -> list[str]:
         none = {name.lower() for name in (*mapping.load.none, "")}
         text = grid.text(mapping.load.column)
         return ["none" if name.lower() in none else name for name in text]
-    if mapping.hung_mass is not None:
-        unit = mapping.hung_mass.unit
-        mass = np.nan_to_num(grid.numbers(mapping.hung_mass.column))
-        return ["none" if m == 0 else f"{m:g}{unit}" for m in mass]
+    if (hung := mapping.hung_mass) is not None:
+        mass = np.nan_to_num(grid.numbers(hung.column))
+        return ["none" if m == 0 else f"{m:g}{hung.unit}" for m in mass]
     return ["load" if loaded else "none" for loaded in np.asarray(wrench.any(axis=1))]
 
 
@@ -501,53 +440,30 @@ def _poses(grid: Grid, of: PoseName | None, q: Floats | None) -> list[str]:
                 f"[pose], rows of the same joints are one pose"
             )
         return names
+    rows = grid.rows.tolist()
     if of is not None or q is None:
-        return [f"row {row}" for row in grid.rows.tolist()]
-    keys = np.rint(q / (10 * SAME_POSE)).astype(np.int64)
+        return [f"row {row}" for row in rows]
+    keys = map(tuple, np.rint(q / (10 * SAME_POSE)).astype(np.int64).tolist())
     first: dict[tuple[int, ...], int] = {}
-    out = []
-    for row, key in zip(grid.rows.tolist(), map(tuple, keys.tolist()), strict=True):
-        out.append(f"row {first.setdefault(key, row)}")
-    return out
+    return [f"row {first.setdefault(key, row)}" for row, key in zip(rows, keys, strict=True)]
 
 
 def seconds(grid: Grid, time: Time) -> Floats:
-    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row.
+    """(N,) times in s; dates, and times since an epoch, are counted from the earliest row."""
+    import pandas as pd
 
-    Raises:
-        InputError: a cell that is no time, or empty.
-    """
+    cells, expected = grid.cells(time.column), time.format or _EXPECTED.get(time.unit, "a date")
+    dated = all(isinstance(c, datetime) for c in cells)
     if time.unit in units.SECONDS:
-        values = units.SECONDS[time.unit] * grid.numbers(time.column)
-        _refuse_missing(grid, time, values, "a time")
-        return values - values.min() if values.min() > EPOCH else values
-    cells = grid.cells(time.column)
-    values = np.array([_stamp(c, grid, time, k) for k, c in enumerate(cells)])
-    expected = time.format or _EXPECTED.get(time.unit, "a date")
-    _refuse_missing(grid, time, values, expected)
-    return np.asarray(np.round(values - values.min(), 6))
-
-
-def _stamp(cell: Cell, grid: Grid, time: Time, k: int) -> float:
-    """Seconds since 1970 (any zone), NaN where the cell is no time."""
-    if isinstance(cell, datetime):
-        return _since(cell)
-    try:
-        if time.unit == "excel":
-            return _DAY * float(str(cell).replace(",", "."))
-        text = str(cell).strip()
-        if time.format is not None:
-            return _since(datetime.strptime(text, time.format))
-        return _since(datetime.fromisoformat(text.replace(",", ".")))
-    except ValueError:
-        return float("nan")
-
-
-def _since(when: datetime) -> float:
-    return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
-
-
-def _refuse_missing(grid: Grid, time: Time, values: Floats, expected: str) -> None:
+        values, expected = units.SECONDS[time.unit] * grid.numbers(time.column), "a time"
+    elif time.unit == "excel" and not dated:
+        days = pd.Series([str(c).replace(",", ".") for c in cells])
+        values = _DAY * pd.to_numeric(days, errors="coerce").to_numpy(dtype=float)
+    else:
+        form = None if dated else time.format
+        texts = [str(c).strip() if form else str(c).strip().replace(",", ".") for c in cells]
+        when = pd.to_datetime(pd.Series(texts), format=form or "ISO8601", errors="coerce", utc=True)
+        values = (when - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy(dtype=float)
     bad = ~np.isfinite(values)
     if bad.any():
         k = int(np.argmax(bad))
@@ -555,6 +471,9 @@ def _refuse_missing(grid: Grid, time: Time, values: Floats, expected: str) -> No
             f"{grid.at(k, time.column)}: '{grid.text(time.column)[k]}' is not "
             f"{expected}; see unit of the times in the mapping"
         )
+    if time.unit in units.SECONDS:
+        return values - values.min() if values.min() > EPOCH else values
+    return np.asarray(np.round(values - values.min(), 6))
 
 
 def approach_by_order(q: Floats) -> Floats:
@@ -563,20 +482,13 @@ def approach_by_order(q: Floats) -> Floats:
     The first row, and joints that have not moved yet, count as +1. Rows without a value are passed
     over.
     """
-    last = _fill(q)
-    step = np.diff(last, axis=0, prepend=last[:1])
+    import pandas as pd
+
+    known = pd.DataFrame(q).ffill().bfill().to_numpy()
+    step = np.diff(known, axis=0, prepend=known[:1])
     side = np.where(np.abs(step) > STILL, np.sign(step), np.nan)
     side[0] = 1.0
-    return _fill(side)
-
-
-def _fill(a: Floats) -> Floats:
-    """Replace NaN by the last value above it in the column (by the first one at the top)."""
-    row = np.where(np.isfinite(a), np.arange(len(a))[:, None], -1)
-    row = np.maximum.accumulate(row, axis=0)
-    first = np.argmax(np.isfinite(a), axis=0)
-    row = np.where(row < 0, first, row)
-    return np.asarray(np.take_along_axis(a, row, axis=0), dtype=float)
+    return np.asarray(pd.DataFrame(side).ffill().to_numpy(), dtype=float)
 
 
 def _plausible(

@@ -12,8 +12,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import ObserverKind
 from hilcal.robot.catalogue import configs_dir
-from hilcal.tables.orientation import CONVENTIONS, NUMBERS
-from hilcal.tables.units import SECONDS, Angle, Length, Temperature
+from hilcal.tables.units import CONVENTIONS, NUMBERS, SECONDS, Angle, Length, Temperature
 from hilcal.toml import NonNegative, Positive, Section, load_section, suggest
 
 Column = Annotated[str, Field(min_length=1)] | Annotated[int, Strict(), Field(ge=1)]
@@ -514,15 +513,7 @@ def find_mapping(name: str | Path, kind: type[M]) -> M:
 
 
 def load_mapping(path: Path, kind: type[M]) -> M:
-    """Read a mapping file.
-
-    Args:
-        kind: `Mapping` for readings, `PointMapping` for points.
-
-    Raises:
-        InputError: unreadable file, syntax error (names the line), unknown key (lists the valid
-            ones of its section), missing key or bad value.
-    """
+    """Read a mapping file."""
     mapping = load_section(path, kind)
     if (second := mapping.second_file) is None or second.path is None:
         return mapping

@@ -20,8 +20,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 
-LIMIT_S = 60
-"""Time that reading may take; a choice: 1 GB takes a few seconds."""
+LIMIT_S = 60  # Time that reading may take; a choice: 1 GB takes a few seconds
 MEMORY = 8 << 30
 """Address space of the process, bytes; a choice: the largest file that is read, several times."""
 

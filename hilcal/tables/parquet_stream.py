@@ -21,12 +21,7 @@ from hilcal.robot.batch import CHUNK
 from hilcal.tables import checks, columns
 from hilcal.tables.files import is_plain, package
 from hilcal.tables.grid import ColumnTable
-from hilcal.tables.table import (
-    check_covers,
-    instrument_covariance,
-    measured_of,
-    stated_covariance,
-)
+from hilcal.tables.table import check_covers, instrument_covariance, measured_of, stated_covariance
 from hilcal.tables.uncertainty import floored, rounding_variance, with_rounding
 from hilcal.types import Floats
 
@@ -39,22 +34,17 @@ class ReadingStream:
     """A Parquet file of readings; nothing of it is held.
 
     Attributes:
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        rows: number of rows of each row group.
-        covers: what its covariances cover, `INSTRUMENT` or `WHOLE`.
-        rounding: (3,) variance of the positions' rounding, m².
     """
 
     path: Path
-    arm: Arm
-    noise: TrackerNoise | None
+    arm: Arm  # its number of joints, their limits and its reach are checked
+    noise: TrackerNoise | None  # gives the covariances where the file has none
     station: tuple[float, ...] | None
     columns: tuple[str, ...]
-    rows: tuple[int, ...]
-    covers: str = INSTRUMENT
-    rounding: Floats | None = None
+    rows: tuple[int, ...]  # number of rows of each row group
+    covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
+    rounding: Floats | None = None  # (3,) variance of the positions' rounding, m²
 
     def __len__(self) -> int:
         """Return the number of readings."""

@@ -12,11 +12,11 @@ from hilcal.readings.covariance import INSTRUMENT, ROUNDING, WHOLE, TrackerNoise
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.robot.arm import Arm
 from hilcal.tables import checks, columns
+from hilcal.tables.checks import observed_of, observer_columns
 from hilcal.tables.columns import following_columns, with_following
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import ColumnTable
 from hilcal.tables.mapping import FileFormat
-from hilcal.tables.observed import observed_of, observer_columns
 from hilcal.tables.uncertainty import LEAST, floored, rounding_variance, with_rounding
 from hilcal.tables.write import Column, write_columns
 from hilcal.toml import suggest
@@ -26,29 +26,19 @@ FROM_TABLE = "covariance: from the table"
 FROM_TRACKER = "covariance: from the tracker's noise in [tracker]"
 LONGEST = 1e12
 """No time of a campaign is as long, s: those since 1970 are 1e9, in nanoseconds they were 1e18."""
-LARGEST_NM = 1e5
-"""No joint of an arm carries as much, N·m."""
+LARGEST_NM = 1e5  # No joint of an arm carries as much, N·m
 FORM = FileFormat(encoding="utf-8")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImportResult:
-    """Readings, and what was decided on the way.
+    """Readings, and what was decided on the way."""
 
-    Attributes:
-        readings: the readings that can be used.
-        notes: one sentence per decision; left out rows are named as a spreadsheet counts them.
-        covers: what the covariances cover, see `readings.covariance`.
-        noise_stated: whether the table or [tracker] states the noise; where False, the covariances
-            are those of the instrument that [tracker] has by default.
-        from_tracker: whether the covariances are those of the noise in [tracker].
-    """
-
-    readings: Readings
-    notes: tuple[str, ...]
-    covers: str = INSTRUMENT
-    noise_stated: bool = True
-    from_tracker: bool = False
+    readings: Readings  # the readings that can be used
+    notes: tuple[str, ...]  # one sentence per decision
+    covers: str = INSTRUMENT  # what the covariances cover, see `readings.covariance`
+    noise_stated: bool = True  # by the table or [tracker], not by the defaults of [tracker] alone
+    from_tracker: bool = False  # whether the covariances are those of the noise in [tracker]
 
 
 def read_table(
@@ -73,19 +63,7 @@ def import_table(
     """Read an exchange table; every unit is SI, every complaint names row and column.
 
     Args:
-        path: a CSV, Parquet or XLSX file with the columns of `columns.known_columns`.
-        arm: its number of joints, their limits and its reach are checked.
-        noise: gives the covariances where the table has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        targets: names of the cell's targets, see `Cell.target_names`.
-        std: as of `readings_of`.
-
-    Returns:
-        The readings in the table's order, poses and loads numbered as they appear; and notes on
-        where its covariances come from.
-
-    Raises:
-        InputError: anything that cannot be right.
     """
     chosen: list[Sequence[str]] = []
     grid = open_grid(path, FORM, lambda header: chosen.extend(_choose(str(path), header, arm)))
@@ -107,18 +85,12 @@ def readings_of(
     """Check a table with the exchange table's columns, in SI units, and make readings of it.
 
     Args:
-        arm: its number of joints, their limits and its reach are checked.
         noise: gives the covariances where there are none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-        covariance: (K, m, m) of the K rows with a position, in place of the table's columns,
-            checked like them.
-        targets: names of the cell's targets, see `Cell.target_names`.
-        rounding: (3,) variance of the positions' rounding, m²; found from the positions where
-            None. It is added where it counts beside the covariance.
+        covariance: (K, m, m) of the K rows with a position, in place of the table's columns.
+        rounding: (3,) variance of the positions' rounding, m², added where it counts beside the
+            covariance; found from the positions where None.
         std: standard deviations of distances and heights, m, for a table that states none.
-
-    Raises:
-        InputError: anything that cannot be right.
     """
     checks.check_names(table)
     pose, pose_names = _index(table.text["pose"])
@@ -127,8 +99,7 @@ def readings_of(
     observed = observed_of(table)
     whole = np.ones(len(table.rows), dtype=np.bool_) if observed is None else ~observed.scalar
     states, value = measured_of(table, arm, whole)
-    by = None if observed is None else observed.number
-    states = replace(states, target=target, observer=by)
+    states = replace(states, target=target, observer=None if observed is None else observed.number)
     checks.check_same_pose(table, pose, pose_names, states.q)
     checks.check_wrenches(table, states.wrench, load, load_names, arm)
     cov, notes, covers = np.zeros((len(value), 3, 3)), tuple[str, ...](), _covers(table)[0]
@@ -166,15 +137,15 @@ def _covariance(
     stated = stated_covariance(table, value.shape[1]) if covariance is None else covariance
     notes: tuple[str, ...]
     if stated is None:
-        cov, notes = instrument_covariance(table, value, noise, station), (FROM_TRACKER,)
+        cov = instrument_covariance(table, value, noise, station)
+        notes, covers, included = (FROM_TRACKER,), INSTRUMENT, False
     else:
         checks.check_covariances(table, stated)
         tiny = np.any(np.diagonal(stated, axis1=1, axis2=2) < min(LEAST) ** 2)
         known = bool(tiny) and noise is not None
         spec = instrument_covariance(table, value, noise, station) if known else None
-        cov, notes = floored(table, stated, spec)
-        notes = (FROM_TABLE, *notes)
-    covers, included = (INSTRUMENT, False) if stated is None else _covers(table)
+        cov, more = floored(table, stated, spec)
+        notes, (covers, included) = (FROM_TABLE, *more), _covers(table)
     if rounding is None:
         rounding = np.zeros(3) if included else rounding_variance(value[:, :3], 1.0)
     cov, rounded = with_rounding(cov, rounding)
@@ -220,22 +191,19 @@ def _targets(table: ColumnTable, names: Sequence[str]) -> Ints | None:
                 f"{', '.join(names)} ([[tool.targets]]); name in each row the one that was read"
             )
         return None
-    if "" in given:
+    if not names and len(set(given)) > 1:
         raise InputError(
-            f"{table.at(given.index(''), columns.TARGET)}: the cell is empty; name the target"
+            f"{table.path}: column '{columns.TARGET}' names "
+            f"{', '.join(map(repr, dict.fromkeys(given)))}, but the cell has one target; give each "
+            "a section [[tool.targets]] with its name (and target_m, where its offset is known)"
         )
-    used = list(dict.fromkeys(given))
-    if not names and len(used) > 1:
-        raise InputError(
-            f"{table.path}: column '{columns.TARGET}' names {', '.join(map(repr, used))}, but the "
-            f"cell has one target; give each a section [[tool.targets]] with its name (and "
-            f"target_m, where its offset is known)"
-        )
-    for name in used if names else ():
-        if name not in names:
+    for k, name in enumerate(given):
+        if not name:
+            raise InputError(f"{table.at(k, columns.TARGET)}: the cell is empty; name the target")
+        if names and name not in names:
             raise InputError(
-                f"{table.at(given.index(name), columns.TARGET)}: target {name!r} is not in the "
-                f"cell's [[tool.targets]]{suggest(name, names)}; valid: {', '.join(names)}"
+                f"{table.at(k, columns.TARGET)}: target {name!r} is not in the cell's "
+                f"[[tool.targets]]{suggest(name, names)}; valid: {', '.join(names)}"
             )
     if len(names) < 2:
         return None
@@ -259,11 +227,7 @@ def _covers(table: ColumnTable) -> tuple[str, bool]:
 
 
 def check_covers(word: str, where: str) -> None:
-    """Refuse another word than those for what covariances cover.
-
-    Raises:
-        InputError: lists the valid ones.
-    """
+    """Refuse another word than those for what covariances cover."""
     if word.removesuffix(ROUNDING) not in (INSTRUMENT, WHOLE):
         raise InputError(
             f"{where}: {word!r} is unknown; valid: {INSTRUMENT} (the covariance of the tracker), "
@@ -276,11 +240,7 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     """Return the states of a table's rows, and what was measured in them, (N, m) m and rad.
 
     Args:
-        arm: its number of joints, their limits and its reach are checked.
         whole: (N,) rows with a position, others are zero; all of them where None.
-
-    Raises:
-        InputError: a value that cannot be right.
     """
     states = _states(table, arm)
     if whole is not None and not whole.all():
@@ -300,21 +260,25 @@ def measured_of(table: ColumnTable, arm: Arm, whole: Bools | None = None) -> tup
     return states, value
 
 
+_RANGES = (
+    ("air_degC", -50.0, 80.0, "°C"),
+    ("time_s", -LONGEST, LONGEST, "s"),
+    ("load_time_s", 0.0, LONGEST, "s"),
+)
+
+
 def _states(table: ColumnTable, arm: Arm) -> States:
     table = with_following(table, arm)
     number, n = table.number, arm.n
     joints, reported = columns.joint_columns(arm.units), columns.actual_columns(arm.units)
-    q = table.matrix(joints)
+    torques, sides = columns.torque_columns(arm.units), columns.approach_columns(n)
+    q, zero = table.matrix(joints), np.zeros(len(table.rows))
     checks.check_joints(table, joints, q, arm)
-    zero = np.zeros(len(q))
     wrench = np.stack([number.get(name, zero) for name in columns.WRENCH], axis=1)
     temperature = _group(table, columns.temperature_columns(n))
-    approach = _group(table, columns.approach_columns(n))
-    actual = _group(table, reported)
-    torque = _group(table, columns.torque_columns(arm.units))
+    approach, actual, torque = (_group(table, names) for names in (sides, reported, torques))
     if approach is not None:
-        names = columns.approach_columns(n)
-        table.refuse(np.abs(approach) != 1, names, lambda v: f"{v:g} must be -1 or +1")
+        table.refuse(np.abs(approach) != 1, sides, lambda v: f"{v:g} must be -1 or +1")
     if actual is not None:
         checks.check_actual_joints(table, reported, actual, q)
     if temperature is not None:
@@ -322,15 +286,11 @@ def _states(table: ColumnTable, arm: Arm) -> States:
     if torque is not None:
         lost = np.isnan(torque)
         some = lost & ~lost.all(axis=1, keepdims=True)
-        names = columns.torque_columns(arm.units)
-        table.refuse(some, names, lambda _: "no value; give all torques of a row, or none")
-        _in_range(table, columns.torque_columns(arm.units), -LARGEST_NM, LARGEST_NM, "N·m or N")
-    if "air_degC" in number:
-        _in_range(table, ("air_degC",), -50, 80, "°C")
-    if "time_s" in number:
-        _in_range(table, ("time_s",), -LONGEST, LONGEST, "s")
-    if "load_time_s" in number:
-        _in_range(table, ("load_time_s",), 0, LONGEST, "s")
+        table.refuse(some, torques, lambda _: "no value; give all torques of a row, or none")
+        _in_range(table, torques, -LARGEST_NM, LARGEST_NM, "N·m or N")
+    for name, low, high, unit in _RANGES:
+        if name in number:
+            _in_range(table, (name,), low, high, unit)
     return States(
         q=q,
         wrench=wrench,
@@ -350,11 +310,8 @@ def _group(table: ColumnTable, names: Sequence[str]) -> Floats | None:
 
 def _in_range(table: ColumnTable, names: Sequence[str], low: float, high: float, unit: str) -> None:
     value = table.matrix(names)
-    table.refuse(
-        (value < low) | (value > high),
-        names,
-        lambda v: f"{v:g} {unit} cannot be right; expected {low:g} to {high:g} {unit}",
-    )
+    words = f"{unit} cannot be right; expected {low:g} to {high:g} {unit}"
+    table.refuse((value < low) | (value > high), names, lambda v: f"{v:g} {words}")
 
 
 def _cycles(table: ColumnTable) -> Ints:
@@ -418,9 +375,8 @@ def write_table(
     Raises:
         InputError: a name that a table cannot hold, no pyarrow, or the file cannot be written.
     """
-    path = Path(path)
-    found = exchange_columns(readings, covers, units)
-    write_columns(path, found, {"table": "readings", "covers": covers, **(about or {})})
+    about = {"table": "readings", "covers": covers, **(about or {})}
+    write_columns(Path(path), exchange_columns(readings, covers, units), about)
 
 
 def exchange_columns(
@@ -437,8 +393,7 @@ def exchange_columns(
         found |= observer_columns(readings)
     if covers != INSTRUMENT:
         found[columns.COVERS] = [covers] * len(readings)
-    header, numbers = _number_columns(readings, units)
-    return found | dict(zip(header, numbers, strict=True))
+    return found | _number_columns(readings, units)
 
 
 def with_what_rounding_does(covers: str, readings: Readings) -> str:
@@ -461,41 +416,36 @@ def _names(names: Sequence[str], index: Ints, what: str) -> list[str]:
             raise InputError(f"{what} {name!r}: a name must be not empty and not padded")
         if what == "load" and name != "none" and name.lower() == "none":
             raise InputError(f"load '{name}' must be spelled 'none'")
-    if len(set(used)) < len(used):
-        name = next(name for name in used if used.count(name) > 1)
-        raise InputError(f"{what} '{name}': two of the readings' {what}s have this name")
+        if used.count(name) > 1:
+            raise InputError(f"{what} '{name}': two of the readings' {what}s have this name")
     return [names[k] for k in index.tolist()]
 
 
-def _number_columns(
-    readings: Readings, units: Sequence[str] | None
-) -> tuple[list[str], list[Floats | Ints]]:
-    """Names and (N,) arrays of the number columns that the readings have."""
+def _number_columns(readings: Readings, units: Sequence[str] | None) -> dict[str, Column]:
+    """(N,) number columns that the readings have, by name."""
     s, m, n = readings.states, readings.m, readings.states.q.shape[1]
     i, j = np.triu_indices(m)
-    value, cov = readings.value, readings.covariance[:, i, j]
-    if (one := readings.scalar).any():
-        value, cov = value.copy(), cov.copy()
-        value[one] = cov[one] = np.nan
-    any_whole = not one.all()
+    value, cov = readings.value.copy(), readings.covariance[:, i, j]
+    one, of = readings.scalar, units or n
+    value[one] = cov[one] = np.nan
+    loaded = np.any(s.wrench) or np.signbit(s.wrench).any()
     blocks: list[tuple[Sequence[str], Floats | Ints | None]] = [
         (("cycle",), readings.cycle),
-        (columns.joint_columns(units or n), s.q),
-        ((columns.POSITION + columns.ROTATION)[:m], value if any_whole else None),
-        (columns.covariance_columns(m), cov if any_whole else None),
-        (columns.WRENCH, s.wrench if np.any(s.wrench) or np.signbit(s.wrench).any() else None),
+        (columns.joint_columns(of), s.q),
+        ((columns.POSITION + columns.ROTATION)[:m], None if one.all() else value),
+        (columns.covariance_columns(m), None if one.all() else cov),
+        (columns.WRENCH, s.wrench if loaded else None),
         (("time_s",), s.time),
         (("load_time_s",), s.load_time),
         (("air_degC",), s.air_temperature),
         (columns.temperature_columns(n), s.joint_temperature),
         (columns.approach_columns(n), s.approach),
-        (columns.actual_columns(units or n), s.q_actual),
-        (columns.torque_columns(units or n), s.torque),
+        (columns.actual_columns(of), s.q_actual),
+        (columns.torque_columns(of), s.torque),
     ]
-    header: list[str] = []
-    numbers: list[Floats | Ints] = []
-    for names, block in blocks:
-        if block is not None:
-            header += names
-            numbers += list(block.reshape(len(readings), len(names)).T)
-    return header, numbers
+    return {
+        name: column
+        for names, block in blocks
+        if block is not None
+        for name, column in zip(names, block.reshape(len(readings), len(names)).T, strict=True)
+    }

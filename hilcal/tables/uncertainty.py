@@ -12,13 +12,11 @@ from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.tables import units
 from hilcal.tables.grid import ColumnTable, Grid
 from hilcal.tables.mapping import Column, CovarianceColumns, Mapping, Std
-from hilcal.tables.orientation import angle_axes
+from hilcal.tables.units import angle_axes
 from hilcal.types import Bools, Floats
 
-FAR = 5.0
-"""Ratio of stated and instrument's standard deviation that is worth a word; a choice."""
-NEAR = 3.0
-"""Ratio within which another reading of the figures fits the instrument; a choice."""
+FAR = 5.0  # Ratio of stated and instrument's standard deviation that is worth a word; a choice
+NEAR = 3.0  # Ratio within which another reading of the figures fits the instrument; a choice
 LEAST = (1e-7, 1e-7)
 """m, rad; no instrument in air measures an arm to better than 0.1 µm and 0.02": a choice, about
 the resolution of the best."""
@@ -50,18 +48,11 @@ def mapped_covariance(
     mapping adds it. Orientations without a figure of their own have the instrument's.
 
     Args:
-        table: the columns in SI units, for messages.
-        grid: the columns as the file holds them.
-        mapping: what they hold.
         position: (N, 3) m.
-        angles: (N, k) the orientation's numbers in the file's unit; None for positions.
         station: (3,) where its beam starts.
 
     Returns:
         (N, m, m) m² and rad², None where the table states none; and one sentence per decision.
-
-    Raises:
-        InputError: a figure that is missing or cannot be right.
     """
     m = 3 if angles is None else 6
     origin = np.zeros(3) if station is None else np.asarray(station, dtype=float)
@@ -106,46 +97,44 @@ def _block(grid: Grid, columns: Sequence[Column]) -> Floats:
     if bad.any():
         i, j = divmod(int(np.argmax(bad)), values.shape[1])
         raise InputError(
-            f"{grid.at(i, grid.name(columns[j]))}: no value; every reading needs its uncertainty "
+            f"{grid.at(i, columns[j])}: no value; every reading needs its uncertainty "
             f"(take the column out of the mapping to use the noise in [tracker])"
         )
     return values
 
 
+_KINDS = {
+    "std": "standard deviations",
+    "expanded": "expanded uncertainties",
+    "variance": "variances",
+}
+
+
 def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats, str]:
     missing = [name for name in std.columns if isinstance(name, str) and name not in grid.names]
     absent = std.optional and len(missing) == len(std.columns)
-    if absent:
-        figures = np.zeros((count, len(std.columns)))
-    elif std.columns:
+    if absent or not std.columns:
+        given = [0.0] * len(std.columns) if absent else std.values
+        figures = np.tile(np.array(given, dtype=float), (count, 1))
+    else:
         figures = _block(grid, std.columns)
         bad = figures < 0
         if bad.any():
             i, j = divmod(int(np.argmax(bad)), figures.shape[1])
-            raise InputError(
-                f"{grid.at(i, grid.name(std.columns[j]))}: {figures[i, j]:g}: a "
-                f"{'variance' if std.kind == 'variance' else 'standard deviation'} is 0 or more"
-            )
-    else:
-        figures = np.tile(np.array(std.values, dtype=float), (count, 1))
-    what = {
-        "std": "standard deviations",
-        "expanded": f"expanded uncertainties (k = {std.k:g})",
-        "variance": "variances",
-    }[std.kind]
+            what = "variance" if std.kind == "variance" else "standard deviation"
+            where = grid.at(i, std.columns[j])
+            raise InputError(f"{where}: {figures[i, j]:g}: a {what} is 0 or more")
+    what = _KINDS[std.kind] + (f" (k = {std.k:g})" if std.kind == "expanded" else "")
     sigma = np.sqrt(figures) if std.kind == "variance" else figures
-    if std.kind == "expanded":
-        sigma = sigma / std.k
+    sigma = sigma / (std.k if std.kind == "expanded" else 1.0)
     if std.at_least is not None:
-        least = np.repeat(std.at_least, 3)
-        sigma = np.maximum(sigma, least[: sigma.shape[1]])
+        sigma = np.maximum(sigma, np.repeat(std.at_least, 3)[: sigma.shape[1]])
         what += f" (at least {std.at_least[0]:g} {std.unit}"
         what += f", {std.at_least[1]:g} {std.angle_unit})" if sigma.shape[1] == 6 else ")"
     if sigma.shape[1] == 1:
         sigma = np.repeat(sigma, 3, axis=1) / (np.sqrt(3) if std.of == "point" else 1.0)
-    scale = [units.LENGTHS[std.unit]] * 3 + [units.ANGLES[std.angle_unit]] * 3
-    sigma = sigma * np.array(scale[: sigma.shape[1]])
     m = sigma.shape[1]
+    sigma = sigma * _scale(std, m)
     correlation = np.broadcast_to(np.eye(m), (count, m, m)).copy()
     if mapping.correlation is not None:
         upper, right = np.triu_indices(m, 1)
@@ -158,10 +147,12 @@ def _of_std(grid: Grid, mapping: Mapping, std: Std, count: int) -> tuple[Floats,
         correlation[:, upper, right] = correlation[:, right, upper] = value
     where = "from the table" if std.columns else "the same for all readings"
     where = f"since the table has no column '{missing[0]}'" if absent else where
-    return (
-        sigma[:, :, None] * correlation * sigma[:, None, :],
-        f"covariance: {what}, {where}",
-    )
+    return sigma[:, :, None] * correlation * sigma[:, None, :], f"covariance: {what}, {where}"
+
+
+def _scale(section: Std | CovarianceColumns, m: int) -> Floats:
+    """(m,) m and rad in the units of a section."""
+    return np.repeat([units.LENGTHS[section.unit], units.ANGLES[section.angle_unit]], 3)[:m]
 
 
 def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
@@ -170,21 +161,16 @@ def _of_matrix(grid: Grid, section: CovarianceColumns) -> Floats:
     m = 3 if k <= 9 else 6
     if k in (9, 36):
         cov = figures.reshape(count, m, m)
-        off = np.abs(cov - np.swapaxes(cov, 1, 2)).max(axis=(1, 2))
-        bad = off > 1e-3 * np.abs(cov).max(axis=(1, 2))
-        if bad.any():
-            i = int(np.argmax(bad))
-            raise InputError(
-                f"{grid.at(i, grid.name(section.columns[0]))}: the covariance is not symmetric"
-            )
-        cov = 0.5 * (cov + np.swapaxes(cov, 1, 2))
+        turned = np.swapaxes(cov, 1, 2)
+        bad = np.abs(cov - turned).max(axis=(1, 2)) > 1e-3 * np.abs(cov).max(axis=(1, 2))
+        for i in np.flatnonzero(bad)[:1].tolist():
+            raise InputError(f"{grid.at(i, section.columns[0])}: the covariance is not symmetric")
+        cov = 0.5 * (cov + turned)
     else:
         upper, right = np.triu_indices(m)
         cov = np.zeros((count, m, m))
         cov[:, upper, right] = cov[:, right, upper] = figures
-    scale = np.array(
-        ([units.LENGTHS[section.unit]] * 3 + [units.ANGLES[section.angle_unit]] * 3)[:m]
-    )
+    scale = _scale(section, m)
     return np.asarray(scale[:, None] * cov * scale)
 
 
@@ -221,13 +207,6 @@ def floored(
     Args:
         covariance: (N, m, m), m² and rad².
         instrument: covariances (N, m, m) of the noise in [tracker]; None where it is not known.
-
-    Returns:
-        The covariances, and a note that counts the rows.
-
-    Raises:
-        InputError: the usual standard deviation is below 0.1 µm or 1e-7 rad; or a zero where the
-            instrument's noise is not known.
     """
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     m = variance.shape[1]
@@ -332,8 +311,6 @@ def check_joint_rounding(
     A rounding of Δ displaces the target by up to Δ/√12 times the reach, one standard deviation.
 
     Args:
-        q: (N, n) in the file's unit.
-        unit: radians in that unit.
         covariance: (N, m, m), m².
     """
     size = max((step(q[:, k]) for k in range(q.shape[1])), default=0.0)

@@ -23,15 +23,12 @@ from hilcal.tables.files import package
 from hilcal.types import Floats
 from hilcal.whole_file import replacing
 
-UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")
-"""Ends of names that are units."""
+UNITS = ("m2", "rad2", "m", "rad", "N", "Nm", "s", "degC")  # Ends of names that are units
 KEY = b"hilcal"
-ORDER = "x_order"
-"""Column of a plan that numbers its readings."""
+ORDER = "x_order"  # Column of a plan that numbers its readings
 SUFFIXES = (".csv", ".parquet")
 
-Column = Sequence[object] | np.ndarray
-"""Numbers, or words; None for a cell without a value."""
+Column = Sequence[object] | np.ndarray  # Numbers, or words; None for a cell without a value
 
 
 def check_suffix(path: Path) -> None:
@@ -144,9 +141,7 @@ def _number(value: Any) -> float | None:
 
 
 def plan_csv(
-    plan: Plan,
-    wrenches: Mapping[str, Floats] | None = None,
-    units: Sequence[str] | None = None,
+    plan: Plan, wrenches: Mapping[str, Floats] | None = None, units: Sequence[str] | None = None
 ) -> str:
     """Return a plan as CSV: `x_order` from 1, pose, load, cycle, q1_rad ... (and wrenches).
 

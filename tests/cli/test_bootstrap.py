@@ -1,21 +1,26 @@
-"""`bootstrap` on the command line."""
+"""`bootstrap`, `--prior`, and gross errors on the command line."""
 
-from pathlib import Path
+import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from tests.support.cli_cases import CELL, ok, refused, table
+import hilcal as hc
+from hilcal.cli import main
+from hilcal.readings.covariance import WHOLE
+from hilcal.tables.table import write_table
+from studies.gross_errors import spoil
+from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
 from tests.support.cli_cases import run as command
-
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def csv(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def csv(tmp_path_factory):
     return table(tmp_path_factory.mktemp("bootstrap") / "t.csv", "nothing", poses=12)
 
 
-def test_words_and_document_and_nothing_is_written(csv: Path, capsys: Capsys) -> None:
+def test_words_and_document_and_nothing_is_written(csv, capsys):
     run = csv.with_name("run.hilcal")
     ok(capsys, "import", csv, "--config", CELL, "-o", run)
     before = run.read_bytes()
@@ -32,7 +37,7 @@ def test_words_and_document_and_nothing_is_written(csv: Path, capsys: Capsys) ->
     assert run.read_bytes() == before
 
 
-def test_what_it_refuses(csv: Path, capsys: Capsys) -> None:
+def test_what_it_refuses(csv, capsys):
     few = csv.with_name("few.hilcal")
     lines = csv.read_text().splitlines(keepends=True)
     csv.with_name("few.csv").write_text("".join(lines[: 1 + 5 * (len(lines) - 1) // 12]))
@@ -42,3 +47,139 @@ def test_what_it_refuses(csv: Path, capsys: Capsys) -> None:
     ended = command(capsys, "bootstrap", few, "--workers", "1")
     assert (ended.code, ended.out) == (4, "")
     assert "error: 5 distinct poses were fitted" in ended.err
+
+
+def run(capsys, *words):
+    with pytest.raises(SystemExit) as end:
+        main([str(w) for w in words])
+    out = capsys.readouterr()
+    return int(end.value.code or 0), out.out, out.err
+
+
+def test_the_next_campaign_starts_from_what_the_last_one_taught(tmp_path, capsys):
+    old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
+    run(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 12), "--config", CELL, "-o", old)
+    run(capsys, "import", table(tmp_path / "b.csv", "nothing", 2, 6), "--config", CELL, "-o", new)
+    code, _, err = run(capsys, "identify", new, "--prior", old)
+    assert code == 2
+    assert "no revision yet" in err
+    assert run(capsys, "identify", old)[0] == 0
+    alone = json.loads(run(capsys, "identify", new, "--json")[1])
+    code, out, _ = run(capsys, "identify", new, "--prior", old, "--json")
+    assert code == 0
+    found = json.loads(out)
+    assert found["prior"]["source"]["campaign"] == "old.hilcal"
+    assert found["prior"]["source"]["revision"] == 1
+    assert {"effect", "joint", "moved_sigma", "p_value", "drift"} <= set(
+        found["prior"]["effects"][0]
+    )
+    name = "joint_compliance.j2"
+    std = [next(p["std"] for p in d["parameters"] if p["name"] == name) for d in (alone, found)]
+    assert std[1] < std[0]  # the two simulated arms differ: some of it drifted
+    # Later commands find the prior in the file.
+    old.unlink()
+    code, out, _ = run(capsys, "compare", new, "--json")
+    assert code == 0
+    assert json.loads(out)["variance_factor"] == pytest.approx(found["variance_factor"], rel=1e-6)
+
+
+@pytest.mark.long
+def test_a_misfit_that_the_prior_does_not_know_is_told(tmp_path, capsys):
+    old, new = tmp_path / "old.hilcal", tmp_path / "new.hilcal"
+    hidden = table(tmp_path / "b.csv", "joint_tilt_compliance", 1, 8)
+    run(capsys, "import", table(tmp_path / "a.csv", "nothing", 2, 8), "--config", CELL, "-o", old)
+    run(capsys, "import", hidden, "--config", CELL, "-o", new)
+    run(capsys, "identify", old)
+    _, out, _ = run(capsys, "identify", new, "--prior", old)
+    assert "leaves more than the noise; hilcal compare EARLIER LATER" in " ".join(out.split())
+    more = "base_frame,joint_compliance,joint_tilt_compliance"
+    _, out, _ = run(capsys, "identify", new, "--prior", old, "--effects", more)
+    assert "did not have joint_tilt_compliance; hilcal compare" in " ".join(out.split())
+
+
+def test_refusals(tmp_path, capsys):
+    old = tmp_path / "old.hilcal"
+    run(capsys, "import", table(tmp_path / "a.csv", "nothing", 1, 8), "--config", CELL, "-o", old)
+    run(capsys, "identify", old)
+    other = tmp_path / "other.json"
+    other.write_text("{}")
+    for words, said in (
+        (("--prior", old), "count twice"),
+        (("--prior", tmp_path / "none.hilcal"), "cannot be read"),
+        (("--prior", other), "hilcal-posterior"),
+        (("--prior", old, "--prior-of", "cousin"), "arm, type"),
+        (("--prior", old, "--drift", "creep=1"), "joint_compliance"),
+        (("--drift", "creep=1"), "--prior"),
+    ):
+        code, _, err = run(capsys, "identify", old, *words)
+        assert code == 2, said
+        assert said in " ".join(err.split())
+        assert "Traceback" not in err
+
+
+def imported(readings, folder, capsys):
+    write_table(readings, folder / "t.csv", WHOLE)
+    run = folder / "run.hilcal"
+    said = ok(capsys, "import", folder / "t.csv", "--config", CELL, "-o", run).out
+    return run, " ".join(said.split())
+
+
+@pytest.mark.long
+def test_wrong_readings_are_listed_and_the_others_fitted(tmp_path, capsys):
+    readings, wrong = spoil(rehearsal("nothing").readings, 0.2, 5e-3, np.random.default_rng(0))
+    run, _ = imported(readings, tmp_path, capsys)
+    d = ok(capsys, "refine", run, "--readings", "absolute", "--json").document
+    assert d["verdict"] == "adequate"
+    d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
+    r = readings
+    names = sorted((r.pose_names[r.pose[k]], r.load_names[r.load[k]]) for k in wrong)
+    assert sorted((o["pose"], o["load"]) for o in d["outliers"]) == names
+    told = f"{len(wrong)} readings are set aside as gross errors, and in none of these figures"
+    for asked in (("identify",), ("refine",), ("identify", "--details"), ("refine", "--details")):
+        words = ok(capsys, asked[0], run, "--readings", "absolute", *asked[1:]).out
+        assert told in " ".join(words.split())
+        assert (f"  {names[0][0]}/{names[0][1]}: " in words) == ("--details" in command)
+
+
+def test_what_is_set_aside_is_in_no_figure_of_the_fit(tmp_path, capsys):
+    """One reading off by 5 mm: errors and bands are those of the readings that were fitted."""
+    readings = rehearsal("nothing").readings
+    value = readings.value.copy()
+    value[7] += [4e-3, 0.0, 3e-3]
+    found = {}
+    for name, r in (("good", readings), ("off", replace(readings, value=value))):
+        folder = tmp_path / name
+        folder.mkdir()
+        run, _ = imported(r, folder, capsys)
+        d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
+        with hc.Campaign.open(run, read_only=True) as opened:
+            q = opened.readings.states.q[::7] + 0.01
+            found[name] = d["error"], opened.calibration().predict(q).band_m
+    assert len(d["outliers"]) == 1
+    (good, band), (off, its) = found.values()
+    for key in ("before", "fit", "holdout"):
+        assert off[key]["rms_m"] == pytest.approx(good[key]["rms_m"], rel=0.1)
+        assert off[key]["max_m"] < 4e-3
+    np.testing.assert_allclose(its, band, rtol=0.2)
+
+
+def test_errors_of_centimetres_are_named_at_import(tmp_path, capsys):
+    readings, wrong = spoil(rehearsal("nothing").readings, 0.3, 5e-2, np.random.default_rng(0))
+    run, said = imported(readings, tmp_path, capsys)
+    assert f"{len(wrong)} of {len(readings)} rows do not fit" in said
+    d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
+    assert len(d["outliers"]) == len(wrong)
+
+
+@pytest.mark.long
+def test_a_bumped_tracker_is_said_and_never_adequate(tmp_path, capsys):
+    readings = rehearsal("nothing").readings
+    value = readings.value.copy()
+    value[40:62, :3] += [4e-3, 3e-3, 0.0]
+    run, _ = imported(replace(readings, value=value), tmp_path, capsys)
+    d = ok(capsys, "identify", run, "--readings", "absolute", "--json").document
+    assert d["outliers"] == []
+    assert any("22 of 70 readings" in n and "by the same shift" in n for n in d["notes"])
+    words = " ".join(ok(capsys, "refine", run, "--readings", "absolute").out.split())
+    assert "by the same shift" in words
+    assert ok(capsys, "diagnose", run, "--json").document["verdict"] != "adequate"

@@ -1,32 +1,35 @@
-"""`calibrate`: refusals, and what is said of a calibration that is there."""
+"""`calibrate`: refusals, a calibration that is there, and random cells to an end."""
 
+import json
 import os
-from pathlib import Path
+import shlex
 
+import numpy as np
 import pytest
+import tomli_w
 
 from hilcal.procedure.state import BEGUN
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.procedure_log import ProcedureLog
 from tests.support.calibrate_process import CELL
+from tests.support.campaign_cases import STARVED, TRIES
 from tests.support.cli_cases import ok, refused, run
-from tests.support.procedure_cases import Drawn, drawn, small
-
-Capsys = pytest.CaptureFixture[str]
+from tests.support.procedure_cases import drawn, small
+from tests.support.random_cells import random_cell, random_options
 
 
 @pytest.fixture
-def cell(tmp_path: Path) -> Path:
+def cell(tmp_path):
     path = tmp_path / "cell.toml"
     path.write_text(CELL, encoding="utf-8")
     return path
 
 
 @pytest.fixture(scope="module")
-def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
+def there(tmp_path_factory):
     """A calibration that is complete, of the cell in `cell.toml` beside it."""
     path = tmp_path_factory.mktemp("run")
-    from hilcal.config.template import to_toml
+    from hilcal.config.reference import to_toml
 
     config = small(1)
     (path / "cell.toml").write_text(to_toml(config), encoding="utf-8")
@@ -35,24 +38,20 @@ def there(tmp_path_factory: pytest.TempPathFactory) -> Drawn:
     return d
 
 
-def test_nothing_moves_where_nobody_can_be_asked(cell: Path, capsys: Capsys) -> None:
+def test_nothing_moves_where_nobody_can_be_asked(cell, capsys):
     out = cell.with_name("run.hilcal")
     line = refused(capsys, 2, "calibrate", cell, "-o", out)
     assert "give --yes" in line
     assert not out.exists()
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "said"),
-    [
-        ("--goal", "0.1", "has no unit"),
-        ("--limit", "much", "is not understood"),
-        ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
-        ("--poses", "0", "valid: a whole number from 1"),
-        ("--validation", "0", "valid: a whole number from 1"),
-    ],
-)
-def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: str) -> None:
+@pytest.mark.parametrize(("option", "value", "said"), [
+    ("--goal", "0.1", "has no unit"),
+    ("--limit", "much", "is not understood"),
+    ("--max-time", "2 days", 'valid: a duration over 0 in s, min, h, e.g. "90 min"'),
+    ("--poses", "0", "valid: a whole number from 1"),
+    ("--validation", "0", "valid: a whole number from 1")])  # fmt: skip
+def test_bad_options(cell, capsys, option, value, said):
     line = refused(
         capsys, 2, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--yes", option, value
     )
@@ -60,7 +59,7 @@ def test_bad_options(cell: Path, capsys: Capsys, option: str, value: str, said: 
 
 
 @pytest.mark.long
-def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Capsys) -> None:
+def test_a_goal_needs_readings_that_show_it(there, cell, capsys):
     """Deflections know nothing of the unloaded arm, however well the model predicts them."""
     p = there.procedure
     for command in (
@@ -75,14 +74,14 @@ def test_a_goal_needs_readings_that_show_it(there: Drawn, cell: Path, capsys: Ca
     assert "geometry is not calibrated" in told
 
 
-def test_the_plain_command_says_what_is_there(there: Drawn, capsys: Capsys) -> None:
+def test_the_plain_command_says_what_is_there(there, capsys):
     path = there.procedure.run
     line = refused(capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--yes")
     assert "a calibration is there already, it is complete; go on with: hilcal calibrate" in line
     assert line.endswith("--resume --yes")
 
 
-def test_a_complete_one_is_told_again(there: Drawn, capsys: Capsys) -> None:
+def test_a_complete_one_is_told_again(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
     told = ok(capsys, *command)
@@ -96,7 +95,7 @@ def test_a_complete_one_is_told_again(there: Drawn, capsys: Capsys) -> None:
     assert (d["verdict"], d["plans"], d["rehearsed"]) == ("adequate", 1, False)
 
 
-def test_a_limit_is_judged_by_what_was_measured(there: Drawn, capsys: Capsys) -> None:
+def test_a_limit_is_judged_by_what_was_measured(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume")
     assert "PASSED" in ok(capsys, *command, "--limit", "1 mm").out
@@ -111,7 +110,7 @@ def test_a_limit_is_judged_by_what_was_measured(there: Drawn, capsys: Capsys) ->
         assert "are over the limit of" in found.err
 
 
-def test_what_fits_refuses_a_validation_campaign(there: Drawn, capsys: Capsys) -> None:
+def test_what_fits_refuses_a_validation_campaign(there, capsys):
     path = there.procedure.files.validation
     for command in ("identify", "refine", "diagnose"):
         line = refused(capsys, 2, command, path)
@@ -127,7 +126,7 @@ def test_what_fits_refuses_a_validation_campaign(there: Drawn, capsys: Capsys) -
         path.write_bytes(kept)
 
 
-def test_another_campaign_is_no_calibration(there: Drawn, cell: Path, capsys: Capsys) -> None:
+def test_another_campaign_is_no_calibration(there, cell, capsys):
     path = there.procedure.files.validation
     line = refused(
         capsys, 2, "calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--yes"
@@ -135,15 +134,13 @@ def test_another_campaign_is_no_calibration(there: Drawn, cell: Path, capsys: Ca
     assert "not a campaign of hilcal calibrate" in line
 
 
-def test_a_rehearsal_goes_on_as_one(there: Drawn, capsys: Capsys) -> None:
+def test_a_rehearsal_goes_on_as_one(there, capsys):
     path = there.procedure.run
     command = ("calibrate", path.with_name("cell.toml"), "-o", path, "--resume", "--rehearse")
     assert "no rehearsal; leave --rehearse out" in refused(capsys, 2, *command)
 
 
-def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(tmp_path, capsys):
     path = tmp_path / "cell.toml"
     text = CELL.replace('model = "ur10e"', 'model = "ur10e"\ndriver = "ur"\nhost = "127.0.0.1"')
     path.write_text(
@@ -170,3 +167,58 @@ def test_devices_that_are_not_there_end_it_with_the_line_that_goes_on(
     assert f"--prior {elsewhere}" in told.err
     again = refused(capsys, 2, "calibrate", path, "-o", out, "--yes")
     assert '"Measure" (16 of 16 readings are missing)' in again
+
+
+ENDS = (0, 4, 5)
+"""Done; the data cannot answer; a limit is not kept."""
+SMALL = ("--poses", "4", "--validation", "3", "--rehearse", "--yes", "--json")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_cell_is_calibrated_to_an_end(seed, tmp_path, capsys):
+    rng = np.random.default_rng([seed, 32])
+    cell = tmp_path / "CELL.toml"
+    cell.write_text(tomli_w.dumps(random_cell(rng)), encoding="utf-8")
+    options = (*random_options(rng), *SMALL)
+    found = rehearsed(capsys, cell, *options)
+    if "or leave out --goal" in found.err:  # of the position, which deflections do not show
+        assert found.code == 2
+        k = options.index("--goal")
+        options = (*options[:k], *options[k + 2 :])
+        found = rehearsed(capsys, cell, *options)
+    assert found.code in ENDS, found.err
+    document = json.loads(found.out)
+    assert ("error" in document) == bool(found.code)
+    if found.code != 4:
+        assert document["improvement"]
+        steps_are_taken(capsys, found, cell.with_name("run.hilcal"))
+        again = run(capsys, "calibrate", cell, "-o", cell.with_name("run.hilcal"), "--resume",
+                    *options)  # fmt: skip
+        assert again.code == found.code
+        assert json.loads(again.out)["improvement"] == document["improvement"]
+
+
+def steps_are_taken(capsys, found, path):
+    """Correct a point, and write a report, by the lines that are told, where it was measured."""
+    points = path.with_name("points.csv")
+    with CampaignFile.open(path, read_only=True) as campaign:
+        q = campaign.readings().states.q[0]
+    names = ",".join(f"q{k}_rad" for k in range(1, 7))
+    points.write_text(f"{names}\n{','.join(map(repr, q.tolist()))}\n", encoding="utf-8")
+    steps = [shlex.split(x)[1:] for x in found.err.splitlines() if x.startswith("  hilcal ")]
+    assert [words[0] for words in steps] == ["compensate", "report"]
+    for words in steps:
+        given = [{"POINTS": str(points), "NAME": "A. Miller"}.get(w, w) for w in words]
+        ok(capsys, *given)
+
+
+def rehearsed(capsys, cell, *options):
+    """Rehearse; where this computer was too busy for the devices, go on as an operator does."""
+    path = cell.with_name("run.hilcal")
+    for _ in range(TRIES):
+        resume = ("--resume",) if path.exists() else ()
+        found = run(capsys, "calibrate", cell, "-o", path, *resume, *options)
+        if found.code != 3 or not STARVED.search(found.err):
+            break
+    return found

@@ -1,41 +1,36 @@
 """Options of effects on the command line: given, refused, stored, shown."""
 
 import shutil
-from pathlib import Path
 
 import pytest
 
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, Outcome, ok, refused, table
-
-Capsys = pytest.CaptureFixture[str]
+from tests.support.cli_cases import CELL, ok, refused, table
 
 
 @pytest.fixture(scope="module")
-def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def measured(tmp_path_factory):
     return table(tmp_path_factory.mktemp("tables") / "hysteresis.csv", "hysteresis")
 
 
 @pytest.fixture
-def campaign(measured: Path, tmp_path: Path, capsys: Capsys) -> Path:
+def campaign(measured, tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     ok(capsys, "import", measured, "--config", CELL, "-o", path)
     return path
 
 
-def names_of(result: Outcome, effect: str) -> list[str]:
+def names_of(result, effect):
     named = [p["name"] for p in result.document["parameters"]]
     return [n.partition(".")[2] for n in named if n.startswith(f"{effect}.")]
 
 
-def revisions(path: Path) -> list[tuple[tuple[str, ...], str | None, dict[str, object]]]:
+def revisions(path):
     with CampaignFile.open(path) as stored:
         return [(r.effects, r.added, r.options["effects"]) for r in stored.revisions()]
 
 
-def test_identify_takes_options_and_keeps_them(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_identify_takes_options_and_keeps_them(campaign, tmp_path, capsys):
     text = "joint_compliance(joints=1/2/3/4-6), hysteresis(joints=1-3), transmission_error(harmonics=5; joints='2/3')"  # noqa: E501
     found = ok(capsys, "identify", campaign, "--effects", text, "--json")
     d = found.document
@@ -64,14 +59,14 @@ def test_identify_takes_options_and_keeps_them(
     ok(capsys, "view", campaign, "--record", tmp_path / "story.rrd")
 
 
-def test_usual_options_are_not_shown(campaign: Path, capsys: Capsys) -> None:
+def test_usual_options_are_not_shown(campaign, capsys):
     result = ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=each)")
     assert "Options" not in result.out
     assert "joints=" not in ok(capsys, "compare", campaign).out
 
 
 @pytest.mark.long
-def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
+def test_add_takes_options(campaign, capsys):
     ok(capsys, "identify", campaign)
     result = ok(capsys, "add", campaign, "hysteresis(joints=2/3+4)", "--json")
     last = result.document["revisions"][-1]
@@ -90,7 +85,7 @@ def test_add_takes_options(campaign: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_refine_starts_from_options(campaign: Path, capsys: Capsys) -> None:
+def test_refine_starts_from_options(campaign, capsys):
     chosen = "joint_compliance(joints=1/2/3/4-6)"
     d = ok(capsys, "refine", campaign, "--effects", chosen, "--json").document
     joints = [r["options"]["joint_compliance"]["joints"] for r in d["revisions"]]
@@ -100,21 +95,15 @@ def test_refine_starts_from_options(campaign: Path, capsys: Capsys) -> None:
     assert added == {"hysteresis", "joint_compliance(joints=each)"}
 
 
-@pytest.mark.parametrize(
-    ("text", "wrong"),
-    [
-        ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
-        ("hysteresis(joints=7)", "effect hysteresis: joints = 7, there is no joint 7; valid: each"),
-        ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
-        ("base_frame(prior_m=-1; prior_rad=1)", "prior_m and prior_rad must be positive"),
-        ("hysteresis(joints=1", "hysteresis(joints=1': ) is missing at the end; valid: NAME or"),
-        ("hysteresis(joints)", "hysteresis: 'joints' is not an option with a value; valid: NAME"),
-        ("histeresis(joints=1)", "unknown effect 'histeresis'"),
-    ],
-)
-def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(
-    campaign: Path, capsys: Capsys, text: str, wrong: str
-) -> None:
+@pytest.mark.parametrize(("text", "wrong"), [
+    ("hysteresis(colour=1)", "effect hysteresis: unknown option 'colour'; valid: joints"),
+    ("hysteresis(joints=7)", "effect hysteresis: joints = 7, there is no joint 7; valid: each"),
+    ("backlash(crossing=wide)", "effect backlash: crossing = 'wide'; valid: a finite number"),
+    ("base_frame(prior_m=-1; prior_rad=1)", "prior_m and prior_rad must be positive"),
+    ("hysteresis(joints=1", "hysteresis(joints=1': ) is missing at the end; valid: NAME or"),
+    ("hysteresis(joints)", "hysteresis: 'joints' is not an option with a value; valid: NAME"),
+    ("histeresis(joints=1)", "unknown effect 'histeresis'")])  # fmt: skip
+def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(campaign, capsys, text, wrong):
     for command in (("identify", campaign, "--effects", f"joint_compliance,{text}"),
                     ("refine", campaign, "--effects", text),
                     ("add", campaign, text)):  # fmt: skip
@@ -122,7 +111,7 @@ def test_what_is_wrong_is_said_in_one_line_and_nothing_is_stored(
     assert revisions(campaign) == []
 
 
-def test_other_refusals(campaign: Path, capsys: Capsys) -> None:
+def test_other_refusals(campaign, capsys):
     assert "creep is there twice" in refused(
         capsys, 2, "identify", campaign, "--effects", "creep,creep(joints=1)"
     )
@@ -132,7 +121,7 @@ def test_other_refusals(campaign: Path, capsys: Capsys) -> None:
     assert "unknown effect" in refused(capsys, 2, "remove", campaign, "creep(joints=1)")
 
 
-def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
+def test_effects_shows_options_and_defaults(capsys):
     d = {e["name"]: e for e in ok(capsys, "effects", "--json").document["effects"]}
     assert d["backlash"]["options"] == ["joints", "crossing"]
     assert d["backlash"]["defaults"] == {"joints": "each", "crossing": 0.01}
@@ -153,7 +142,7 @@ def test_effects_shows_options_and_defaults(capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_joints_that_differ_are_let_differ(campaign: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_joints_that_differ_are_let_differ(campaign, tmp_path, capsys):
     finer = "joint_compliance(joints=each)"
     ok(capsys, "identify", campaign, "--effects", "joint_compliance(joints=common)")
     found = ok(capsys, "diagnose", campaign, "--json").document

@@ -1,7 +1,5 @@
 """The main job on the real UR10: from the public files to the missing effect."""
 
-from pathlib import Path
-
 import pytest
 
 from hilcal.robot.catalogue import configs_dir
@@ -12,13 +10,7 @@ CELL = configs_dir() / "cells" / "ipa_ur10.toml"
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("series", "limit_m"), [("Series_B", 0.110e-3), ("Series_C", 0.100e-3)])
-def test_refine_finds_what_the_arm_lacks(
-    series: str,
-    limit_m: float,
-    ipa_ur10: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_refine_finds_what_the_arm_lacks(series, limit_m, ipa_ur10, tmp_path, capsys):
     (measured,) = (ipa_ur10 / series).glob("measurements_*.csv")
     run = tmp_path / "ur10.hilcal"
     ok(capsys, "import", measured, "--format", "ipa-ur10", "--config", CELL, "-o", run)

@@ -1,4 +1,4 @@
-"""Bad input on the command line: one clear line, the exit code of the contract, no traceback."""
+"""What is wrong is said in one line, with the exit code of its kind."""
 
 import signal
 import socket
@@ -19,27 +19,27 @@ Rows = list[list[str]]
 
 
 @pytest.fixture(scope="module")
-def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def good(tmp_path_factory):
     return table(tmp_path_factory.mktemp("tables") / "good.csv", "nothing", poses=6)
 
 
 @pytest.fixture
-def campaign(good: Path, tmp_path: Path, capsys: Capsys) -> Path:
+def campaign(good, tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     ok(capsys, "import", good, "--config", CELL, "-o", path)
     return path
 
 
-def rows_of(path: Path) -> Rows:
+def rows_of(path):
     return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
 
 
-def rename(old: str, new: str) -> Callable[[Rows], Rows]:
+def rename(old, new):
     return lambda rows: [[new if c == old else c for c in rows[0]], *rows[1:]]
 
 
-def cell(column: str, row: int, value: str) -> Callable[[Rows], Rows]:
-    def change(rows: Rows) -> Rows:
+def cell(column, row, value):
+    def change(rows):
         k = rows[0].index(column)
         return [
             [*r[:k], value, *r[k + 1 :]] if number == row else r
@@ -49,8 +49,8 @@ def cell(column: str, row: int, value: str) -> Callable[[Rows], Rows]:
     return change
 
 
-def drop(column: str) -> Callable[[Rows], Rows]:
-    def change(rows: Rows) -> Rows:
+def drop(column):
+    def change(rows):
         k = rows[0].index(column)
         return [[*r[:k], *r[k + 1 :]] for r in rows]
 
@@ -73,9 +73,7 @@ BAD_TABLES: dict[str, tuple[Callable[[Rows], Rows], tuple[str, ...]]] = {
 
 
 @pytest.mark.parametrize("case", BAD_TABLES)
-def test_a_bad_table_is_one_clear_line(
-    case: str, good: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_bad_table_is_one_clear_line(case, good, tmp_path, capsys):
     change, named = BAD_TABLES[case]
     bad, output = tmp_path / "bad.csv", tmp_path / "bad.hilcal"
     bad.write_text("".join(",".join(r) + "\n" for r in change(rows_of(good))), encoding="utf-8")
@@ -85,7 +83,7 @@ def test_a_bad_table_is_one_clear_line(
     assert not output.exists()
 
 
-def test_a_pose_without_an_unloaded_reading(good: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_pose_without_an_unloaded_reading(good, tmp_path, capsys):
     rows = rows_of(good)
     lacking = tmp_path / "lacking.csv"
     kept = [r for r in rows if r[:2] != ["p2", "none"]]
@@ -99,9 +97,7 @@ def test_a_pose_without_an_unloaded_reading(good: Path, tmp_path: Path, capsys: 
     assert d["readings"] == "absolute"  # deflections are not possible, so they are not the default
 
 
-def test_files_that_are_no_campaigns(
-    good: Path, campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_files_that_are_no_campaigns(good, campaign, tmp_path, capsys):
     assert "not a hilcal campaign" in refused(capsys, 2, "compare", good)
     assert "no such" in refused(capsys, 2, "compare", tmp_path / "none.hilcal")
     cut = tmp_path / "cut.hilcal"
@@ -113,9 +109,7 @@ def test_files_that_are_no_campaigns(
     assert rows_of(good)  # a file of another kind is never overwritten
 
 
-def test_unknown_names_list_the_valid_ones(
-    campaign: Path, good: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_unknown_names_list_the_valid_ones(campaign, good, tmp_path, capsys):
     line = refused(capsys, 2, "add", campaign, "histeresis")
     assert "hysteresis" in line
     assert "base_frame" in line
@@ -134,19 +128,19 @@ def test_unknown_names_list_the_valid_ones(
     assert "ipa-ur10" in line
 
 
-def test_usage_errors_are_one_line(campaign: Path, capsys: Capsys) -> None:
+def test_usage_errors_are_one_line(campaign, capsys):
     assert "nonsense" in refused(capsys, 2, "nonsense")
     assert "EFFECT" in refused(capsys, 2, "add", campaign)
     assert "--frobnicate" in refused(capsys, 2, "refine", campaign, "--frobnicate")
 
 
-def test_diagnosis_needs_the_full_scaling(campaign: Path, capsys: Capsys) -> None:
+def test_diagnosis_needs_the_full_scaling(campaign, capsys):
     ok(capsys, "identify", campaign, "--scaling", "gu")
     assert "gc" in refused(capsys, 2, "diagnose", campaign)
     assert "gc" in refused(capsys, 2, "compare", campaign)
 
 
-def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
+def test_fewer_readings_than_parameters(tmp_path, capsys):
     r = rehearsal("nothing", poses=4)
     path = tmp_path / "few.hilcal"
     unloaded = r.readings.unloaded
@@ -163,7 +157,7 @@ def test_fewer_readings_than_parameters(tmp_path: Path, capsys: Capsys) -> None:
     assert "poses" in refused(capsys, 4, "identify", two)
 
 
-def test_readings_appended_after_a_fit(campaign: Path, capsys: Capsys) -> None:
+def test_readings_appended_after_a_fit(campaign, capsys):
     ok(capsys, "identify", campaign)
     more: Readings = rehearsal("nothing", seed=2, poses=2).readings
     with CampaignFile.open(campaign) as file:
@@ -173,11 +167,11 @@ def test_readings_appended_after_a_fit(campaign: Path, capsys: Capsys) -> None:
     assert "identify again" in line
 
 
-def _fields(readings: Readings) -> dict[str, object]:
+def _fields(readings):
     return {name: getattr(readings, name) for name in readings.__dataclass_fields__}
 
 
-def test_a_busy_port_is_refused(campaign: Path, capsys: Capsys) -> None:
+def test_a_busy_port_is_refused(campaign, capsys):
     ok(capsys, "identify", campaign)
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -186,10 +180,8 @@ def test_a_busy_port_is_refused(campaign: Path, capsys: Capsys) -> None:
     assert "port" in line
 
 
-def test_an_unexpected_error_names_itself(
-    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
-) -> None:
-    def broken(*_: object) -> None:
+def test_an_unexpected_error_names_itself(monkeypatch, campaign, capsys):
+    def broken(*_):
         raise ZeroDivisionError("by\nzero")
 
     monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", broken)
@@ -203,17 +195,15 @@ def test_an_unexpected_error_names_itself(
     assert "Traceback" in result.err
 
 
-def refused_with_notice(capsys: Capsys, campaign: Path) -> str:
+def refused_with_notice(capsys, campaign):
     result = run(capsys, "compare", campaign)
     assert result.code == 1
     assert "Traceback" not in result.err
     return result.err.splitlines()[-1]
 
 
-def test_an_interrupt_ends_quietly(
-    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
-) -> None:
-    def interrupted(*_: object) -> None:
+def test_an_interrupt_ends_quietly(monkeypatch, campaign, capsys):
+    def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("hilcal.cli.comparing.misfit_breakdown", interrupted)
@@ -222,14 +212,12 @@ def test_an_interrupt_ends_quietly(
     assert result.err.splitlines()[-1] == "error: interrupted"
 
 
-def test_numerical_warnings_do_not_reach_the_user(
-    monkeypatch: pytest.MonkeyPatch, campaign: Path, capsys: Capsys
-) -> None:
+def test_numerical_warnings_do_not_reach_the_user(monkeypatch, campaign, capsys):
     import warnings
 
     from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 
-    def noisy(p: object) -> object:
+    def noisy(p):
         warnings.warn("divide by zero", RuntimeWarning, stacklevel=1)
         return misfit_breakdown(p)  # type: ignore[arg-type]
 
@@ -237,10 +225,8 @@ def test_numerical_warnings_do_not_reach_the_user(
     assert "divide" not in ok(capsys, "compare", campaign).err
 
 
-def test_a_reader_that_leaves_early_is_no_error(campaign: Path) -> None:
+def test_a_reader_that_leaves_early_is_no_error(campaign):
     process = start("effects")
-    assert process.stdout is not None
-    assert process.stderr is not None
     process.stdout.close()
     with process.stderr:
         assert process.stderr.read() == ""
@@ -251,11 +237,10 @@ def test_a_reader_that_leaves_early_is_no_error(campaign: Path) -> None:
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)]
 )
-def test_view_serves_until_it_is_told_to_stop(campaign: Path, number: int, capsys: Capsys) -> None:
+def test_view_serves_until_it_is_told_to_stop(campaign, number, capsys):
     ok(capsys, "identify", campaign)
     with start("view", campaign, "--port", str(free_port())) as process:
         try:
-            assert process.stdout is not None
             assert process.stdout.readline().startswith("Open the viewer with")
             assert "rerun+http://127.0.0.1:" in process.stdout.readline()
             process.send_signal(number)
@@ -266,13 +251,13 @@ def test_view_serves_until_it_is_told_to_stop(campaign: Path, number: int, capsy
     assert "Traceback" not in out + err
 
 
-def free_port() -> int:
+def free_port():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
-def test_a_kill_leaves_every_committed_revision(campaign: Path, capsys: Capsys) -> None:
+def test_a_kill_leaves_every_committed_revision(campaign, capsys):
     ok(capsys, "identify", campaign)
     process = start("refine", campaign)
     time.sleep(0.3)  # anywhere: whatever it is doing, the file stays whole
@@ -283,22 +268,18 @@ def test_a_kill_leaves_every_committed_revision(campaign: Path, capsys: Capsys) 
     assert ok(capsys, "refine", campaign, "--json").document["verdict"] == "adequate"
 
 
-def test_a_program_without_a_place_to_write(good: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_program_without_a_place_to_write(good, tmp_path, capsys):
     line = refused(capsys, 2, "import", good, "--config", CELL, "-o", tmp_path / "no" / "x.hilcal")
     assert "written" in line
 
 
-@pytest.mark.parametrize(
-    ("no_wheel", "said"),
-    [
-        ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
-        ((4, 0), "is not installed; pip install ur-rtde"),
-    ],
-)
+@pytest.mark.parametrize(("no_wheel", "said"), [
+    ((3, 0), "has no wheel for Python 3.{}; use Python 3.11 or 3.12 for the cell's computer"),
+    ((4, 0), "is not installed; pip install ur-rtde")])  # fmt: skip
 def test_a_ur_arm_without_ur_rtde(
-    no_wheel: tuple[int, int], said: str, tmp_path: Path, capsys: Capsys,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    no_wheel, said, tmp_path, capsys,
+    monkeypatch,
+):  # fmt: skip
     text = CELL.read_text(encoding="utf-8")
     text = text.replace("[robot]", '[robot]\ndriver = "ur"\nhost = "127.0.0.1"')
     text = text.replace("[tracker]", '[tracker]\ndriver = "geocom"\nport = "/dev/none"')
@@ -317,9 +298,8 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
     def planned(*_: object) -> None:
         raise AssertionError("it plans first")
 
-    for module in ("rehearsing", "running"):
-        name = "make_plan" if module == "rehearsing" else "_own_plan"
-        monkeypatch.setattr(f"hilcal.cli.{module}.{name}", planned)
+    for name in ("make_plan", "make_checked"):
+        monkeypatch.setattr(f"hilcal.cli.running.{name}", planned)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[simulation]", '[simulation]\nhide = "foo"'), encoding="utf-8")
     more = ("--rehearse",) if command == "run" else ()
@@ -331,19 +311,38 @@ def test_what_cannot_be_hidden_is_refused_before_anything_is_planned(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    ("hidden", "said"),
-    [("transmission_error", True), ("backlash", False)],
-)
+@pytest.mark.parametrize(("hidden", "said"), [("transmission_error", True), ("backlash", False)])
 def test_it_is_said_that_deflections_do_not_show_what_is_hidden(
-    hidden: str, said: bool, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def started(*_: object) -> None:
+    hidden, said, tmp_path, capsys, monkeypatch
+):
+    def started(*_):
         raise InputError("no devices here")
 
-    monkeypatch.setattr("hilcal.cli.rehearsing.simulated_cell", started)
+    monkeypatch.setattr("hilcal.cli.running.simulated_cell", started)
     path, words = tmp_path / "CELL.toml", CELL.read_text(encoding="utf-8")
     path.write_text(words.replace("[planning]", "[planning]\nagainst = []"), encoding="utf-8")
     told = run(capsys, "simulate", path, "-o", tmp_path / "out", "--hide", hidden)
     warned = f'{hidden} cancels in them; set readings = "absolute"' in " ".join(told.err.split())
     assert warned == said
+
+
+@pytest.mark.parametrize(("section", "said"), [
+    (
+        '[planning]\nmodel = ["joint_complianse"]',
+        "[planning] model: unknown effect 'joint_complianse' (did you mean "
+        '"joint_compliance"?); valid: ',
+    ),
+    ('[planning]\nmodel = ["joint_compliance(joints=2-9)"]', "[planning] model: "),
+    ('[planning]\nagainst = ["creap"]',
+        "[planning] against: unknown effect 'creap' (did you mean \"creep\"?); valid: "),
+    ("[plausible]\nlink_geometri = 4.0",
+        "[plausible]: unknown effect 'link_geometri' (did you mean \"link_geometry\"?)"),
+    ("[ordinary]\ncrep = 0.1", "[ordinary]: unknown effect 'crep' (did you mean \"creep\"?)"),
+])  # fmt: skip
+def test_an_unknown_effect_is_one_line(section, said, tmp_path, capsys):
+    head, name = section.split("\n")[0], tmp_path / "mine.toml"
+    text = CELL.read_text(encoding="utf-8")
+    text = text.replace(head, section) if f"\n{head}\n" in text else f"{text}\n{section}\n"
+    name.write_text(text, encoding="utf-8")
+    line = refused(capsys, 2, "check", name)
+    assert line.startswith(f"error: mine.toml: {said}")

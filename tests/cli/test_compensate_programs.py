@@ -16,11 +16,9 @@ from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.points import solutions
 from hilcal.robot import se3
-from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.se3 import of_six
 from hilcal.robot.urdf import arm_from_urdf
-from hilcal.types import Floats
 from tests.support.cli_cases import ok, refused
 from tests.support.maker_arms import EXAMPLES, maker_arm
 from tests.support.paths import ROOT
@@ -32,13 +30,13 @@ SEEN = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.
 """The arm's base as the tracker stands to it."""
 
 
-def flanges(arm: Arm, q: Floats) -> Floats:
+def flanges(arm, q):
     chain = evaluate(arm, q)
     return se3.matrix(chain.rotation[-1], chain.position[-1])
 
 
 @pytest.fixture(scope="module")
-def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
+def lab(tmp_path_factory):
     """The table, the nominal arm, and the arm as it is."""
     folder, rng = tmp_path_factory.mktemp("lab"), np.random.default_rng(3)
     nominal = maker_arm("krl", folder)
@@ -66,11 +64,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Arm, Arm]:
 
 
 @pytest.mark.long
-def test_the_guide_leads_from_a_table_to_corrected_krl_points(
-    lab: tuple[Path, Arm, Arm],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_guide_leads_from_a_table_to_corrected_krl_points(lab, capsys, monkeypatch):
     folder, nominal, true = lab
     monkeypatch.chdir(folder)
     (folder / "corrected").mkdir()
@@ -107,9 +101,7 @@ def test_the_guide_leads_from_a_table_to_corrected_krl_points(
     assert text.count("\r\n") == Path("weld.src").read_bytes().count(b"\r\n")
 
 
-def test_into_the_labs_own_urdf(
-    lab: tuple[Path, Arm, Arm], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_into_the_labs_own_urdf(lab, capsys):
     """The same table: the URDF that the cell names, corrected, is the arm that was measured."""
     folder, _, true = lab
     run, mine, cell = folder / "into.hilcal", folder / "mine.urdf", folder / "BASE.toml"
@@ -144,12 +136,12 @@ def test_into_the_labs_own_urdf(
         assert words in refused(capsys, 2, "export", run, *given)
 
 
-def pose(values: list[float]) -> Floats:
+def pose(values):
     turn = Rotation.from_euler("ZYX", values[3:], degrees=True).as_matrix()
     return se3.matrix(turn, 1e-3 * np.array(values[:3]))
 
 
-def points(path: Path) -> dict[str, Floats]:
+def points(path):
     """Points of a .dat file, as other eyes have them."""
     text = path.read_bytes().decode("latin-1")
     found = re.findall(

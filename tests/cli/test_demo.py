@@ -1,12 +1,11 @@
-"""The demo: it hides an effect, finds it, and says whether it did."""
-
-from pathlib import Path
+"""The demo, what `run` asks without a plan, and going on after a failure."""
 
 import numpy as np
 import pytest
 
-from hilcal.cli.rehearsing import RehearsalSettings, first_plan
-from hilcal.config import CellConfig, load_config
+from hilcal.cli.running import TRIES, first_plan, to_the_end
+from hilcal.cli.terminal import terminal
+from hilcal.config import load_config
 from hilcal.drivers.simulated.rehearsal import (
     INVENTED,
     check_choice,
@@ -15,22 +14,21 @@ from hilcal.drivers.simulated.rehearsal import (
     own_choices,
 )
 from hilcal.effects.catalogue import installed
-from hilcal.errors import InputError
-from hilcal.present.progress import Say
+from hilcal.errors import DeviceError, InputError
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
 from hilcal.store.purpose import purpose_of
 from studies.random_campaigns import rehearse
-from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal
+from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal, run
+from tests.support.screen import AtTerminal
 from tests.support.user_effect_cases import CLASS
 
-Capsys = pytest.CaptureFixture[str]
 FAST = "--without-devices"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("effect", ["hysteresis", "encoder_offset", "base_frame"])
-def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_hidden_effect_is_found(effect, tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     result = ok(capsys, "demo", FAST, "--hide", effect, "--seed", "1", "-o", path, "--json")
     d = result.document
@@ -54,7 +52,7 @@ def test_the_hidden_effect_is_found(effect: str, tmp_path: Path, capsys: Capsys)
 
 
 @pytest.mark.slow
-def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_hidden_is_nothing_found(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     d = ok(capsys, "demo", FAST, "--hide", "nothing", "--seed", "2", "-o", path, "--json").document
     assert (d["hidden"], d["found"], d["verdict"]) == ("nothing", True, "adequate")
@@ -62,11 +60,11 @@ def test_nothing_hidden_is_nothing_found(tmp_path: Path, capsys: Capsys) -> None
 
 
 @pytest.mark.long
-def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_in_words(tmp_path, capsys, monkeypatch):
     asked: list[tuple[int, int]] = []
     made: list[Plan] = []
 
-    def plan(settings: RehearsalSettings, config: CellConfig, poses: int, say: Say) -> Plan:
+    def plan(settings, config, poses, say):
         """Plan once, quickly; what a plan is worth, and that a seed gives one, is tested there."""
         asked.append((settings.seed, poses))
         if not made:
@@ -103,7 +101,7 @@ def test_the_demo_in_words(tmp_path: Path, capsys: Capsys, monkeypatch: pytest.M
     assert "is replaced" in again.err
 
 
-def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_demo_does_not_replace_another_file(tmp_path, capsys):
     path = tmp_path / "notes.txt"
     path.write_text("mine", encoding="utf-8")
     line = refused(capsys, 2, "demo", FAST, "--hide", "nothing", "-o", path)
@@ -112,7 +110,7 @@ def test_the_demo_does_not_replace_another_file(tmp_path: Path, capsys: Capsys) 
 
 
 @pytest.mark.slow
-def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsys) -> None:
+def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path, capsys):
     file = tmp_path / "mine.py"
     file.write_text(CLASS, encoding="utf-8")
     path = tmp_path / "own.hilcal"
@@ -131,7 +129,7 @@ def test_an_effect_of_ones_own_is_hidden_and_found(tmp_path: Path, capsys: Capsy
 
 
 @pytest.mark.slow
-def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
+def test_an_invented_law_is_discovered(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     result = ok(capsys, "demo", FAST, "--hide", "invented", "-o", path, "--json")
     d, words = result.document, " ".join(result.err.split())
@@ -147,21 +145,21 @@ def test_an_invented_law_is_discovered(tmp_path: Path, capsys: Capsys) -> None:
     assert stored.document["verdict"] == "adequate"
 
 
-def test_the_invented_law_is_an_effect_that_the_catalogue_lacks() -> None:
+def test_the_invented_law_is_an_effect_that_the_catalogue_lacks():
     world = invented_law(installed())
     assert INVENTED not in installed().names
     assert INVENTED in own_choices(world)
     check_choice(INVENTED, world)
 
 
-def test_what_cannot_be_hidden(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_cannot_be_hidden(tmp_path, capsys):
     line = refused(capsys, 2, "demo", "--hide", "gremlins", "-o", tmp_path / "x.hilcal")
     assert all(name in line for name in (*choices(), "random", "nothing"))
     line = refused(capsys, 2, "demo", "--seed", "-1", "-o", tmp_path / "x.hilcal")
     assert "--seed" in line
 
 
-def test_a_rehearsal_repeats_itself_and_loads_every_joint() -> None:
+def test_a_rehearsal_repeats_itself_and_loads_every_joint():
     one, two, other = rehearsal("hysteresis"), rehearsal("hysteresis"), rehearsal("hysteresis", 2)
     np.testing.assert_array_equal(one.readings.value, two.readings.value)
     assert not np.array_equal(one.readings.value, other.readings.value)
@@ -170,7 +168,7 @@ def test_a_rehearsal_repeats_itself_and_loads_every_joint() -> None:
     assert (np.abs(torque - unloaded).max(axis=0) > 5.0).all()  # N·m
 
 
-def test_a_random_choice_gives_nothing_away() -> None:
+def test_a_random_choice_gives_nothing_away():
     config = load_config(CELL)
     drawn = [rehearse(config, "random", seed, 3) for seed in range(6)]
     assert len({r.hidden for r in drawn}) > 2
@@ -178,7 +176,125 @@ def test_a_random_choice_gives_nothing_away() -> None:
     assert {r.cell.registration_known for r in drawn} == {False}
 
 
-def test_a_cell_without_loads_is_refused() -> None:
+def test_a_cell_without_loads_is_refused():
     config = load_config(CELL).model_copy(update={"loads": ()})
     with pytest.raises(InputError, match="loads"):
         rehearse(config, "nothing", 1)
+
+
+FACTS = ("poses", "readings", "load changes", "of the plan: at least")
+
+
+TOML = """
+[robot]
+model = "ur10e"
+driver = "ur"
+host = "127.0.0.1"
+[tool]
+target_m = [0.06, 0.02, 0.12]
+load_point_m = [0.10, 0.0, 0.15]
+[tracker]
+frame = "tracker"
+driver = "geocom"
+port = "nowhere"
+[[loads]]
+name = "pull"
+force_N = [60.0, 50.0, 0.0]
+moment_Nm = [6.0, 0.0, 6.0]
+[planning]
+model = ["joint_compliance"]
+against = []
+candidates = 30
+[simulation]
+seed = 4
+"""
+
+
+@pytest.fixture
+def toml(tmp_path):
+    """A cell that is planned fast, and whose devices are not there."""
+    path = tmp_path / "cell.toml"
+    path.write_text(TOML, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("columns", [
+    pytest.param(80, marks=pytest.mark.long),
+    *(pytest.param(wide, marks=pytest.mark.slow) for wide in (60, 120))])  # fmt: skip
+def test_a_person_is_shown_the_plan_and_asked(columns, toml):
+    home = toml.parent
+    with AtTerminal("run", "cell.toml", "-o", "run.hilcal", columns=columns, home=home) as person:
+        person.keeps("The arm will move. y = yes, n = no:")
+        for words in FACTS:
+            assert words in person.text
+        person.types("maybe\n")
+        person.keeps("'maybe' is no answer. Type y or n, and press Enter.")
+        person.sees("n = no:", 2)
+        person.types("n\n")
+        assert person.ends() == 130
+        assert "nothing has moved" in person.text
+        assert person.lines[-1] == "  hilcal plan cell.toml -o plan.json --seed 4"
+    assert not (home / "run.hilcal").exists()
+
+
+@pytest.mark.slow
+def test_ctrl_c_at_the_question_and_the_end_of_the_input_are_no(toml):
+    for keys, words in (("\x03", "error: interrupted"), ("\x04", "nothing has moved")):
+        with AtTerminal("run", "cell.toml", "-o", "run.hilcal", home=toml.parent) as person:
+            person.keeps("n = no:")
+            person.types(keys)
+            assert person.ends() == 130
+            assert words in person.text
+    assert not (toml.parent / "run.hilcal").exists()
+
+
+def test_a_script_is_shown_the_plan_and_goes_on(toml, capsys):
+    path = toml.parent / "run.hilcal"
+    result = run(capsys, "run", toml, "-o", path, "--json")
+    assert result.code == 3  # it has gone on, as far as to the devices that are not there
+    assert result.document["error"]["kind"] == "device"
+    said = " ".join(result.err.split())
+    for words in FACTS:
+        assert words in said
+    assert "n = no" not in said
+    with CampaignFile.open(path) as campaign:
+        assert campaign.n_readings == 0
+
+
+def work(failures, kind=DeviceError):
+    calls = []
+
+    def once():
+        calls.append(1)
+        if len(calls) <= failures:
+            raise kind("force sensor: nothing came for 0.2 s")
+
+    return once, calls
+
+
+def test_what_is_missing_is_measured_after_a_failure(capsys):
+    once, calls = work(2)
+    to_the_end(terminal(False), once, lambda: 7)
+    assert len(calls) == 3
+    said = capsys.readouterr()
+    assert (said.out + said.err).count("nothing came for 0.2 s") == 2
+
+
+def test_a_device_that_always_fails_ends_it(capsys):
+    once, calls = work(TRIES)
+    with pytest.raises(DeviceError, match=r"nothing came for 0\.2 s"):
+        to_the_end(terminal(False), once, lambda: 7)
+    assert len(calls) == TRIES
+
+
+def test_as_long_as_readings_come_it_goes_on(capsys):
+    once, calls = work(3 * TRIES)
+    to_the_end(terminal(False), once, lambda: len(calls) // 2)
+    assert len(calls) == 3 * TRIES + 1
+
+
+def test_other_errors_end_it_at_once(capsys):
+    once, calls = work(1, InputError)
+    with pytest.raises(InputError):
+        to_the_end(terminal(False), once, lambda: 7)
+    assert len(calls) == 1

@@ -9,7 +9,7 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.discovery import shapes
 from hilcal.discovery.amplitudes import Amplitude, Factor, variables
 from hilcal.discovery.discovery import Discovery
@@ -21,14 +21,11 @@ from hilcal.drivers.simulated.injected_effects import nothing_hidden
 from hilcal.drivers.simulated.rehearsal import measurement_noise, simulate
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
 from hilcal.effects.from_file import read_effects
-from hilcal.identification.fit import Fit
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import States
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.tables.table import write_table
-from hilcal.types import Floats
 from studies.random_campaigns import rehearsal_states, rehearse
-from studies.unmodelled_laws import Law, UnmodelledLaw, shift
+from studies.unmodelled_laws import UnmodelledLaw, shift
 from tests.support.cli_cases import CELL, ok, run
 
 SITUATION = example_situation(example_cell(), example_states(example_cell()))
@@ -36,11 +33,10 @@ VARIABLES = {v.symbol: v for v in variables(SITUATION)}
 PRODUCT = (Factor(VARIABLES["q_5"], shapes.COS, (1.0,)), Factor(VARIABLES["τ_3"], shapes.LINEAR))
 COMPLIANCE = Form((LawPart(sites(6)[2], Amplitude(PRODUCT), 0),))
 BASELINE = ["base_frame", "joint_compliance"]
-Capsys = pytest.CaptureFixture[str]
 
 
 @pytest.fixture(scope="module")
-def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def campaign(tmp_path_factory):
     path = tmp_path_factory.mktemp("discover") / "run.hilcal"
     config = load_config(CELL)
     with CampaignFile.create(path, config.to_json(), str(CELL.parent), "test") as file:
@@ -48,9 +44,7 @@ def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(campaign, tmp_path, capsys):
     out = tmp_path / "found.py"
     found = run(capsys, "discover", campaign, "-o", out, "--json")
     assert found.code == 4
@@ -61,28 +55,17 @@ def test_where_nothing_is_left_to_explain_it_says_so_and_exits_4(
 
 
 @pytest.mark.long
-def test_a_law_is_written_as_an_effect_and_told(
-    campaign: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_law_is_written_as_an_effect_and_told(campaign, tmp_path, capsys, monkeypatch):
     form = Form((LawPart(sites(6)[1], Amplitude(()), 0),))
     law = FoundLaw(
-        "bent",
-        form,
-        (Coefficient("a", 1e-4, 1e-6, "rad"),),
-        1e-9,
-        30.0,
-        0.8,
-        1.1,
-        0.7,
-        (),
-        (),
+        "bent", form, (Coefficient("a", 1e-4, 1e-6, "rad"),), 1e-9, 30.0, 0.8, 1.1, 0.7, (), ()
     )
     one, listed = np.ones(1), [3]
     hardly = Form((LawPart(sites(6)[3], Amplitude(()), 0),))
     drawn = ((form, 0.7, 0.8, "bent"), (COMPLIANCE, 0.2, 0.8, ""), (hardly, 0.01, 0.2, ""))
     source = source_of_form(form, "bent", law.parameters)
 
-    def search(fit: Fit, say: object, name: str) -> Discovery:
+    def search(fit, say, name):
         assert name == "bent"
         d = Discovery(fit, "law", (law,), 0.9, 0.8, candidates=7, source=source)
         absorbed = np.zeros((fit.solution.rows.shape[1], 1))
@@ -92,7 +75,7 @@ def test_a_law_is_written_as_an_effect_and_told(
         ]
         return replace(d, structures=tuple(likely[: listed[0]]))
 
-    monkeypatch.setattr("hilcal.cli.discovering.search", search)
+    monkeypatch.setattr("hilcal.cli.refining.search", search)
     out = tmp_path / "bent.py"
     asked = ("-o", out, "--against", "joint_compliance", "--json")
     found = ok(capsys, "discover", campaign, *asked, "--alternatives")
@@ -132,9 +115,7 @@ def test_a_law_is_written_as_an_effect_and_told(
     assert "--effects-from" in found.err
 
 
-def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_law_with_a_name_of_its_own_is_an_effect_everywhere(campaign, tmp_path, capsys):
     """The file of a law, its name changed by hand: the catalogue, fits, plans, and use."""
     run_file = tmp_path / "run.hilcal"
     run_file.write_bytes(campaign.read_bytes())
@@ -175,13 +156,12 @@ SOFTENING = 1e-3 * np.array([-4.0, -0.5, 2.0, -1.2, -0.2, -4.0])
 """Growth of each joint's compliance, at any size."""
 
 
-def softening(s: States, torque: Floats) -> Floats:
+def softening(s, torque):
     """dq_j = a_j τ_j t."""
-    assert s.time is not None
     return np.hstack([SOFTENING * torque * s.time[:, None], np.zeros((len(s), 3))])
 
 
-def one_sided(s: States, torque: Floats) -> Floats:
+def one_sided(s, torque):
     """dq_3 = a max(τ_3, 0)^1.5."""
     out = np.zeros((len(s), 9))
     out[:, 2] = np.maximum(torque[:, 2], 0.0) ** 1.5
@@ -193,9 +173,7 @@ def one_sided(s: States, torque: Floats) -> Floats:
     ("motion", "formula"),
     [(softening, r"dq_1 = a·τ_1·\(t .*dq_6 = "), (one_sided, r"dq_3 = a·max\(τ_3")],
 )
-def test_a_law_is_found_written_added_and_the_model_is_adequate(
-    motion: Law, formula: str, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_law_is_found_written_added_and_the_model_is_adequate(motion, formula, tmp_path, capsys):
     """30 poses under 6 loads; what is found is added from its file."""
     config, rng = load_config(CELL), np.random.default_rng(1)
     pulls = ({"mass_kg": 3.0}, {"mass_kg": 6.0}, {"mass_kg": 9.0}, {"force_N": (60.0, 0.0, 0.0)},
@@ -229,9 +207,7 @@ def test_a_law_is_found_written_added_and_the_model_is_adequate(
 
 
 @pytest.mark.long
-def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
-    campaign: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(campaign, tmp_path, capsys):
     square = Factor(VARIABLES["q_5"], shapes.EVEN, (2.0, 0.01))
     other = Form((LawPart(sites(6)[2], Amplitude((square, PRODUCT[1])), 0),))
     given: list[str | Path] = []
@@ -252,20 +228,14 @@ def test_next_separates_a_law_from_what_readings_do_not_tell_from_it(
     assert plan.exists()
 
 
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        (("-o", "found.txt"), "the effect is called after its file"),
-        (("-o", "creep.py"), "no name of the catalogue"),
-        (("-o", "nowhere/found.py"), "no folder"),
-        (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
-        (("-o", "found.py", "--against", "crep"), "unknown effect"),
-        (("-o", "found.py", "--against", "no.json"), "no calibration"),
-    ],
-)
-def test_what_cannot_be_is_refused_by_name(
-    campaign: Path, capsys: Capsys, given: tuple[str, ...], message: str
-) -> None:
+@pytest.mark.parametrize(("given", "message"), [
+    (("-o", "found.txt"), "the effect is called after its file"),
+    (("-o", "creep.py"), "no name of the catalogue"),
+    (("-o", "nowhere/found.py"), "no folder"),
+    (("-o", "found.py", "--against", "creep", "--revision", "1"), "give one of them"),
+    (("-o", "found.py", "--against", "crep"), "unknown effect"),
+    (("-o", "found.py", "--against", "no.json"), "no calibration")])  # fmt: skip
+def test_what_cannot_be_is_refused_by_name(campaign, capsys, given, message):
     found = run(capsys, "discover", campaign, *given)
     assert found.code == 2
     assert message in " ".join(found.err.split())

@@ -3,7 +3,6 @@
 import csv
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as parquet
@@ -15,7 +14,6 @@ import hilcal as hc
 from hilcal.config import load_config
 from hilcal.identification.parameters_document import covariance_of, read
 from hilcal.readings.covariance import COVERS, INSTRUMENT, WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.store.campaign_file import CampaignFile
@@ -25,7 +23,7 @@ from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.readings_cases import make_arm, simple
 
 
-def made(path: Path, readings: Readings, covers: str = INSTRUMENT) -> Path:
+def made(path, readings, covers=INSTRUMENT):
     """Write a campaign without any revision."""
     path.unlink(missing_ok=True)
     config = load_config(CELL).to_json()
@@ -35,7 +33,7 @@ def made(path: Path, readings: Readings, covers: str = INSTRUMENT) -> Path:
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted(tmp_path_factory):
     """A campaign with one revision of corrected geometry."""
     path = made(tmp_path_factory.mktemp("export") / "run.hilcal", rehearsal("nothing").readings)
     with hc.Campaign.open(path) as run:
@@ -46,9 +44,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("kind", ["csv", "parquet"])
 @pytest.mark.parametrize("covers", [INSTRUMENT, WHOLE])
-def test_a_campaign_imports_what_another_exported(
-    capsys, tmp_path: Path, kind: str, covers: str
-) -> None:
+def test_a_campaign_imports_what_another_exported(capsys, tmp_path, kind, covers):
     readings = rehearsal("nothing").readings
     rounded = np.round(readings.value, 4)  # a reader adds the rounding's variance to others
     first = made(tmp_path / "a.hilcal", replace(readings, value=rounded), covers)
@@ -70,9 +66,7 @@ def test_a_campaign_imports_what_another_exported(
     parquet_file=st.booleans(),
     digits=st.sampled_from([3, 17]),
 )
-def test_tables_of_readings_keep_every_bit(
-    tmp_path_factory, seed: int, m: int, parquet_file: bool, digits: int
-) -> None:
+def test_tables_of_readings_keep_every_bit(tmp_path_factory, seed, m, parquet_file, digits):
     rng, x = np.random.default_rng(seed), simple(20, m=m)
     n = x.states.q.shape[1]
     states = replace(
@@ -103,7 +97,7 @@ def test_tables_of_readings_keep_every_bit(
         assert given_.tobytes() == read_.tobytes()
 
 
-def test_other_programs_find_units_and_origin(capsys, fitted: Path, tmp_path: Path) -> None:
+def test_other_programs_find_units_and_origin(capsys, fitted, tmp_path):
     table, residuals, revisions = (tmp_path / f"{k}.parquet" for k in ("r", "e", "v"))
     ok(
         capsys, "export", fitted, "--readings", table, "--residuals", residuals,
@@ -130,7 +124,7 @@ def test_other_programs_find_units_and_origin(capsys, fitted: Path, tmp_path: Pa
     assert row["model"].endswith("encoder_offset")
 
 
-def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path: Path) -> None:
+def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path):
     run = made(tmp_path / "d.hilcal", rehearsal("nothing").readings, WHOLE)
     ok(capsys, "identify", run)
     ok(capsys, "export", run, "--residuals", tmp_path / "e.csv")
@@ -140,7 +134,7 @@ def test_deflections_leave_unloaded_readings_without_residual(capsys, tmp_path: 
     assert all(r["load"] != "none" for r in rows if r["residual_x_m"])
 
 
-def test_parameters_have_their_covariance(capsys, fitted: Path, tmp_path: Path) -> None:
+def test_parameters_have_their_covariance(capsys, fitted, tmp_path):
     ok(capsys, "export", fitted, "--parameters", tmp_path / "p.json")
     p = read(tmp_path / "p.json")
     with hc.Campaign.open(fitted, read_only=True) as run:
@@ -156,7 +150,7 @@ def test_parameters_have_their_covariance(capsys, fitted: Path, tmp_path: Path) 
     assert [row.name for row in found.parameters] == list(p.names)
 
 
-def test_the_corrected_table_is_a_robot_again(capsys, fitted: Path, tmp_path: Path) -> None:
+def test_the_corrected_table_is_a_robot_again(capsys, fitted, tmp_path):
     names = ("a.urdf", "s.toml", "k.yaml", "f.json")
     paths = [tmp_path / name for name in names]
     options = ("--urdf", "--dh", "--ur-kinematics", "--frames")
@@ -172,28 +166,23 @@ def test_the_corrected_table_is_a_robot_again(capsys, fitted: Path, tmp_path: Pa
     assert (tmp_path / "m.csv").read_text().startswith("joint,a_m,d_m,alpha_rad,offset_rad\n")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ((), "nothing to export; give --readings"),
-        (("--readings", "{out}/r.xlsx"), "unknown kind of table; valid: .csv or .parquet"),
-        (("--parameters", "{out}/p.txt"), "--parameters"),
-        (("--dh", "{out}/d.json"), "valid: .toml or .csv"),
-        (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified is about --dh"),
-        (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash is about"),
-        (("--ur-kinematics", "{out}/k.yaml", "--ur-hash", "mine"), "valid: calib_ and digits"),
-        (("--table", "{out}/t.csv", "--readings", "{out}/t.csv"), "two things cannot be written"),
-    ],
-)
-def test_what_cannot_be_written_is_refused(
-    capsys, fitted: Path, tmp_path: Path, arguments: tuple[str, ...], words: str
-) -> None:
+@pytest.mark.parametrize(("arguments", "words"), [
+    ((), "nothing to export; give --readings"),
+    (("--readings", "{out}/r.xlsx"), "unknown kind of table; valid: .csv or .parquet"),
+    (("--parameters", "{out}/p.txt"), "--parameters"),
+    (("--dh", "{out}/d.json"), "valid: .toml or .csv"),
+    (("--dh-modified", "--urdf", "{out}/a.urdf"), "--dh-modified is about --dh"),
+    (("--ur-hash", "calib_1", "--urdf", "{out}/a.urdf"), "--ur-hash is about"),
+    (("--ur-kinematics", "{out}/k.yaml", "--ur-hash", "mine"), "valid: calib_ and digits"),
+    (("--table", "{out}/t.csv", "--readings", "{out}/t.csv"), "two things cannot be written"),
+])  # fmt: skip
+def test_what_cannot_be_written_is_refused(capsys, fitted, tmp_path, arguments, words):
     given = [a.format(out=tmp_path) for a in arguments]
     assert words in refused(capsys, 2, "export", fitted, *given)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_parquet_file_that_cannot_be_readings_is_refused(capsys, tmp_path: Path) -> None:
+def test_a_parquet_file_that_cannot_be_readings_is_refused(capsys, tmp_path):
     import pyarrow
 
     path, run = tmp_path / "t.parquet", tmp_path / "run.hilcal"

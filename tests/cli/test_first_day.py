@@ -31,7 +31,6 @@ from hilcal.readings.readings import States
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.se3 import inverse, of_six, rotation
 from hilcal.store.plan import load_plan
-from hilcal.types import Floats
 from tests.support.campaign_cases import STARVED
 from tests.support.foreign_tables import lines as table_of
 from tests.support.foreign_tables import write
@@ -91,12 +90,11 @@ class Said:
     def number(self, pattern: str) -> float:
         """A number that stands in a pattern, or a length in m."""
         found = re.search(pattern, self.text)
-        assert found is not None, self.text
         unit = found[2] if len(found.groups()) > 1 else "m"
         return float(found[1]) * LENGTHS[unit]
 
 
-def at_terminal(home: Path, *words: str, code: int = 0) -> Said:
+def at_terminal(home, *words, code=0):
     """Run a command there; it ends with the exit code, within 80 columns and without a rest."""
     with AtTerminal(*words, home=home, paper=300) as t:
         found = Said(t.ends(LONG), [line.rstrip() for line in t.lines])
@@ -136,7 +134,7 @@ class Day:
 
 
 @pytest.fixture(scope="module")
-def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
+def day(tmp_path_factory):
     home = tmp_path_factory.mktemp("lab")
     plan, run, check = asked(home).steps
     at_terminal(home, *check[:2], code=2)  # init has said what it lacks
@@ -155,7 +153,7 @@ def day(tmp_path_factory: pytest.TempPathFactory) -> Day:
     return Day(home, secret, {"plan": planned, "run": measured, "refine": refined})
 
 
-def asked(home: Path) -> Said:
+def asked(home):
     with AtTerminal("init", home=home, paper=300) as t:
         for k, (question, answer) in enumerate(ANSWERS):
             t.sees(question, 1 + [q for q, _ in ANSWERS[:k]].count(question))
@@ -165,7 +163,7 @@ def asked(home: Path) -> Said:
         return Said(0, t.lines)
 
 
-def rehearsed(home: Path, words: list[str]) -> Said:
+def rehearsed(home, words):
     """Measure; where this computer was too busy for the devices, go on as is said."""
     for _ in range(8):
         with AtTerminal(*words, home=home, paper=300) as t:
@@ -178,14 +176,14 @@ def rehearsed(home: Path, words: list[str]) -> Said:
     raise AssertionError(found.text)
 
 
-def axis_of_joint_1(secret: SimulationCase) -> tuple[Floats, Floats]:
+def axis_of_joint_1(secret):
     """A point of the axis, and its direction, in the tracker's frame."""
     w = secret.world
     place = w.registration @ w.cell.arm.links[0] @ displacement(w.physics.link_geometry[0])
     return place[:3, 3], place[:3, 2]
 
 
-def test_the_plan_is_one_screen_and_what_it_counts_is_in_its_file(day: Day) -> None:
+def test_the_plan_is_one_screen_and_what_it_counts_is_in_its_file(day):
     said, made = day.said["plan"], load_plan(day.home / "plan.json")
     assert len(said.lines) <= ONE_SCREEN
     assert said.number(r"poses (\d+) and the reference") == POSES == len(made.pose_names) - 1
@@ -193,7 +191,7 @@ def test_the_plan_is_one_screen_and_what_it_counts_is_in_its_file(day: Day) -> N
     assert f"{len(made.steps)} readings are in {RUN}" in day.said["run"].text
 
 
-def test_the_hidden_effect_is_named_no_other_and_the_base_is_the_worlds(day: Day) -> None:
+def test_the_hidden_effect_is_named_no_other_and_the_base_is_the_worlds(day):
     said = day.said["refine"]
     assert len(said.lines) <= ONE_SCREEN
     assert "Verdict: adequate: the residual is noise." in said.text
@@ -202,10 +200,9 @@ def test_the_hidden_effect_is_named_no_other_and_the_base_is_the_worlds(day: Day
     the_base_is_true(day, said)
 
 
-def the_base_is_true(day: Day, said: Said, within: float = 2e-5) -> None:
+def the_base_is_true(day, said, within=2e-5):
     """The base that is printed has the axis of joint 1 where the world has it."""
     found = re.search(r"base: at \((.*?)\) m, turned by the rotation vector \((.*?)\)°", said.text)
-    assert found is not None
     place, turn = (np.array([float(v) for v in group.split(", ")]) for group in found.groups())
     point, direction = axis_of_joint_1(day.secret)
     assert np.linalg.norm(np.cross(place - point, direction)) < within
@@ -213,25 +210,23 @@ def the_base_is_true(day: Day, said: Said, within: float = 2e-5) -> None:
     assert np.linalg.norm(off) < within
 
 
-def test_what_is_missing_is_not_measured_twice_and_the_way_on_leads_on(day: Day) -> None:
+def test_what_is_missing_is_not_measured_twice_and_the_way_on_leads_on(day):
     """Nothing is in doubt: `next` says so, and how to sharpen the model."""
     said = day.at("next", RUN, "-o", "next.json", code=4)
     assert "the model is adequate" in said.text
     more = re.search(r"plan on with: (hilcal plan .*?\.hilcal)", said.text)
-    assert more is not None
     words = shlex.split(more[1])[1:]
     day.at(*words, "--poses", "3", "--quick")
     assert (day.home / words[words.index("-o") + 1]).is_file()
 
 
-def test_the_report_passes_what_the_truth_passes(day: Day) -> None:
+def test_the_report_passes_what_the_truth_passes(day):
     said = day.at("report", RUN, "-o", "report.html", "--operator", "A. Miller",
                   "--limit", "0.1 mm")  # fmt: skip
     page = html.unescape(re.sub(r"<[^>]+>", " ", (day.home / "report.html").read_text("utf-8")))
     page = " ".join(page.split())
     assert said.number(r"PASSED: (\d+) of \d+ errors") == len(day.states())
     told = re.search(r"expanded uncertainty U = ([\d.]+) (µm|mm) \(3-D, k = 2\)", page)
-    assert told is not None
     U = float(told[1]) * {"µm": 1e-6, "mm": 1e-3}[told[2]]
     states, c = day.states(), day.calibration()
     predicted = c.predict(states.q, states.wrench).position
@@ -241,11 +236,11 @@ def test_the_report_passes_what_the_truth_passes(day: Day) -> None:
     assert the_same_base(page) == the_same_base(day.said["refine"].text)
 
 
-def the_same_base(text: str) -> str:
+def the_same_base(text):
     return re.search(r"The robot's base: at .*? in the tracker frame", text)[0]
 
 
-def test_corrected_joint_values_put_the_tool_where_it_was_asked_to_be(day: Day) -> None:
+def test_corrected_joint_values_put_the_tool_where_it_was_asked_to_be(day):
     states, c = day.states("10kg"), day.calibration()
     names = [f"m{k}" for k in range(len(states))]
     head = ["pose", *(f"q{k}_deg" for k in range(1, 7)), "load"]
@@ -271,7 +266,7 @@ def test_corrected_joint_values_put_the_tool_where_it_was_asked_to_be(day: Day) 
     assert after.mean() < 0.05 * before.mean()
 
 
-def test_every_export_puts_the_arm_where_the_tracker_finds_it(day: Day) -> None:
+def test_every_export_puts_the_arm_where_the_tracker_finds_it(day):
     """But for what it says that it leaves out: an arm of this geometry that does not yield."""
     words = "--urdf a.urdf --dh a.toml --ur-kinematics a.yaml --frames frames.json"
     said = day.at("export", RUN, *words.split(), "--calibration", "arm.json")
@@ -305,7 +300,7 @@ def test_every_export_puts_the_arm_where_the_tracker_finds_it(day: Day) -> None:
     np.testing.assert_allclose(c.base_in_tracker(), base, atol=1e-9)
 
 
-def test_the_table_of_a_colleague_tells_the_same(day: Day) -> None:
+def test_the_table_of_a_colleague_tells_the_same(day):
     """Semicolons, decimal commas, degrees, millimetres, names in German, loads by name alone."""
     config, made = day.secret.config, load_plan(day.home / "plan.json")
     r = read_plan(day.secret, made, [SEED, 9]).readings
@@ -331,7 +326,6 @@ def test_the_table_of_a_colleague_tells_the_same(day: Day) -> None:
     factor = refined.number(r"scale the covariance by ([\d.]+);")
     with hc.Campaign.open(day.home / "theirs.hilcal", read_only=True) as run:
         repeats = hc.diagnose(run.fit()).pure_error
-    assert repeats is not None
     low, high = chi2.ppf([0.001, 0.999], repeats.dof) / repeats.dof  # they tell the factor
     assert low < factor / (mean / one) ** 2 < high
     day.at("validate", RUN, "theirs.hilcal", "--limit", "0.1 mm")

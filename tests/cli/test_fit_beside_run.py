@@ -13,7 +13,6 @@ import hilcal as hc
 from hilcal.config import load_config
 from hilcal.errors import InputError
 from hilcal.readings.covariance import COVERS, WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.records import content_hash
@@ -22,11 +21,9 @@ from tests.support.appending import again, appending
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 from tests.support.unguarded import unguarded
 
-Capsys = pytest.CaptureFixture[str]
-
 
 @pytest.fixture(scope="module")
-def fresh(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def fresh(tmp_path_factory):
     """A campaign without revisions."""
     path, config = tmp_path_factory.mktemp("fresh") / "run.hilcal", load_config(CELL).to_json()
     with CampaignFile.create(path, config, str(CELL.parent), "made", more={COVERS: WHOLE}) as file:
@@ -35,7 +32,7 @@ def fresh(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def found(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> hc.Fit:
+def found(fresh, tmp_path_factory):
     """A fit of it."""
     path = tmp_path_factory.mktemp("fitted") / "run.hilcal"
     path.write_bytes(fresh)
@@ -44,20 +41,20 @@ def found(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> hc.Fit:
 
 
 @pytest.fixture
-def run(fresh: bytes, tmp_path: Path) -> Path:
+def run(fresh, tmp_path):
     path = tmp_path / "run.hilcal"
     path.write_bytes(fresh)
     return path
 
 
-def more(path: Path, cycle: int) -> None:
+def more(path, cycle):
     """Measure one pose again, by another connection."""
     with CampaignFile.open(path) as file:
         x = file.readings()
         file.append_readings(again(x, np.random.default_rng(cycle), cycle))
 
 
-def checked(path: Path) -> int:
+def checked(path):
     """Return how many revisions there are; each tells the readings that it was fitted to."""
     with CampaignFile.open(path, read_only=True) as file:
         readings, records = file.readings(), file.revisions()
@@ -68,9 +65,7 @@ def checked(path: Path) -> int:
 
 
 @pytest.mark.parametrize("order", ["append, store", "store, append", "append, store, append"])
-def test_a_revision_is_of_the_readings_that_were_fitted(
-    run: Path, found: hc.Fit, order: str
-) -> None:
+def test_a_revision_is_of_the_readings_that_were_fitted(run, found, order):
     with hc.Campaign.open(run) as o:
         before = len(o.readings)
         for k, step in enumerate(order.split(", "), start=1):
@@ -89,7 +84,7 @@ def test_a_revision_is_of_the_readings_that_were_fitted(
     assert checked(run) == 2
 
 
-def test_what_a_refinement_stores_follows_itself(run: Path, found: hc.Fit) -> None:
+def test_what_a_refinement_stores_follows_itself(run, found):
     """Another program's revision comes between two of a chain."""
     with hc.Campaign.open(run) as one, hc.Campaign.open(run) as other:
         grown = hc.fit(found.model + hc.effect("hysteresis"), one.readings, "absolute")
@@ -99,7 +94,7 @@ def test_what_a_refinement_stores_follows_itself(run: Path, found: hc.Fit) -> No
         assert one.file.revision(made).made_from == first
 
 
-def test_commands_beside_a_run(run: Path, capsys: Capsys) -> None:
+def test_commands_beside_a_run(run, capsys):
     """Each fits what it read, whatever comes meanwhile; more in the slow suite."""
     with appending(run, 1, pause=0.1) as process:
         with CampaignFile.open(run, read_only=True) as file:
@@ -118,13 +113,13 @@ def test_commands_beside_a_run(run: Path, capsys: Capsys) -> None:
     assert checked(run) == 3
 
 
-def readings_of(path: Path) -> Readings:
+def readings_of(path):
     with CampaignFile.open(path, read_only=True) as file:
         return file.readings()
 
 
 @pytest.mark.slow
-def test_many_commands_at_random_moments_beside_a_run(fresh: bytes, tmp_path: Path, capsys) -> None:
+def test_many_commands_at_random_moments_beside_a_run(fresh, tmp_path, capsys):
     rng = np.random.default_rng(8)
     commands = [
         ["identify", "--readings", "absolute"],
@@ -144,7 +139,7 @@ def test_many_commands_at_random_moments_beside_a_run(fresh: bytes, tmp_path: Pa
 # what programs before left behind
 
 
-def _mixed(path: Path, found: hc.Fit) -> None:
+def _mixed(path, found):
     """As programs before stored it: the count of what was fitted, the hash of what was there."""
     with hc.Campaign.open(path) as o:
         record = o.record(found)
@@ -154,9 +149,7 @@ def _mixed(path: Path, found: hc.Fit) -> None:
     more(path, 2)
 
 
-def test_a_count_and_a_hash_of_two_moments_stop_nothing(
-    run: Path, found: hc.Fit, capsys: Capsys
-) -> None:
+def test_a_count_and_a_hash_of_two_moments_stop_nothing(run, found, capsys):
     """Its hash proves the readings that it was fitted to, and those that came meanwhile."""
     _mixed(run, found)
     ok(capsys, "info", run)
@@ -165,11 +158,11 @@ def test_a_count_and_a_hash_of_two_moments_stop_nothing(
     ok(capsys, "compare", run)
 
 
-def test_what_was_fitted_is_not_searched_for_ever(run: Path, found: hc.Fit, monkeypatch) -> None:
+def test_what_was_fitted_is_not_searched_for_ever(run, found, monkeypatch):
     """A received file could tell hashes that take hours to find."""
     hashed: list[int] = []
 
-    def counting(readings: Readings) -> str:
+    def counting(readings):
         hashed.append(len(readings))
         return content_hash(readings)
 
@@ -185,7 +178,7 @@ def test_what_was_fitted_is_not_searched_for_ever(run: Path, found: hc.Fit, monk
     assert len(hashed) <= 4
 
 
-def spoil(path: Path, found: hc.Fit, how: str) -> None:
+def spoil(path, found, how):
     """Make revision 2 of three a bad one."""
     with hc.Campaign.open(path) as o:
         for _ in range(3):
@@ -200,7 +193,7 @@ def spoil(path: Path, found: hc.Fit, how: str) -> None:
         db.execute("UPDATE revisions SET content = ?, crc = ? WHERE id = 2", (text, crc))
 
 
-def test_a_revision_before_the_first_one_is_set_aside(run: Path, found: hc.Fit, capsys) -> None:
+def test_a_revision_before_the_first_one_is_set_aside(run, found, capsys):
     with hc.Campaign.open(run) as o:
         o.append(found)
     with closing(sqlite3.connect(run, isolation_level=None)) as db, unguarded(db):
@@ -211,9 +204,7 @@ def test_a_revision_before_the_first_one_is_set_aside(run: Path, found: hc.Fit, 
 
 
 @pytest.mark.parametrize("how", ["hash", "damage"])
-def test_a_bad_revision_is_set_aside_and_no_reading(
-    run: Path, found: hc.Fit, capsys: Capsys, how: str
-) -> None:
+def test_a_bad_revision_is_set_aside_and_no_reading(run, found, capsys, how):
     spoil(run, found, how)
     original = run.read_bytes()
     for command in ("info", "identify", "compare", "export"):
@@ -245,12 +236,12 @@ def test_a_bad_revision_is_set_aside_and_no_reading(
     assert len(list(run.parent.iterdir())) == 2
 
 
-def _first(path: Path) -> object:
+def _first(path):
     with CampaignFile.open(path, read_only=True) as file:
         return file.revision(1)
 
 
-def test_a_second_repair_keeps_both_originals(run: Path, found: hc.Fit, capsys: Capsys) -> None:
+def test_a_second_repair_keeps_both_originals(run, found, capsys):
     spoil(run, found, "damage")
     first = Path(ok(capsys, "repair", run, "--json").document["original"])
     kept = first.read_bytes()

@@ -4,7 +4,6 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -26,7 +25,7 @@ POINTS = "pose,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad\n" + "\n".join(
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def fitted(tmp_path_factory):
     """A folder with a campaign of one revision, points and a table."""
     folder = tmp_path_factory.mktemp("full")
     readings = rehearsal("nothing").readings
@@ -43,7 +42,7 @@ def fitted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @contextmanager
-def full_after(size: int) -> Iterator[None]:
+def full_after(size):
     """No file grows beyond a size: writes fail in the system, as on a full disk."""
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
@@ -54,33 +53,20 @@ def full_after(size: int) -> Iterator[None]:
 
 
 COMMANDS = [
-    *(
-        ("export", "run.hilcal", option, name)
-        for option, name in (
-            ("--readings", "r.csv"),
-            ("--readings", "r.parquet"),
-            ("--table", "t.csv"),
-            ("--cell", "C.toml"),
-            ("--parameters", "p.csv"),
-            ("--parameters", "p.json"),
-            ("--residuals", "e.csv"),
-            ("--calibration", "c.json"),
-        )
-    ),
-    *(
-        ("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o", name)
-        for name in ("o.script", "o.csv", "o.json")
-    ),
+    *(("export", "run.hilcal", option, name) for option, name in (("--readings", "r.csv"),
+        ("--readings", "r.parquet"), ("--table", "t.csv"), ("--cell", "C.toml"), ("--parameters",
+        "p.csv"), ("--parameters", "p.json"), ("--residuals", "e.csv"), ("--calibration",
+        "c.json"))),
+    *(("compensate", "run.hilcal", "points.csv", "--load", "10kg", "-o",
+        name) for name in ("o.script", "o.csv", "o.json")),
     ("report", "run.hilcal", "-o", "story.html"),
     ("import", "table.csv", "--preview", "-o", "m.toml"),
     ("effects", "new", "mine", "-o", "mine.py"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize("size", first(1, [0, 200]))
-def test_a_full_disk_leaves_no_half_file(
-    capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch, size: int
-) -> None:
+def test_a_full_disk_leaves_no_half_file(capsys, fitted, monkeypatch, size):
     monkeypatch.chdir(fitted)
     for command in COMMANDS:
         output = Path(command[-1])
@@ -101,8 +87,8 @@ def test_a_full_disk_leaves_no_half_file(
 
 
 def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
-    capsys, fitted: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    capsys, fitted, monkeypatch
+):
     """Whatever room there is: for nothing, for an empty campaign, for some readings."""
     monkeypatch.chdir(fitted)
     old, new = Path("old.hilcal"), Path("new.hilcal")
@@ -121,7 +107,7 @@ def test_an_import_that_finds_no_room_leaves_the_campaign_that_was_there(
             assert set(Path().iterdir()) == here
 
 
-def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted: Path, monkeypatch) -> None:
+def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted, monkeypatch):
     monkeypatch.chdir(fitted)
     real, link = Path("real.script"), Path("link.script")
     real.write_text(OLD)
@@ -135,7 +121,7 @@ def test_a_link_stays_and_output_may_be_a_pipe(capsys, fitted: Path, monkeypatch
 
 
 @pytest.mark.parametrize("redirected", first(1, [False, True]))
-def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> None:
+def test_standard_output_is_written_straight(fitted, redirected):
     """`--preview -o /dev/stdout` would be no .toml: a link gives the name."""
     link, out = fitted / f"out-{redirected}.toml", fitted / "redirected"
     link.symlink_to("/dev/stdout")
@@ -157,7 +143,7 @@ def test_standard_output_is_written_straight(fitted: Path, redirected: bool) -> 
 
 
 @pytest.mark.long
-def test_output_that_finds_no_room_is_one_line(fitted: Path) -> None:
+def test_output_that_finds_no_room_is_one_line(fitted):
     with Path("/dev/full").open("w") as full:
         ended = subprocess.run(
             [sys.executable, "-m", "hilcal", "info", str(fitted / "run.hilcal")],

@@ -2,8 +2,6 @@
 
 import json
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +13,6 @@ from hilcal.store.campaign_file import CampaignFile
 from tests.support.cli_cases import ok, refused
 from tests.support.foreign_tables import CELL, campaign, lines, write
 
-Capsys = pytest.CaptureFixture[str]
 C = campaign(12)
 NAMES = [f"A{k}" for k in range(1, 7)]
 HEADER = ["Point", *NAMES, "X", "Y", "Z", "sX", "sY", "sZ", "T", "M"]
@@ -44,10 +41,10 @@ column = "M"
 """
 
 
-def cell(row: int, column: str, value: str) -> Callable[[str], str]:
+def cell(row, column, value):
     """The text with one cell changed; rows as an editor counts them."""
 
-    def change(text: str) -> str:
+    def change(text):
         rows = [line.split(";") for line in text.splitlines()]
         rows[row - 1][HEADER.index(column)] = value
         return "\n".join(";".join(r) for r in rows) + "\n"
@@ -55,8 +52,8 @@ def cell(row: int, column: str, value: str) -> Callable[[str], str]:
     return change
 
 
-def scaled(column: str, factor: float) -> Callable[[str], str]:
-    def change(text: str) -> str:
+def scaled(column, factor):
+    def change(text):
         rows = [line.split(";") for line in text.splitlines()]
         k = HEADER.index(column)
         for r in rows[1:]:
@@ -66,8 +63,8 @@ def scaled(column: str, factor: float) -> Callable[[str], str]:
     return change
 
 
-def all_of(*changes: Callable[[str], str]) -> Callable[[str], str]:
-    def change(text: str) -> str:
+def all_of(*changes):
+    def change(text):
         for one in changes:
             text = one(text)
         return text
@@ -75,86 +72,68 @@ def all_of(*changes: Callable[[str], str]) -> Callable[[str], str]:
     return change
 
 
-def same(text: str) -> str:
+def same(text):
     return text
 
 
-def swap(old: str, new: str) -> Callable[[str], str]:
+def swap(old, new):
     return lambda text: text.replace(old, new)
 
 
 STD = ("sX", "sY", "sZ")
 BAD: dict[str, tuple[Callable[[str], str], Callable[[str], str], tuple[str, ...]]] = {
-    "text for a number": (
-        cell(4, "X", "abc"), same, ("row 4", "column 'X'", "'abc' is not a number", "missing"),
-    ),
-    "a comma as decimal mark": (
-        cell(4, "A2", "1,5"), same, ("row 4", "column 'A2'", "with '.' as decimal mark"),
-    ),
+    "text for a number": (cell(4, "X", "abc"), same, ("row 4", "column 'X'",
+        "'abc' is not a number", "missing")),
+    "a comma as decimal mark": (cell(4, "A2", "1,5"), same, ("row 4", "column 'A2'",
+        "with '.' as decimal mark")),
     "infinite": (cell(4, "X", "inf"), same, ("row 4", "column 'X'", "not a number")),
     "a row that is too long": (swap("P3;", "P3;;;"), same, ("row 5 has 17 cells", "skip_rows")),
     "a row that is too short": (swap("P3;", ""), same, ("row 5 has 14 cells", "15")),
     "no such column": (same, swap('"A6"', '"A7"'), ("no column 'A7'", "Point")),
     "a column beyond the last": (same, swap('"A6"', "77"), ("column 77", "there are 15")),
-    "joints in radians": (
-        same, swap('"A6"]\nunit = "deg"', '"A6"]\nunit = "rad"'),
-        ("row 2", "column 'A1'", "looks like degrees"),
-    ),
-    "positions in metres": (
-        same, swap('"Z"]\nunit = "mm"', '"Z"]\nunit = "m"'),
-        ("row 2", "column 'X'", "looks like millimetres"),
-    ),
+    "joints in radians": (same, swap('"A6"]\nunit = "deg"', '"A6"]\nunit = "rad"'), ("row 2",
+        "column 'A1'", "looks like degrees")),
+    "positions in metres": (same, swap('"Z"]\nunit = "mm"', '"Z"]\nunit = "m"'), ("row 2",
+        "column 'X'", "looks like millimetres")),
     "unknown unit": (same, swap('unit = "deg"', 'unit = "grad"'), ("[joints] unit", '"deg"')),
     "unknown section": (same, swap("[air]", "[aire]"), ("aire", 'did you mean "air"')),
     "unknown key": (same, swap('column = "T"', 'colum = "T"'), ("[air]", "colum", "column")),
-    "no position": (
-        same, lambda t: t.replace('[position]\ncolumns = ["X", "Y", "Z"]\nunit = "mm"\n', ""),
-        ("no reading", "[position]", "[distance]"),
-    ),
+    "no position": (same,
+        lambda t: t.replace('[position]\ncolumns = ["X", "Y", "Z"]\nunit = "mm"\n', ""),
+        ("no reading", "[position]", "[distance]")),
     "five joints": (same, swap(', "A6"]', "]"), ("5 columns of joints", "has 6 joints")),
-    "negative standard deviation": (
-        cell(3, "sY", "-0.02"), same, ("row 3", "column 'sY'", "0 or more"),
-    ),
+    "negative standard deviation": (cell(3, "sY", "-0.02"), same, ("row 3", "column 'sY'",
+        "0 or more")),
     "no standard deviation": (cell(3, "sY", ""), same, ("row 3", "column 'sY'", "no value")),
-    "absurd precision": (
-        all_of(*(scaled(c, 1e-12) for c in STD)), same, ("row 2", "no instrument reaches"),
-    ),
-    "millimetres as metres": (
-        same, swap('"sZ"]\nunit = "mm"', '"sZ"]\nunit = "m"'),
-        ("row 2", "standard deviation of 0.02 m"),
-    ),
-    "larger than the workspace": (
-        all_of(*(scaled(c, 1e5) for c in STD)), same, ("row 2", "standard deviation of 2 m"),
-    ),
+    "absurd precision": (all_of(*(scaled(c, 1e-12) for c in STD)), same, ("row 2",
+        "no instrument reaches")),
+    "millimetres as metres": (same, swap('"sZ"]\nunit = "mm"', '"sZ"]\nunit = "m"'), ("row 2",
+        "standard deviation of 0.02 m")),
+    "larger than the workspace": (all_of(*(scaled(c, 1e5) for c in STD)), same, ("row 2",
+        "standard deviation of 2 m")),
     "a negative mass": (cell(3, "M", "-5"), same, ("row 3", "column 'M'", "0 or more")),
     "kelvin": (scaled("T", 14.3), same, ("row 2", "column 'T'", "°C")),
-    "two poses of one name": (
-        swap("P3;", "P2;"), same, ("row 5", "pose 'P2'", "give another pose another name"),
-    ),
+    "two poses of one name": (swap("P3;", "P2;"), same, ("row 5", "pose 'P2'",
+        "give another pose another name")),
     "no header there": (same, swap('separator = ";"', 'separator = ";"\nheader_row = 99'), ("99",)),
     "another separator": (same, swap('";"', '"tab"'), ("no column", "Point;A1")),
     "same marks": (same, swap('";"', '","\ndecimal = ","'), ("separator and decimal",)),
     "a sheet of text": (same, swap('";"', '";"\nsheet = "a"'), ("sheet",)),
-    "both forces": (
-        same, lambda t: t + '[wrench]\ncolumns = ["X", "Y", "Z"]\n', ("[wrench]", "[hung_mass]"),
-    ),
+    "both forces": (same, lambda t: t + '[wrench]\ncolumns = ["X", "Y", "Z"]\n', ("[wrench]",
+        "[hung_mass]")),
     "time": (same, lambda t: t + '[time]\ncolumn = "Point"\nunit = "iso"\n', ("row 2", "'P0'")),
     "most rows lack a value": (swap("20.500000", ""), same, ("column 'T'", "12 of 12")),
-    "quaternion": (
-        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3", "A4"]\n'
-        'convention = "abb"\n', ("row 2", "quaternion of length 1"),
-    ),
-    "orientation in degrees": (
-        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\nconvention = "kuka"\n',
-        ("row 2", "column 'A1'", "looks like degrees", "[orientation] unit"),
-    ),
-    "unknown convention": (
-        same, lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\n'
-        'convention = "kuka-abc"\n', ('did you mean "kuka"', "intrinsic-zyx"),
-    ),
-    "a second file that is not given": (
-        same, lambda t: t + "[second_file]\n", ("[second_file] without path", "--second"),
-    ),
+    "quaternion": (same,
+        lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3", "A4"]\n' 'convention = "abb"\n',
+        ("row 2", "quaternion of length 1")),
+    "orientation in degrees": (same,
+        lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\nconvention = "kuka"\n',
+        ("row 2", "column 'A1'", "looks like degrees", "[orientation] unit")),
+    "unknown convention": (same,
+        lambda t: t + '[orientation]\ncolumns = ["A1", "A2", "A3"]\n' 'convention = "kuka-abc"\n',
+        ('did you mean "kuka"', "intrinsic-zyx")),
+    "a second file that is not given": (same, lambda t: t + "[second_file]\n",
+        ("[second_file] without path", "--second")),
     "no readings": (lambda t: t.splitlines()[0] + "\n", same, ("no readings below row 1",)),
     "empty": (lambda t: "", same, ("the file is empty",)),
     "quotes": (cell(3, "T", '"x'), same, ("not delimited text",)),
@@ -162,7 +141,7 @@ BAD: dict[str, tuple[Callable[[str], str], Callable[[str], str], tuple[str, ...]
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_what_is_wrong_is_one_line(case: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_is_wrong_is_one_line(case, tmp_path, capsys):
     change, remap, named = BAD[case]
     table = write(tmp_path / "t.csv", change(GOOD))
     mapping = write(tmp_path / "m.toml", remap(MAPPING))
@@ -173,9 +152,7 @@ def test_what_is_wrong_is_one_line(case: str, tmp_path: Path, capsys: Capsys) ->
     assert not out.exists()
 
 
-def imported(
-    capsys: Capsys, tmp_path: Path, text: str | bytes, mapping: str = MAPPING, name: str = "t.csv"
-) -> dict[str, Any]:
+def imported(capsys, tmp_path, text, mapping=MAPPING, name="t.csv"):
     path = tmp_path / name
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     out = tmp_path / "run.hilcal"
@@ -185,12 +162,12 @@ def imported(
     return ok(capsys, *arguments).document
 
 
-def values(tmp_path: Path) -> Any:
+def values(tmp_path):
     with CampaignFile.open(tmp_path / "run.hilcal") as file:
         return file.readings()
 
 
-def test_a_good_table(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_good_table(tmp_path, capsys):
     d = imported(capsys, tmp_path, GOOD)
     assert (d["n_readings"], d["n_poses"], set(d["loads"])) == (12, 12, {"none", "5kg"})
     x = values(tmp_path)
@@ -199,7 +176,7 @@ def test_a_good_table(tmp_path: Path, capsys: Capsys) -> None:
     np.testing.assert_allclose(x.covariance[0], (2e-5) ** 2 * np.eye(3), rtol=1e-9, atol=1e-18)
 
 
-def test_copied_rows_are_said_and_counted_once(tmp_path: Path, capsys: Capsys) -> None:
+def test_copied_rows_are_said_and_counted_once(tmp_path, capsys):
     """A block that was pasted twice, once under other names; a reading made again scatters."""
     _, *rows = GOOD.splitlines()
     pasted = [*rows[:3], *(row.replace("P", "Q", 1) for row in rows[4:6])]
@@ -211,7 +188,7 @@ def test_copied_rows_are_said_and_counted_once(tmp_path: Path, capsys: Capsys) -
     assert "5 of 18 rows are copies of others to the last digit (the first is of P0/5kg)" in said
 
 
-def test_the_same_table_with_all_that_is_in_the_wild(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_same_table_with_all_that_is_in_the_wild(tmp_path, capsys):
     imported(capsys, tmp_path, GOOD)
     plain = values(tmp_path)
     head, *rows = GOOD.splitlines()
@@ -224,7 +201,7 @@ def test_the_same_table_with_all_that_is_in_the_wild(tmp_path: Path, capsys: Cap
     np.testing.assert_array_equal(values(tmp_path).states.wrench, plain.states.wrench)
 
 
-def test_rows_without_a_value_are_left_out_and_counted(tmp_path: Path, capsys: Capsys) -> None:
+def test_rows_without_a_value_are_left_out_and_counted(tmp_path, capsys):
     text = cell(4, "X", "-9999")(cell(6, "Z", "n/a")(GOOD))
     mapping = MAPPING.replace('";"', '";"\nmissing = [-9999]')
     d = imported(capsys, tmp_path, text, mapping)
@@ -232,7 +209,7 @@ def test_rows_without_a_value_are_left_out_and_counted(tmp_path: Path, capsys: C
     assert d["notes"][0] == "2 of 12 rows left out (4, 6): no value in X, Z"
 
 
-def test_points_that_were_not_measured(tmp_path: Path, capsys: Capsys) -> None:
+def test_points_that_were_not_measured(tmp_path, capsys):
     text = cell(4, "X", "0.000")(cell(4, "Y", "0")(cell(4, "Z", "-0.0")(GOOD)))
     d = imported(capsys, tmp_path, text)
     assert d["n_readings"] == 11
@@ -242,7 +219,7 @@ def test_points_that_were_not_measured(tmp_path: Path, capsys: Capsys) -> None:
     ]
 
 
-def test_a_position_that_was_not_measured_again(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_position_that_was_not_measured_again(tmp_path, capsys):
     text = GOOD
     for c in ("X", "Y", "Z"):
         value = text.splitlines()[4].split(";")[HEADER.index(c)]
@@ -251,14 +228,14 @@ def test_a_position_that_was_not_measured_again(tmp_path: Path, capsys: Capsys) 
     assert d["notes"][0].startswith("rows 6 read exactly the position of the row before")
 
 
-def test_signs_that_programs_write(tmp_path: Path, capsys: Capsys) -> None:
+def test_signs_that_programs_write(tmp_path, capsys):
     text = cell(3, "X", "\u22121\u00a0234.5")(GOOD)
     mapping = MAPPING.replace('";"', '";"\nthousands = " "')
     imported(capsys, tmp_path, text, mapping)
     assert values(tmp_path).value[1, 0] == pytest.approx(-1.2345)
 
 
-def test_zero_standard_deviations_are_the_instruments(tmp_path: Path, capsys: Capsys) -> None:
+def test_zero_standard_deviations_are_the_instruments(tmp_path, capsys):
     text = GOOD
     for c in STD:
         text = cell(3, c, "0.000")(cell(7, c, "1e-9")(text))
@@ -268,7 +245,7 @@ def test_zero_standard_deviations_are_the_instruments(tmp_path: Path, capsys: Ca
     assert np.sqrt(x.covariance[1].diagonal()).min() > 5e-6
 
 
-def test_rounded_values_are_not_believed_to_the_micrometre(tmp_path: Path, capsys: Capsys) -> None:
+def test_rounded_values_are_not_believed_to_the_micrometre(tmp_path, capsys):
     rounded = lines(
         HEADER, [f"P{k}" for k in range(12)], np.rad2deg(C.q), np.round(1e3 * C.position, 1),
         np.full((12, 3), 0.001), np.full(12, 20.5), np.zeros(12),
@@ -279,7 +256,7 @@ def test_rounded_values_are_not_believed_to_the_micrometre(tmp_path: Path, capsy
     np.testing.assert_allclose(values(tmp_path).covariance[0].diagonal(), expected, rtol=1e-6)
 
 
-def test_rounded_joints_are_said(tmp_path: Path, capsys: Capsys) -> None:
+def test_rounded_joints_are_said(tmp_path, capsys):
     text = lines(
         HEADER, [f"P{k}" for k in range(12)], np.round(np.rad2deg(C.q), 1), 1e3 * C.position,
         np.full((12, 3), 0.02), np.full(12, 20.5), np.zeros(12),
@@ -288,13 +265,13 @@ def test_rounded_joints_are_said(tmp_path: Path, capsys: Capsys) -> None:
     assert any("joint angles are rounded to 0.1 deg" in n for n in d["notes"])
 
 
-def test_variances_that_look_like_standard_deviations(tmp_path: Path, capsys: Capsys) -> None:
+def test_variances_that_look_like_standard_deviations(tmp_path, capsys):
     mapping = MAPPING.replace('"sZ"]', '"sZ"]\nkind = "variance"')
     d = imported(capsys, tmp_path, GOOD, mapping)
     assert any("read as standard deviations the figures would be 20 µm" in n for n in d["notes"])
 
 
-def test_expanded_uncertainty_of_a_point(tmp_path: Path, capsys: Capsys) -> None:
+def test_expanded_uncertainty_of_a_point(tmp_path, capsys):
     std = '[std]\nvalues = [0.06]\nunit = "mm"\nkind = "expanded"\nk = 3\nof = "point"\n'
     mapping = MAPPING.replace('[std]\ncolumns = ["sX", "sY", "sZ"]\nunit = "mm"\n', std)
     imported(capsys, tmp_path, GOOD, mapping)
@@ -302,7 +279,7 @@ def test_expanded_uncertainty_of_a_point(tmp_path: Path, capsys: Capsys) -> None
     np.testing.assert_allclose(values(tmp_path).covariance[5], expected, rtol=1e-9, atol=1e-20)
 
 
-def test_a_table_of_another_form_says_what_to_do(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_table_of_another_form_says_what_to_do(tmp_path, capsys):
     path = write(tmp_path / "t.csv", GOOD)
     line = refused(capsys, 2, "import", path, "--config", CELL, "-o", tmp_path / "x.hilcal")
     assert "--preview" in line
@@ -314,7 +291,7 @@ def test_a_table_of_another_form_says_what_to_do(tmp_path: Path, capsys: Capsys)
     assert "--format" in refused(capsys, 2, "import", path, *both)
 
 
-def test_the_preview_writes_nothing_unless_asked(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_preview_writes_nothing_unless_asked(tmp_path, capsys):
     path = write(tmp_path / "t.csv", GOOD)
     d = ok(capsys, "import", path, "--preview", "--json").document
     assert list(tmp_path.iterdir()) == [path]
@@ -327,9 +304,7 @@ def test_the_preview_writes_nothing_unless_asked(tmp_path: Path, capsys: Capsys)
     assert "exists" in refused(capsys, 2, "import", path, "--preview", "-o", mapping)
 
 
-def test_the_preview_says_what_is_wrong_with_the_description(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_preview_says_what_is_wrong_with_the_description(tmp_path, capsys):
     c = campaign(30)
     q = np.rad2deg(c.q) * [1, 1, 1, -1, 1, 1]
     path = write(tmp_path / "t.csv", lines([*NAMES, "X", "Y", "Z"], q, 1e3 * c.position))
@@ -339,9 +314,7 @@ def test_the_preview_says_what_is_wrong_with_the_description(
     assert "joint 4 turns the other way" in d["outcome"][-1]
 
 
-def test_words_fit_eighty_columns(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_words_fit_eighty_columns(tmp_path, capsys, monkeypatch):
     path = write(tmp_path / "t.csv", GOOD)
     monkeypatch.setattr("hilcal.cli.terminal.WIDTH", 80)
     words = ok(capsys, "import", path, "--preview", "--config", CELL).out
@@ -350,7 +323,7 @@ def test_words_fit_eighty_columns(
 
 @pytest.mark.parametrize("name", ["spatial-analyzer", "spatial-analyzer-points", "polyworks",
                                   "tracker-pilot"])  # fmt: skip
-def test_shipped_mappings(name: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_shipped_mappings(name, tmp_path, capsys):
     points = [f"P{k}" for k in range(12)]
     p = 1e3 * C.position
     text = {
@@ -381,16 +354,14 @@ def test_shipped_mappings(name: str, tmp_path: Path, capsys: Capsys) -> None:
     np.testing.assert_allclose(x.value[:, :3], C.position, atol=1e-8)
 
 
-def test_the_document_is_json_only(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_document_is_json_only(tmp_path, capsys):
     path = write(tmp_path / "t.csv", GOOD)
     with pytest.raises(SystemExit):
         main(["import", str(path), "--preview", "--json"])
     assert json.loads(capsys.readouterr().out)["missing"] == []
 
 
-def test_loads_that_a_table_only_names_act_as_the_cell_states_them(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_loads_that_a_table_only_names_act_as_the_cell_states_them(tmp_path, capsys):
     """Else a load without a force is an error of the arm that follows the load."""
     names = ["ohne", "10 kg", "pull x", "box"] * 3
     header = ["Punkt", "Last", *NAMES, "X", "Y", "Z"]
@@ -410,9 +381,7 @@ def test_loads_that_a_table_only_names_act_as_the_cell_states_them(
     assert "load box: its force is not stated by the table, nor by [[loads]]" in notes
 
 
-def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(
-    tmp_path: Path, capsys: Capsys
-) -> None:
+def test_one_coordinate_of_nines_is_no_unit_and_the_way_out_is_one(tmp_path, capsys):
     position = 1e3 * C.position
     position[5, 1] = -9999
     text = lines(["Point", *NAMES, "X", "Y", "Z"], [f"P{k}" for k in range(12)], np.rad2deg(C.q),

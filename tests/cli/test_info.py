@@ -1,23 +1,38 @@
-"""`info`: what a campaign holds, told from the file alone."""
+"""`info`, the commands that a file keeps, and its robot's file."""
 
 import hashlib
+import json
+import shlex
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import hilcal as hc
+from hilcal.calibration.handover import urdf
+from hilcal.campaign.campaign import Campaign
+from hilcal.cell import cell_from_config
 from hilcal.cli import main
 from hilcal.config import load_config
+from hilcal.errors import InputError
+from hilcal.present.html.sections import page
 from hilcal.readings.covariance import COVERS, INSTRUMENT
+from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.command_line import COMMAND, typed, typed_now
+from hilcal.store.overview import overview
 from hilcal.store.plan import Plan, Step
-from hilcal.store.run_log import RunLog, create_run
+from hilcal.store.robot_file import ROBOT_FILE
+from hilcal.store.run_log import RunLog, check_same_cell, create_run
+from hilcal.write_report import Asked, content_of
+from tests.support.campaigns import campaign, configuration
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, table
-
-Capsys = pytest.CaptureFixture[str]
+from tests.unit.discovery.test_discover import campaign as simulated
 
 
 @pytest.fixture(scope="module")
-def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def imported(tmp_path_factory):
     """An imported campaign with two revisions, the second one from the first."""
     run = tmp_path_factory.mktemp("info") / "run.hilcal"
     csv = table(run.with_name("t.csv"), "hysteresis", poses=8)
@@ -32,7 +47,7 @@ def imported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run
 
 
-def test_an_imported_campaign(imported: Path, capsys: Capsys) -> None:
+def test_an_imported_campaign(imported, capsys):
     before = hashlib.sha256(imported.read_bytes()).hexdigest()
     d = ok(capsys, "info", imported, "--json").document
     assert (d["n_readings"], d["n_poses"], d["robot"]) == (40, 8, "ur10e")
@@ -54,7 +69,7 @@ def test_an_imported_campaign(imported: Path, capsys: Capsys) -> None:
     assert hashlib.sha256(imported.read_bytes()).hexdigest() == before
 
 
-def test_the_accepted_revision_is_marked(imported: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_accepted_revision_is_marked(imported, tmp_path, capsys):
     run = tmp_path / "run.hilcal"
     run.write_bytes(imported.read_bytes())
     ok(capsys, "accept", run, "2")
@@ -67,27 +82,19 @@ def test_the_accepted_revision_is_marked(imported: Path, tmp_path: Path, capsys:
 
 
 ANSWERS = [
-    {
-        "device": "arm", "driver": "ur", "answers": True, "problems": [],
-        "name": "Universal Robots UR10e", "facts": {"serial number": "20235500001"},
-    },
-    {
-        "device": "tracker", "driver": "geocom", "answers": True, "problems": [],
-        "name": "LASER STATION, serial 123456", "facts": {"firmware": "6.20"},
-    },
-    {
-        "device": "force sensor", "driver": "ft300", "answers": True, "problems": [],
-        "name": "Robotiq FT 300, serial number F3004242", "facts": {},
-    },
-    {
-        "device": "operator", "driver": "terminal", "answers": True, "problems": [],
-        "name": "a person", "facts": {},
-    },
+    {"device": "arm", "driver": "ur", "answers": True, "problems": [],
+        "name": "Universal Robots UR10e", "facts": {"serial number": "20235500001"}},
+    {"device": "tracker", "driver": "geocom", "answers": True, "problems": [],
+        "name": "LASER STATION, serial 123456", "facts": {"firmware": "6.20"}},
+    {"device": "force sensor", "driver": "ft300", "answers": True, "problems": [],
+        "name": "Robotiq FT 300, serial number F3004242", "facts": {}},
+    {"device": "operator", "driver": "terminal", "answers": True, "problems": [],
+        "name": "a person", "facts": {}},
 ]  # fmt: skip
 
 
 @pytest.fixture
-def measured(tmp_path: Path) -> Path:
+def measured(tmp_path):
     """A campaign as `run` leaves it after an interruption, with everything that it notes."""
     r = rehearsal("nothing", poses=3).readings
     steps = tuple(
@@ -124,9 +131,7 @@ def measured(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_measured_campaign_says_by_what_and_how_it_was_measured(
-    measured: Path, capsys: Capsys
-) -> None:
+def test_a_measured_campaign_says_by_what_and_how_it_was_measured(measured, capsys):
     d = ok(capsys, "info", measured, "--json").document
     assert (d["n_readings"], d["measured"], d["planned"]) == (8, 8, 15)
     numbers = {i["device"]: i["serial_number"] for i in d["instruments"]}
@@ -158,10 +163,133 @@ def test_a_measured_campaign_says_by_what_and_how_it_was_measured(
         assert part in words, part
 
 
-def test_a_campaign_that_holds_nothing_yet(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_campaign_that_holds_nothing_yet(tmp_path, capsys):
     path = tmp_path / "empty.hilcal"
     config = load_config(CELL).to_json()
     CampaignFile.create(path, config, str(CELL.parent), "test", more={COVERS: INSTRUMENT}).close()
     assert ok(capsys, "info", path, "--json").document["n_readings"] == 0
     assert "none yet" in ok(capsys, "info", path).out
     assert "no such campaign" in refused(capsys, 2, "info", tmp_path / "none.hilcal")
+
+
+@pytest.fixture
+def run(tmp_path):
+    content = json.loads(configuration().to_json())
+    content["limits"]["accuracy_m"] = 2e-4
+    path = tmp_path / "my run.hilcal"
+    with CampaignFile.create(path, json.dumps(content), str(configs_dir() / "cells"), "x") as file:
+        file.append_readings(campaign("none", "deflection", poses=6).readings)
+    return path
+
+
+@pytest.mark.long
+def test_a_revision_keeps_its_command_and_the_page_shows_it(run, capsys):
+    words = ["identify", str(run), "--effects", "base_frame,joint_compliance"]
+    ok(capsys, *words)
+    with Campaign.open(run) as o:
+        line = o.file.revision(1).options[COMMAND]
+        assert shlex.split(line)[1:5] == words
+        o.append(o.fit())  # by the library: nobody has typed anything
+        assert COMMAND not in o.file.revision(2).options
+        assert overview(o.file).command == ""
+        m = content_of(o, Asked(appendix=True))
+    html = page(m)
+    assert "Commands as they were typed" in html
+    assert "base_frame,joint_compliance" in html
+    assert html.count("not kept: ") == 2  # the file, and revision 2
+    assert m.limit_m == 2e-4  # of [limits] accuracy_m
+    assert "within 200 µm" in html
+
+
+def test_a_campaign_keeps_the_command_that_made_it(tmp_path):
+    with typed(["hilcal", "import", "a table.csv"]):
+        content = configuration().to_json()
+        with CampaignFile.create(tmp_path / "x.hilcal", content, "", "x") as file:
+            assert file.about(COMMAND) == "hilcal import 'a table.csv'"
+    assert typed_now() == {}
+
+
+@pytest.fixture
+def sent(tmp_path):
+    """A campaign that was sent: its robot's file stays where it was measured."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    there.mkdir()
+    here.mkdir()
+    (there / "own.urdf").write_text(urdf(load_arm("ur10e")), encoding="utf-8")
+    config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
+    robot = config.robot.model_copy(update={"model": "own.urdf"})
+    config = config.model_copy(update={"robot": robot})
+    with CampaignFile.create(there / "run.hilcal", config.to_json(), str(there), "made") as file:
+        file.append_readings(simulated().readings)
+    shutil.copy(there / "run.hilcal", here)
+    shutil.rmtree(there)
+    return here / "run.hilcal", config
+
+
+def test_a_campaign_that_was_sent_is_fitted_and_exported_without_the_robots_file(sent, capsys):
+    path, _ = sent
+    told = json.loads(ok(capsys, "identify", path, "--json").out)
+    found = {p["name"]: p["value"] for p in told["parameters"]}
+    fitted = simulated()
+    for e in fitted.parameters:
+        if e.name.startswith("joint_compliance") and e.value is not None:
+            assert found[e.name] == pytest.approx(e.value, rel=1e-3)
+    cell = path.parent / "out" / "cell.toml"
+    cell.parent.mkdir()
+    ok(capsys, "export", path, "--cell", cell)
+    with hc.Campaign.open(path) as run:
+        np.testing.assert_allclose(hc.Cell.load(cell).arm.links, run.cell.arm.links, atol=1e-12)
+
+
+def test_another_robots_file_beside_the_exported_cell_is_not_replaced(sent, capsys):
+    path, _ = sent
+    other, cell = path.parent / "own.urdf", path.parent / "cell.toml"
+    other.write_text("another", encoding="utf-8")
+    assert "own.urdf: another file is there" in refused(capsys, 2, "export", path, "--cell", cell)
+    assert other.read_text(encoding="utf-8") == "another"
+    ok(capsys, "export", path, "--cell", cell, "--force")
+    assert other.read_text(encoding="utf-8").startswith("<")
+
+
+def test_a_run_does_not_go_on_with_another_robot(sent, tmp_path):
+    path, config = sent
+    with CampaignFile.open(path, read_only=True) as campaign:
+        kept = campaign.about(ROBOT_FILE)
+        assert kept is not None
+        (tmp_path / "own.urdf").write_text(kept, encoding="utf-8")
+        check_same_cell(campaign, config, tmp_path)
+        (tmp_path / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
+        with pytest.raises(InputError, match=r"own\.urdf is not what it was when"):
+            check_same_cell(campaign, config, tmp_path)
+
+
+def test_a_campaign_reads_no_file_that_it_names(sent, tmp_path):
+    """The arm is the one that is kept, whatever stands at the path now."""
+    path, config = sent
+    with CampaignFile.open(path, read_only=True) as file:
+        kept, place = file.about(ROBOT_FILE), Path(file.base_dir)
+    place.mkdir()
+    (place / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
+    with hc.Campaign.open(path) as run:
+        assert run.cell.arm.name == "own"
+        np.testing.assert_allclose(run.cell.arm.links[2], load_arm("ur10e").links[2], atol=1e-9)
+    assert not np.allclose(
+        cell_from_config(config, place).arm.links, cell_from_config(config, None, kept).arm.links
+    )
+
+
+def test_a_calibration_has_the_robot_beside_the_cell_that_is_given(tmp_path):
+    """Neither one in the working directory, nor one where the campaign says that it was."""
+    there, moved, run = tmp_path / "there", tmp_path / "moved", tmp_path / "run.hilcal"
+    there.mkdir()
+    (there / "own.urdf").write_text(urdf(load_arm("ur10e")), encoding="utf-8")
+    example = (configs_dir() / "cells" / "demo_ur10e.toml").read_text(encoding="utf-8")
+    (there / "CELL.toml").write_text(example.replace('"ur10e"', '"own.urdf"'), encoding="utf-8")
+    begun = hc.Procedure.at(run, hc.Cell.load(there / "CELL.toml"))
+    begun.begin(Plan(("P1",), np.zeros((1, 6)), (Step("P1", "none", 0),)), begun.config)
+    with CampaignFile.open(run) as file:
+        assert file.about(ROBOT_FILE) == (there / "own.urdf").read_text(encoding="utf-8")
+    there.rename(moved)
+    there.mkdir()
+    (there / "own.urdf").write_text(urdf(load_arm("ur5e")), encoding="utf-8")
+    assert hc.Procedure.at(run, hc.Cell.load(moved / "CELL.toml")).next().kind == "measure"

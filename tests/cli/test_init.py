@@ -1,4 +1,4 @@
-"""`init`: a CELL.toml from questions at a terminal, or from options."""
+"""`init`: a CELL.toml from questions or options; `doctor`."""
 
 import re
 import tomllib
@@ -9,12 +9,10 @@ import tomli_w
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.reference import tables
-from hilcal.config.template import SHOWN
-from tests.support.cli_cases import ok, refused, run
+from hilcal.config.reference import SHOWN, tables
+from tests.support.cli_cases import CELL, ok, refused, run
 from tests.support.screen import AtTerminal
 
-Capsys = pytest.CaptureFixture[str]
 OPTIONS = (
     *("--robot", "ur10e", "--host", "192.168.56.101", "--tracker", "geocom"),
     *("--tracker-port", "/dev/ttyUSB0", "--force-sensor", "ft300"),
@@ -24,14 +22,13 @@ OPTIONS = (
 )
 
 
-def test_options_make_a_whole_cell(tmp_path: Path, capsys: Capsys) -> None:
+def test_options_make_a_whole_cell(tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     d = ok(capsys, "init", path, *OPTIONS, "--json").document
     c = load_config(path)
     assert d["config"]["robot"]["model"] == c.robot.model == "ur10e"
     assert (c.robot.driver, c.robot.host) == ("ur", "192.168.56.101")
     assert (c.tracker.driver, c.tracker.port) == ("geocom", "/dev/ttyUSB0")
-    assert c.force_sensor is not None
     assert (c.force_sensor.driver, c.force_sensor.port) == ("ft300", "simulated")
     assert (c.tool.target_m, c.tool.load_point_m) == ((0.06, 0.02, 0.12), (0.1, 0.0, 0.15))
     assert (c.tool.mass_kg, c.tool.com_m) == (0.8, (0.01, 0.0, 0.06))
@@ -39,15 +36,12 @@ def test_options_make_a_whole_cell(tmp_path: Path, capsys: Capsys) -> None:
         ("5kg", 5.0, (0.0, 0.0, 0.0)),
         ("pull x", 0.0, (80.0, 0.0, 0.0)),
     ]
-    assert c.limits.workspace_min_m is not None
     assert c.limits.workspace_min_m[2] == 0.05
     assert c.sight.tracker_m == (3.0, 0.5, 0.9)
 
 
 @pytest.mark.parametrize("options", [OPTIONS, ("--robot", "ur5e")], ids=["whole", "least"])
-def test_comments_and_examples_are_those_of_the_configuration(
-    options: tuple[str, ...], tmp_path: Path, capsys: Capsys
-) -> None:
+def test_comments_and_examples_are_those_of_the_configuration(options, tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     ok(capsys, "init", path, *options)
     text = path.read_text(encoding="utf-8")
@@ -61,13 +55,10 @@ def test_comments_and_examples_are_those_of_the_configuration(
 
 
 @pytest.mark.parametrize("options", [(), ("--tracker", "geocom"), ("--host", "127.0.0.1")])
-def test_what_a_cell_still_lacks_is_all_that_check_asks_for(
-    options: tuple[str, ...], tmp_path: Path, capsys: Capsys
-) -> None:
+def test_what_a_cell_still_lacks_is_all_that_check_asks_for(options, tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     said = " ".join(ok(capsys, "init", path, "--robot", "ur5e", *options).out.split())
     told = re.search(r", once it has (.*?):", said)
-    assert told is not None
     cell, answers = tomllib.loads(path.read_text("utf-8")), ("ur", "127.0.0.1", "geocom", "/no")
     keys = ("[robot] driver", "[robot] host", "[tracker] driver", "[tracker] port")
     for words, answer in zip(keys, answers, strict=True):
@@ -81,7 +72,7 @@ def test_what_a_cell_still_lacks_is_all_that_check_asks_for(
     assert run(capsys, "check", path).code == 3  # every device is asked; nobody answers
 
 
-def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     loaded = ("--robot", "ur10e", "--load", "5 kg")
     for options, readings, geometry in (
@@ -97,17 +88,15 @@ def test_what_is_fitted_is_stated_and_absolute_unless_asked(tmp_path: Path, caps
 
 
 @pytest.mark.parametrize(
-    "words",
-    ["60 mm, 20 mm, 120 mm", "60mm 20mm 120mm", "60, 20, 120 mm", "6 cm, 20 mm, 0.12 m"],
+    "words", ["60 mm, 20 mm, 120 mm", "60mm 20mm 120mm", "60, 20, 120 mm", "6 cm, 20 mm, 0.12 m"]
 )
-def test_units_are_read_as_people_write_them(words: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_units_are_read_as_people_write_them(words, tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     loads = ("--load", "pull x = 80 N, 0 N, 0 N", "--load", "500 g", "--tool-mass", "800 g")
     ok(capsys, "init", path, "--robot", "ur10e", "--target", words, "--floor", "50 mm", *loads)
     c = load_config(path)
     assert c.tool.target_m == (0.06, 0.02, 0.12)
     assert c.tool.mass_kg == 0.8
-    assert c.limits.workspace_min_m is not None
     assert c.limits.workspace_min_m[2] == 0.05
     assert [(x.mass_kg, x.force_N[0]) for x in c.loads] == [(0.0, 80.0), (0.5, 0.0)]
 
@@ -116,9 +105,7 @@ def test_units_are_read_as_people_write_them(words: str, tmp_path: Path, capsys:
 @pytest.mark.parametrize(
     ("options", "poses"), [(OPTIONS, 6), (("--robot", "ur5e"), 6)], ids=["whole", "least"]
 )
-def test_the_file_is_planned_without_an_edit(
-    options: tuple[str, ...], poses: int, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_the_file_is_planned_without_an_edit(options, poses, tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     ok(capsys, "init", path, *options)
     arguments = ("--poses", str(poses), "--quick", "--json")
@@ -128,7 +115,7 @@ def test_the_file_is_planned_without_an_edit(
 
 
 @pytest.mark.slow
-def test_the_steps_that_it_names(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_steps_that_it_names(tmp_path, capsys):
     path, plan, out = (tmp_path / n for n in ("CELL.toml", "plan.json", "rehearsal.hilcal"))
     said = " ".join(ok(capsys, "init", path, "--robot", "ur3").out.split())
     assert f"hilcal plan {path} -o plan.json" in said
@@ -140,7 +127,7 @@ def test_the_steps_that_it_names(tmp_path: Path, capsys: Capsys) -> None:
     assert "[robot] driver is missing" in run(capsys, "check", path, "--plan", plan).err
 
 
-def test_nothing_is_overwritten_unasked(tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_is_overwritten_unasked(tmp_path, capsys):
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")
     assert "the file exists" in refused(capsys, 2, "init", path, "--robot", "ur3")
@@ -170,15 +157,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_a_wrong_option_is_one_line_and_writes_nothing(
-    case: str, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_wrong_option_is_one_line_and_writes_nothing(case, tmp_path, capsys):
     options, said = WRONG[case]
     assert said in refused(capsys, 2, "init", tmp_path / "CELL.toml", *options)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> None:
+def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path):
     with AtTerminal("init", home=tmp_path) as t:
         for question, answer, reply in (
             ("Which arm?", "ur10f", 'did you mean "ur10"?'),
@@ -224,7 +209,7 @@ def test_a_person_is_asked_and_wrong_answers_are_explained(tmp_path: Path) -> No
 
 
 @pytest.mark.long
-def test_a_person_decides_whether_a_file_is_replaced(tmp_path: Path) -> None:
+def test_a_person_decides_whether_a_file_is_replaced(tmp_path):
     path = tmp_path / "CELL.toml"
     path.write_text("mine", encoding="utf-8")
     with AtTerminal("init", home=tmp_path) as t:
@@ -239,3 +224,34 @@ def test_a_person_decides_whether_a_file_is_replaced(tmp_path: Path) -> None:
         t.types("\x03")  # Ctrl-C: nothing is written
         assert t.ends() == 130
     assert path.read_text(encoding="utf-8") == "mine"
+
+
+def test_the_document_and_the_words_say_the_same(tmp_path, capsys):
+    d = ok(capsys, "doctor", "--folder", tmp_path, "--json").document
+    assert d["ok"] is True
+    names = {f["name"] for f in d["findings"]}
+    assert {"hilcal", "Python", "packages", "clock", "writing", "processors"} <= names
+    words = " ".join(ok(capsys, "doctor", CELL, "--folder", tmp_path).out.split())
+    assert "Nothing hinders a campaign" in words
+    assert "can be read" in words
+
+
+def test_what_hinders_a_campaign_is_named_and_ends_with_3(tmp_path, capsys):
+    cell = tmp_path / "cell.toml"
+    text = Path(CELL).read_text(encoding="utf-8")
+    port = tmp_path / "ttyUSB0"
+    text = text.replace('port = "simulated"', f'port = "{port}"')
+    assert str(port) in text
+    cell.write_text(text, encoding="utf-8")
+    result = run(capsys, "doctor", cell, "--folder", tmp_path, "--json")
+    assert result.code == 3
+    assert result.document["ok"] is False
+    (bad,) = [f for f in result.document["findings"] if f["state"] == "problem"]
+    assert (bad["name"], bad["topic"]) == ("force sensor", "serial ports")
+    assert str(port) in bad["said"]
+    assert "1 of " in result.err.splitlines()[-1]
+
+    cell.write_text("[robot]\nmodel = 3\n", encoding="utf-8")
+    result = run(capsys, "doctor", cell, "--folder", tmp_path)
+    assert result.code == 3
+    assert "mend the file" in result.out

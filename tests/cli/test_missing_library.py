@@ -7,7 +7,6 @@ from pathlib import Path
 
 import openpyxl
 import pytest
-import typer
 
 from hilcal import cli
 from hilcal.optional import EXTRAS, REQUIRED
@@ -28,9 +27,7 @@ BARE = {*EXTRAS, "rerun_bindings", *REQUIRED} - {"sklearn"}
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def without(
-    names: set[str], folder: Path, *words: object, code: str = COMMAND
-) -> subprocess.CompletedProcess[str]:
+def without(names, folder, *words, code=COMMAND):
     """Run a command, or other code, in a process in which some packages cannot be imported."""
     program = WITHOUT.format(names=sorted(names), code=code)
     return subprocess.run(
@@ -43,7 +40,7 @@ def without(
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """Folder with t.csv, and with run.hilcal as it was imported and fitted without the packages."""
     made = tmp_path_factory.mktemp("bare")
     table(made / "t.csv", "nothing", poses=12)
@@ -56,7 +53,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folder: Path) -> None:
+def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folder):
     ended = without(BARE, folder, "diagnose", "run.hilcal")
     assert ended.returncode == 0, ended.stderr
     assert "Verdict: " in ended.stdout
@@ -70,30 +67,24 @@ def test_a_table_is_fitted_and_diagnosed_without_arm_viewer_and_simulation(folde
     assert library.stdout.strip() == "adequate", library.stderr
 
 
-def also(package: str, words: tuple[object, ...]) -> object:
+def also(package, words):
     """Another package, found missing in the same way."""
     return pytest.param(package, words, marks=pytest.mark.long)
 
 
-@pytest.mark.parametrize(
-    ("package", "words"),
-    [
-        also("jinja2", ("report", "run.hilcal")),
-        ("plotly", ("report", "run.hilcal")),
-        also("rerun", ("view", "run.hilcal")),
-        also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
-        also("nicegui", ("workbench", "run.hilcal")),
-        also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
-        also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
-        also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
-        also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
-        also("geocompy", ("config", "tracker")),
-        also("serial", ("doctor",)),
-    ],
-)
-def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
-    package: str, words: tuple[str, ...], folder: Path
-) -> None:
+@pytest.mark.parametrize(("package", "words"), [
+    also("jinja2", ("report", "run.hilcal")),
+    ("plotly", ("report", "run.hilcal")),
+    also("rerun", ("view", "run.hilcal")),
+    also("rerun", ("refine", "run.hilcal", "--record", "run.rrd")),
+    also("nicegui", ("workbench", "run.hilcal")),
+    also("distributed", ("bootstrap", "run.hilcal", "--scheduler", "tcp://127.0.0.1:9")),
+    also("openpyxl", ("import", "t.xlsx", "--config", CELL, "-o", "other.hilcal")),
+    also("pyarrow", ("export", "run.hilcal", "--readings", "t.parquet")),
+    also("pinocchio", ("plan", CELL, "-o", "plan.json", "--poses", "3")),
+    also("geocompy", ("config", "tracker")),
+    also("serial", ("doctor",))])  # fmt: skip
+def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(package, words, folder):
     if package == "openpyxl":
         openpyxl.Workbook().save(folder / "t.xlsx")
     ended = without({package}, folder, *words)
@@ -105,7 +96,7 @@ def test_a_command_names_what_it_lacks_and_the_line_that_installs_it(
 
 
 @pytest.mark.long
-def test_the_library_names_what_it_lacks(folder: Path) -> None:
+def test_the_library_names_what_it_lacks(folder):
     code = (
         "import hilcal as hc\n"
         "with hc.Campaign.open('run.hilcal') as run:\n"
@@ -120,7 +111,7 @@ def test_the_library_names_what_it_lacks(folder: Path) -> None:
     assert said.stdout.splitlines() == [f"pages: {line}"] * 2, said.stderr
 
 
-def test_every_optional_package_is_named() -> None:
+def test_every_optional_package_is_named():
     """What an extra for users brings has its line, and nothing else has."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
@@ -138,12 +129,10 @@ def test_every_optional_package_is_named() -> None:
     assert all(name in required for name in REQUIRED.values())
 
 
-def test_a_missing_system_library_is_named(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_system_library_is_named(monkeypatch, capsys):
     """Pinocchio needs the run-time library of OpenMP, which a minimal Debian lacks."""
 
-    def load(_: str) -> typer.Typer:
+    def load(_):
         raise ImportError("libgomp.so.1: cannot open shared object file: No such file or directory")
 
     monkeypatch.setattr(cli, "load", load)

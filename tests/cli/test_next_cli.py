@@ -1,12 +1,19 @@
-"""`hilcal next` and `hilcal demo --ambiguous`: what they say, write and refuse."""
+"""`next`, a further plan in the same campaign, and `demo --ambiguous`."""
 
+import os
 import re
+import shlex
+import subprocess
+import sys
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 
 from hilcal.cli import demo
-from hilcal.cli.rehearsing import RehearsalSettings
+from hilcal.cli.running import RehearsalSettings
 from hilcal.config import load_config
 from hilcal.diagnosis.diagnosis import History
 from hilcal.diagnosis.doubt import in_doubt
@@ -15,22 +22,26 @@ from hilcal.diagnosis.verdict import judge
 from hilcal.drivers.simulated.injected_effects import HARD_TO_SEPARATE
 from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
 from hilcal.effects.catalogue import installed
+from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import load_plan
+from hilcal.store.plan import REFERENCE, Plan, Step, joined, load_plan, with_new_names
+from hilcal.store.run_log import RunLog
+from hilcal.workbench.session import WorkbenchSession
+from tests.cli.test_until_goal import site
 from tests.support.campaigns import configuration
 from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.next_cases import SMALL, doubtful
-from tests.unit.design.test_next import fine_error
+from tests.unit.data.test_run_log import MADE, STEPS, _campaign, _reading
+from tests.unit.design.test_many_poses import fine_error
 
-Capsys = pytest.CaptureFixture[str]
 TILT, LINK, BASE = "joint_tilt_compliance", "link_compliance", "base_compliance"
 CELLS = str(configs_dir() / "cells")
 
 
-def stored(path: Path, effect: str, seed: int) -> Path:
+def stored(path, effect, seed):
     """Write a small campaign, as `hilcal import` would."""
     with CampaignFile.create(path, SMALL.to_json(), CELLS, "a test", overwrite=True) as campaign:
         campaign.append_readings(doubtful(effect, seed).rehearsal.readings)
@@ -38,12 +49,12 @@ def stored(path: Path, effect: str, seed: int) -> Path:
 
 
 @pytest.fixture
-def ambiguous(tmp_path: Path) -> Path:
+def ambiguous(tmp_path):
     assert doubtful(BASE, 2).suspects == (BASE, TILT)
     return stored(tmp_path / "run.hilcal", BASE, 2)
 
 
-def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_next_in_json_and_in_words(ambiguous, tmp_path, capsys):
     ok(capsys, "identify", ambiguous)
     plan, table = tmp_path / "next.json", tmp_path / "next.csv"
     arguments = ("--quick", "--poses", "8", "--csv", table, "--json")
@@ -78,9 +89,7 @@ def test_next_in_json_and_in_words(ambiguous: Path, tmp_path: Path, capsys: Caps
 
 
 @pytest.mark.slow
-def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(ambiguous, tmp_path, capsys):
     old, plan = tmp_path / "old.hilcal", tmp_path / "next.json"
     ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 12), "--config", CELL, "-o", old)
     ok(capsys, "identify", old)
@@ -94,9 +103,7 @@ def test_a_prior_makes_the_powers_of_now_larger_and_is_not_stored(
     assert ok(capsys, "info", ambiguous, "--json").document["revisions"][-1]["revision"] == 1
 
 
-def test_a_revision_with_a_prior_takes_no_other(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_revision_with_a_prior_takes_no_other(ambiguous, tmp_path, capsys):
     old = tmp_path / "old.hilcal"
     ok(capsys, "import", table(tmp_path / "a.csv", "nothing", 3, 8), "--config", CELL, "-o", old)
     ok(capsys, "identify", old)
@@ -106,9 +113,7 @@ def test_a_revision_with_a_prior_takes_no_other(
 
 
 @pytest.mark.long
-def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
-    ambiguous: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(ambiguous, tmp_path, capsys):
     """`refine` has added the leading suspect: the newest model is adequate, and may be wrong."""
     refined = ok(capsys, "refine", ambiguous, "--json").document
     assert refined["verdict"] == "ambiguous"
@@ -120,7 +125,7 @@ def test_an_effect_that_was_added_in_doubt_is_in_doubt_still(
 
 
 @pytest.mark.long
-def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path, capsys):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, configuration().to_json(), CELLS, "a test") as campaign:
         campaign.append_readings(fine_error()[1])
@@ -137,9 +142,7 @@ def test_a_misfit_of_the_pose_alone_asks_for_new_poses(tmp_path: Path, capsys: C
 
 
 @pytest.mark.long
-def test_four_suspects_fit_one_screen(
-    tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_four_suspects_fit_one_screen(tmp_path, capsys, monkeypatch):
     """By default the pair of each suspect that is separated least; all under --details."""
     stored(tmp_path / "run.hilcal", TILT, 1)
     monkeypatch.chdir(tmp_path)  # names of files are short, as people have them
@@ -158,7 +161,7 @@ def test_four_suspects_fit_one_screen(
 
 
 @pytest.mark.long
-def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> None:
+def test_named_suspects_need_no_diagnosis(tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     arguments = ("--suspects", f"{TILT},load_point", "--quick", "--poses", "3", "--json")
     d = ok(capsys, "next", path, "-o", tmp_path / "n.json", *arguments).document
@@ -167,7 +170,7 @@ def test_named_suspects_need_no_diagnosis(tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_in_doubt_is_said_so(tmp_path, capsys):
     plan = tmp_path / "next.json"
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     line = refused_after(capsys, "next", path, "-o", plan)
@@ -180,13 +183,13 @@ def test_nothing_in_doubt_is_said_so(tmp_path: Path, capsys: Capsys) -> None:
     assert not plan.exists()
 
 
-def refused_after(capsys: Capsys, *arguments: str | Path) -> str:
+def refused_after(capsys, *arguments):
     """The line of a refusal with exit 4, of a campaign that has its baseline."""
     ok(capsys, "identify", arguments[1])
     return refused(capsys, 4, *arguments)
 
 
-def test_pairs_that_nothing_separates_are_refused(tmp_path: Path, capsys: Capsys) -> None:
+def test_pairs_that_nothing_separates_are_refused(tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     ok(capsys, "identify", path)
     suspects = ("--suspects", "tracker_scale,hysteresis")
@@ -194,21 +197,15 @@ def test_pairs_that_nothing_separates_are_refused(tmp_path: Path, capsys: Capsys
     assert "no measurement separates them" in line
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--suspects", "gremlins,hysteresis"), ("gremlins", "valid")),
-        (("--suspects", "hysteresis"), ("--suspects", "2 to 4")),
-        (("--suspects", "hysteresis,hysteresis"), ("--suspects", "twice")),
-        (("--poses", "0"), ("--poses", "from 1")),
-        (("--seed", "-1"), ("--seed",)),
-        (("--record", "no/where.rrd"), ("no folder",)),
-        (("--cell", "nothing.toml"), ("nothing.toml",)),
-    ],
-)
-def test_wrong_options(
-    arguments: tuple[str, ...], words: tuple[str, ...], tmp_path: Path, capsys: Capsys
-) -> None:
+@pytest.mark.parametrize(("arguments", "words"), [
+    (("--suspects", "gremlins,hysteresis"), ("gremlins", "valid")),
+    (("--suspects", "hysteresis"), ("--suspects", "2 to 4")),
+    (("--suspects", "hysteresis,hysteresis"), ("--suspects", "twice")),
+    (("--poses", "0"), ("--poses", "from 1")),
+    (("--seed", "-1"), ("--seed",)),
+    (("--record", "no/where.rrd"), ("no folder",)),
+    (("--cell", "nothing.toml"), ("nothing.toml",))])  # fmt: skip
+def test_wrong_options(arguments, words, tmp_path, capsys):
     path = stored(tmp_path / "run.hilcal", "nothing", 1)
     line = refused(capsys, 2, "next", path, "-o", tmp_path / "n.json", *arguments)
     assert all(word in line for word in words)
@@ -218,7 +215,7 @@ def test_wrong_options(
 
 
 @pytest.mark.slow
-def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_demo_settles_a_doubt(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     arguments = ("demo", "--without-devices", "--ambiguous", "--hide", LINK, "--seed", "2")
     result = ok(capsys, *arguments, "-o", path, "--json")
@@ -236,24 +233,23 @@ def test_the_demo_settles_a_doubt(tmp_path: Path, capsys: Capsys) -> None:
     assert records[0].data_hash != records[1].data_hash
     assert d["doubt"]["verdict"] == records[0].result_json["diagnose"]["verdict"]
     told = re.search(r"(\d+) readings were added. All (\d+)", result.err)
-    assert told is not None
     assert 0 < int(told[1]) < int(told[2]) == len(readings)
     viewed = ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json").document
     assert viewed["revisions"] == [2, 3]
 
 
 @pytest.mark.slow
-def test_a_demo_without_devices_can_be_viewed(tmp_path: Path, capsys: Capsys) -> None:
+def test_a_demo_without_devices_can_be_viewed(tmp_path, capsys):
     path = tmp_path / "demo.hilcal"
     ok(capsys, "demo", "--without-devices", "--hide", "nothing", "--poses", "6", "-o", path)
     ok(capsys, "view", path, "--record", tmp_path / "demo.rrd", "--json")
 
 
-def rehearsal_of(seed: int, path: Path) -> RehearsalSettings:
+def rehearsal_of(seed, path):
     return RehearsalSettings(load_config(CELL), "random", seed, path, CELL.parent, installed())
 
 
-def in_doubt_at_first(seed: int, path: Path) -> bool:
+def in_doubt_at_first(seed, path):
     """Whether the first readings of an ambiguous demo, which the seed determines, leave a doubt."""
     case, plan, doubtful = demo.doubtful_case(rehearsal_of(seed, path), None, print)
     assert doubtful
@@ -265,21 +261,209 @@ def in_doubt_at_first(seed: int, path: Path) -> bool:
 
 
 @pytest.mark.long
-def test_an_ambiguous_demo_is_in_doubt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_ambiguous_demo_is_in_doubt(tmp_path, monkeypatch):
     monkeypatch.setattr(demo, "DRAWS", 2)
     assert in_doubt_at_first(2, tmp_path / "x")
 
 
 @pytest.mark.slow
-def test_every_ambiguous_demo_is_in_doubt(tmp_path: Path) -> None:
+def test_every_ambiguous_demo_is_in_doubt(tmp_path):
     assert all(in_doubt_at_first(seed, tmp_path / "x") for seed in range(10))
 
 
 @pytest.mark.long
-def test_a_case_without_a_doubt_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_case_without_a_doubt_is_told(tmp_path, monkeypatch):
     """An effect that everything separates is hidden all the same, if that is asked for."""
     monkeypatch.setattr(demo, "TRIES", 2)
     monkeypatch.setattr(demo, "_resembled", lambda r, case: False)
     case, _, doubtful = demo.doubtful_case(rehearsal_of(0, tmp_path / "x"), "creep", print)
     assert case.choice == "creep"
     assert not doubtful
+
+
+__all__ = ["site"]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def made(*names, shift=0.0):
+    """Every pose unloaded and under a load; poses of one name are those of `MADE` if not moved."""
+    q = np.array([np.arange(6.0) / 10 + int(n[-1]) if n[-1].isdigit() else np.zeros(6)
+                  for n in names])  # fmt: skip
+    steps = tuple(Step(name, load) for load in ("none", "5kg") for name in names)
+    return Plan(names, q + shift, steps)
+
+
+# names and cycles
+
+
+def test_new_poses_get_names_of_their_own():
+    before, further = made(REFERENCE, "p1", "p2"), made(REFERENCE, "p1", "p3", shift=0.2)
+    out = with_new_names(further, before, 2)
+    assert out.pose_names == (REFERENCE, "p1-2", "p3")
+    assert np.array_equal(out.joints(REFERENCE), before.joints(REFERENCE))
+    assert np.array_equal(out.joints("p1-2"), further.joints("p1"))
+    assert [(s.pose, s.load, s.cycle) for s in out.steps] == [
+        (REFERENCE, "none", 1), ("p1-2", "none", 0), ("p3", "none", 0),
+        (REFERENCE, "5kg", 1), ("p1-2", "5kg", 0), ("p3", "5kg", 0),
+    ]  # fmt: skip
+    third = with_new_names(further, joined(before, frozenset(before.steps), out), 3)
+    assert third.pose_names == (REFERENCE, "p1-3", "p3")
+    assert {s.cycle for s in third.steps if s.pose == "p3"} == {1}
+    assert {s.cycle for s in third.steps if s.pose == REFERENCE} == {2}
+
+
+def test_the_same_poses_again_are_new_cycles_with_references_of_their_own():
+    plan = made(REFERENCE, "p1")
+    again = with_new_names(plan, plan, 2)
+    assert again.pose_names == plan.pose_names
+    assert {s.cycle for s in again.steps} == {1}
+    assert not set(again.steps) & set(plan.steps)
+    loaded = {(s.pose, s.cycle) for s in again.steps if s.load != "none"}
+    assert loaded <= {(s.pose, s.cycle) for s in again.steps if s.load == "none"}
+
+
+def test_a_name_that_was_made_up_is_not_taken_twice():
+    before = made("p1", "p1-2")
+    further = made("p1", shift=0.1)
+    assert with_new_names(further, before, 2).pose_names == ("p1-2-2",)
+
+
+@pytest.mark.parametrize(("plan", "words"), [
+    (made("p1"), 'only the campaign has a pose "reference"'),
+    (Plan((REFERENCE,), np.zeros((1, 7)), (Step(REFERENCE, "none"),)), "7 joint angles"),
+])  # fmt: skip
+def test_what_does_not_go_together(plan, words):
+    with pytest.raises(InputError, match=words):
+        with_new_names(plan, made(REFERENCE, "p1"), 2)
+
+
+# the file
+
+
+def test_what_was_not_measured_before_is_given_up(tmp_path):
+    path = tmp_path / "run.hilcal"
+    further = made("p1", "p7", shift=0.3)
+    with _campaign(path) as campaign:
+        log = RunLog(campaign)
+        for step in STEPS[:3]:
+            log.record(_reading(step), step, {})
+        assert log.plan.steps == MADE.steps
+        fitted = log.with_new_names(further)
+        log.append(fitted)
+        assert log.plan.steps == (*STEPS[:3], *fitted.steps)
+        with pytest.raises(InputError, match="in the campaign already, and 4 of its 4 readings"):
+            log.with_new_names(further)
+    with CampaignFile.open(path) as campaign:
+        log = RunLog(campaign)
+        assert [len(p.steps) for p in log.plans] == [6, 4]
+        assert log.plan.steps == (*STEPS[:3], *fitted.steps)
+        assert log.plan.without(log.done()).steps == fitted.steps
+        assert log.plan.pose_names == ("p1-2", "p7", "p1", "p2")
+
+
+_KILLED = """
+import os, sys
+from pathlib import Path
+from tests.cli.test_next_cli import made
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.run_log import RunLog
+with CampaignFile.open(Path(sys.argv[1])) as campaign:
+    log = RunLog(campaign)
+    log.append(log.with_new_names(made("p8", "p9")))
+    os._exit(9)
+"""
+
+
+@pytest.mark.long
+def test_an_appended_plan_survives_a_kill(tmp_path):
+    path = tmp_path / "run.hilcal"
+    _campaign(path).close()
+    search = str(ROOT)
+    child = subprocess.run(
+        [sys.executable, "-c", _KILLED, path],
+        env={**os.environ, "PYTHONPATH": search},
+        timeout=60,
+        check=False,
+    )
+    assert child.returncode == 9
+    with CampaignFile.open(path) as campaign:
+        assert RunLog(campaign).plans[1].pose_names == ("p8", "p9")
+
+
+# the command
+
+
+def further_plan(site):
+    """Half of the site's poses, a little elsewhere, at another reference."""
+    plan = site.plan
+    q = plan.q + 0.02
+    names = plan.pose_names[:5]
+    steps = tuple(s for s in plan.steps if s.pose in names)
+    path = site.directory / "next.json"
+    path.write_text(Plan(names, q[:5], steps).to_json(), encoding="utf-8")
+    return path
+
+
+@pytest.mark.long
+def test_a_further_plan_is_measured_into_the_campaign(site, capsys):
+    path, first = site.directory / "run.hilcal", len(site.plan.steps)
+    ok(capsys, *site.command(*site.fresh))
+    site.bench.world.again()
+    further = further_plan(site)
+    d = ok(capsys, *site.command("--append", "--plan", str(further), "--json")).document
+    added = d["readings"] - first
+    assert (added, d["planned"]) == (15, d["readings"])
+    with CampaignFile.open(path) as campaign:
+        readings, events = campaign.readings(), RunLog(campaign).events()
+    old, new = readings[slice(0, first)], readings[slice(first, None)]
+    names = readings.pose_names
+    assert {names[p] for p in new.pose} == {
+        REFERENCE, *(f"{n}-2" for n in site.plan.pose_names[1:5])
+    }  # fmt: skip
+    keys = [{(p, c) for p, c in zip(r.pose, r.cycle, strict=True)} for r in (old, new)]
+    assert not keys[0] & keys[1]
+    assert keys[1] == {(p, c) for p, c in zip(new.pose[new.unloaded], new.cycle[new.unloaded],
+                                               strict=True)}  # fmt: skip
+    assert readings.states.time is not None
+    assert (np.diff(readings.states.time) > 0).all()  # time goes on
+    assert [e["kind"] for e in events].count("start") == 2
+    fitted = ok(capsys, "identify", path, "--json").document
+    assert fitted["n_readings"] == len(readings)
+    again = ok(capsys, *site.command("--resume", "--json")).document  # nothing is missing
+    assert again["readings"] == len(readings)
+
+
+@pytest.mark.long
+def test_the_line_that_next_prints(site, capsys):
+    """As `next` and the workbench print it; the cell that they do not know is CELL.toml there."""
+    ok(capsys, *site.command(*site.fresh))
+    site.bench.world.again()
+    path, further = site.directory / "run.hilcal", further_plan(site)
+    planned: Any = SimpleNamespace(path=path, planned=(None, further))
+    line = WorkbenchSession.run_line(planned)
+    named = line.replace("CELL.toml", str(site.directory / "cell.toml"))
+    assert ok(capsys, *shlex.split(named)[1:]).code == 0
+
+
+@pytest.mark.long
+def test_an_append_that_was_stopped_is_resumed(site, capsys):
+    ok(capsys, *site.command(*site.fresh))
+    site.bench.world.again()
+    further = str(further_plan(site))
+    with CampaignFile.open(site.directory / "run.hilcal") as campaign:  # stopped before it moved
+        log = RunLog(campaign)
+        log.append(log.with_new_names(load_plan(Path(further))))
+    line = refused(capsys, 2, *site.command("--append", "--plan", further))
+    assert "go on with --resume" in line
+    d = ok(capsys, *site.command("--resume", "--json")).document
+    assert d["readings"] == d["planned"] == len(site.plan.steps) + 15
+
+
+def test_wrong_ways_to_append(site, capsys):
+    further = str(further_plan(site))
+    line = refused(capsys, 2, *site.command("--append", "--plan", further))
+    assert "no such campaign file" in line
+    ok(capsys, *site.command(*site.fresh))
+    assert "--plan" in refused(capsys, 2, *site.command("--append"))
+    assert "give one" in refused(capsys, 2, *site.command("--append", "--resume"))
+    assert "--append" in refused(capsys, 2, *site.command("--plan", further))

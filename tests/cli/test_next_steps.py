@@ -9,9 +9,7 @@ import html
 import json
 import re
 import shlex
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -19,14 +17,12 @@ import hilcal as hc
 from hilcal.cli.commands import COMMANDS
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.cli_cases import CELL, Outcome, ok, refused, table
+from tests.support.cli_cases import CELL, ok, refused, table
 from tests.support.cli_cases import run as command
 from tests.support.paths import ROOT
 
-Capsys = pytest.CaptureFixture[str]
 
-
-def follow(capsys: Capsys, said: str, step: str, **places: str | Path) -> Outcome:
+def follow(capsys, said, step, **places):
     """Take a step that a message names; its words in capitals stand for places."""
     assert step in " ".join(said.split()), said
     chosen = [str(places.get(word, word)) for word in shlex.split(step)]
@@ -34,7 +30,7 @@ def follow(capsys: Capsys, said: str, step: str, **places: str | Path) -> Outcom
     return ok(capsys, *chosen[1:])
 
 
-def imported(capsys: Capsys, path: Path, hidden: str = "hysteresis", seed: int = 1) -> Path:
+def imported(capsys, path, hidden="hysteresis", seed=1):
     """A campaign without revisions, the name of which must be quoted."""
     ok(
         capsys,
@@ -49,12 +45,12 @@ def imported(capsys: Capsys, path: Path, hidden: str = "hysteresis", seed: int =
 
 
 @pytest.fixture
-def run(tmp_path: Path, capsys: Capsys) -> Path:
+def run(tmp_path, capsys):
     return imported(capsys, tmp_path / "a run.hilcal")
 
 
 @pytest.mark.long
-def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_without_a_revision(run, tmp_path, capsys):
     out, later = tmp_path / "p.json", imported(capsys, tmp_path / "later.hilcal", seed=2)
     for arguments in (
         ("accept", run),
@@ -73,7 +69,7 @@ def test_without_a_revision(run: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert "no revision" not in ok(capsys, "compare", run, later).err
 
 
-def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
+def test_readings_were_appended(run, capsys):
     ok(capsys, "identify", run)
     ok(capsys, "accept", run)
     with hc.Campaign.open(run) as opened:
@@ -88,7 +84,7 @@ def test_readings_were_appended(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Capsys) -> None:
+def test_another_scaling_or_parameters_of_another_version(run, capsys):
     ok(capsys, "identify", run, "--scaling", "gu")
     said = refused(capsys, 2, "diagnose", run)
     follow(capsys, f"{said} hilcal identify RUN", "hilcal identify RUN", RUN=run)
@@ -104,7 +100,7 @@ def test_another_scaling_or_parameters_of_another_version(run: Path, capsys: Cap
 
 
 @pytest.mark.long
-def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_an_effect_of_ones_own(run, tmp_path, capsys):
     empty, path = tmp_path / "empty.py", tmp_path / "my effect.py"
     empty.write_text("")
     said = refused(capsys, 2, "effects", "--effects-from", empty)
@@ -120,7 +116,7 @@ def test_an_effect_of_ones_own(run: Path, tmp_path: Path, capsys: Capsys) -> Non
     ok(capsys, "diagnose", run, "--effects-from", path)
 
 
-def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_deflections_lack_the_unloaded_arm(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--readings", "deflection")
     said = refused(capsys, 4, "export", run, "--urdf", tmp_path / "arm.urdf")
     follow(capsys, said, "hilcal identify RUN --readings absolute", RUN=run)
@@ -128,7 +124,7 @@ def test_deflections_lack_the_unloaded_arm(run: Path, tmp_path: Path, capsys: Ca
 
 
 @pytest.mark.long
-def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_nothing_to_carry_over(run, tmp_path, capsys):
     table(csv := tmp_path / "later.csv", "hysteresis", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
     ok(capsys, "identify", run, "--readings", "absolute", "--effects", "base_frame")
@@ -142,7 +138,7 @@ def test_nothing_to_carry_over(run: Path, tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_diagnosis_says(run, tmp_path, capsys):
     ok(capsys, "add", run, "hysteresis")
     ok(capsys, "add", run, "tool_compliance")
     said = ok(capsys, "diagnose", run).out
@@ -151,7 +147,7 @@ def test_what_a_diagnosis_says(run: Path, tmp_path: Path, capsys: Capsys) -> Non
 
 
 @pytest.mark.long
-def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
+def test_what_next_says(tmp_path, capsys):
     cell, plan = tmp_path / "cell.toml", tmp_path / "PLAN.json"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
     run = imported(capsys, tmp_path / "run.hilcal", "nothing")
@@ -166,7 +162,7 @@ def test_what_next_says(tmp_path: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_comparison_says(run, tmp_path, capsys):
     table(csv := tmp_path / "later.csv", "creep", 1, 9)
     ok(capsys, "import", csv, "--config", CELL, "-o", later := tmp_path / "later.hilcal")
     ok(capsys, "identify", run)
@@ -176,7 +172,7 @@ def test_what_a_comparison_says(run: Path, tmp_path: Path, capsys: Capsys) -> No
     follow(capsys, said, "hilcal compare EARLIER LATER", EARLIER=run, LATER=later)
 
 
-def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_files_that_are_not_there_yet(run, tmp_path, capsys):
     assert "make one with: hilcal plan" in refused(
         capsys, 2, "check", CELL, "--plan", tmp_path / "plan.json"
     )
@@ -202,9 +198,7 @@ def test_files_that_are_not_there_yet(run: Path, tmp_path: Path, capsys: Capsys)
 
 
 @pytest.mark.long
-def test_what_a_report_names(
-    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_a_report_names(run, tmp_path, capsys, monkeypatch):
     page = tmp_path / "page.html"
     ok(capsys, "report", run, "-o", page)
     assert "hilcal refine finds the effects that are missing" in page.read_text()
@@ -220,15 +214,13 @@ def test_what_a_report_names(
     ok(capsys, "accept", run, "1")
 
 
-def test_a_campaign_that_calibrate_did_not_make(run: Path, capsys: Capsys) -> None:
+def test_a_campaign_that_calibrate_did_not_make(run, capsys):
     said = refused(capsys, 2, "calibrate", CELL, "-o", run)
     follow(capsys, said, f"hilcal info '{run}'")
 
 
 @pytest.mark.long
-def test_another_arm_is_calibrated_by_itself(
-    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_another_arm_is_calibrated_by_itself(run, tmp_path, capsys, monkeypatch):
     later = imported(capsys, tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
     monkeypatch.setattr(Comparison, "another_arm", True)
@@ -239,7 +231,7 @@ HERE, RARE = "tests/cli/test_next_steps.py::test_", "tests/cli/test_rare_next_st
 PAGE, CALIBRATE = "tests/cli/test_workbench_page.py::test_", "tests/cli/test_calibrate.py::test_"
 DISCOVER, IMPORT = "tests/cli/test_discover.py::test_", "tests/cli/test_import_tables.py::test_"
 KINEMATICS = (
-    "tests/wire/test_network_cell.py"
+    "tests/wire/test_polyscope_x_cell.py"
     "::test_the_controllers_kinematics_are_checked_written_stored_and_judged"
 )
 TAKEN: dict[str, dict[str, str]] = {
@@ -250,106 +242,74 @@ TAKEN: dict[str, dict[str, str]] = {
         "--preview -o M.toml": "tests/unit/calibration/test_points.py"
         "::test_poses_without_joint_values_by_a_mapping"
     },
-    "campaign/campaign": {
-        "is used: hilcal accept {} --release": f"{HERE}readings_were_appended",
+    "campaign/campaign": {"is used: hilcal accept {} --release": f"{HERE}readings_were_appended",
         "use it first: hilcal accept": f"{RARE}a_revision_in_a_cell_that_was_changed",
         "needs gc: run hilcal identify": f"{HERE}another_scaling_or_parameters_of_another_version",
-        "no revision yet; run hilcal identify or refine": f"{HERE}without_a_revision",
-    },
-    "campaign/revisions": {
-        "before readings were appended": f"{HERE}readings_were_appended",
+        "no revision yet; run hilcal identify or refine": f"{HERE}without_a_revision"},
+    "campaign/revisions": {"before readings were appended": f"{HERE}readings_were_appended",
         "targets, the cell has": f"{RARE}a_revision_of_other_targets",
         "other parameters": f"{HERE}another_scaling_or_parameters_of_another_version",
-        "fit again: hilcal identify or refine": f"{HERE}an_effect_of_ones_own",
-    },
-    "cli/campaigns": {
-        "hilcal identify {}": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again",
+        "fit again: hilcal identify or refine": f"{HERE}an_effect_of_ones_own"},
+    "cli/campaigns": {"hilcal identify {}": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again",
         "take it back with: hilcal accept": f"{RARE}what_accept_says",
-        "make one with hilcal identify or refine": f"{HERE}without_a_revision",
-    },
+        "make one with hilcal identify or refine": f"{HERE}without_a_revision"},
     "cli/comparing": {"hilcal refine makes a model": f"{HERE}without_a_revision"},
-    "cli/demo": {
-        "hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
-        "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words",
-    },
-    "cli/discovering": {
+    "cli/demo": {"hilcal view": "tests/cli/test_demo.py::test_the_demo_in_words",
+        "hilcal report": "tests/cli/test_demo.py::test_the_demo_in_words"},
+    "cli/refining": {
         "hilcal add": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal diagnose": f"{DISCOVER}a_law_is_found_written_added_and_the_model_is_adequate",
         "hilcal next": f"{DISCOVER}a_law_is_written_as_an_effect_and_told",
     },
-    "cli/doctor": {"hilcal config explains": f"{HERE}files_that_are_not_there_yet"},
-    "cli/exporting": {
-        "hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
-        "run hilcal identify first": f"{HERE}without_a_revision",
-    },
-    "cli/fits": {"hilcal identify keeps it": f"{HERE}without_a_revision"},
-    "cli/fitting": {
-        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"
-    },
-    "cli/init": {"hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
+    "cli/exporting": {"hilcal compensate has it": f"{RARE}what_a_file_for_others_lacks",
+        "run hilcal identify first": f"{HERE}without_a_revision"},
+    "cli/fitting": {"hilcal identify keeps it": f"{HERE}without_a_revision",
+        "hilcal identify --fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"},
+    "cli/preparing": {"hilcal config explains": f"{HERE}files_that_are_not_there_yet",
+        "hilcal plan {}": "tests/cli/test_init.py::test_the_steps_that_it_names"},
     "cli/looking_up": {"hilcal diagnose RUN.hilcal": f"{HERE}an_effect_of_ones_own"},
     "cli/planning": {
-        "hilcal run {}": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+        "hilcal run {}": "tests/cli/test_next_cli.py::test_the_line_that_next_prints"
     },
-    "cli/running": {
-        "Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
-        "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until",
-    },
+    "cli/running": {"Go on with: hilcal refine": "tests/cli/test_until_goal.py::test_run_until",
+        "hilcal plan {} -o more.json": "tests/cli/test_until_goal.py::test_run_until"},
     "cli/showing": {"hilcal workbench": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
-    "config/cell": {
-        "check CELL.toml --save-calibration": KINEMATICS,
-    },
-    "config/template": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
+    "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
+    "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
     "identification/earlier_fit": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
     },
     "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
     "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
-    "measuring/connect": {"check CELL.toml --save-calibration": KINEMATICS},
-    "measuring/route": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
-    "present/campaign": {
-        "hilcal accept RUN N": f"{HERE}what_a_report_names",
-        "None yet: hilcal identify": f"{HERE}without_a_revision",
-    },
-    "present/comparison": {
-        "hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
+    "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
+    "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
+    "present/campaign": {"hilcal accept RUN N": f"{HERE}what_a_report_names",
+        "None yet: hilcal identify": f"{HERE}without_a_revision"},
+    "present/comparison": {"hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
         "hilcal refine {} --prior": f"{HERE}what_a_comparison_says",
-        "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks",
-    },
-    "present/diagnosis": {
-        "remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
+        "hilcal refine EARLIER": f"{RARE}an_effect_that_an_earlier_model_lacks"},
+    "present/diagnosis": {"remove it, hilcal remove": f"{RARE}an_addition_that_breaks_its_promise",
         "to remove {}: hilcal remove": f"{HERE}what_a_diagnosis_says",
         "hilcal effects new NAME": f"{HERE}an_effect_of_ones_own",
-        "its own: hilcal add RUN": f"{RARE}joints_that_differ",
-    },
+        "its own: hilcal add RUN": f"{RARE}joints_that_differ"},
     "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
     "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
-    "present/html/certificate": {
-        "report --limit": f"{RARE}the_page_says_how_to_be_judged",
-        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged",
-    },
+    "present/html/certificate": {"report --limit": f"{RARE}the_page_says_how_to_be_judged",
+        "--scaling gc": f"{RARE}the_page_says_how_to_be_judged"},
     "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
-    "present/html/sections": {
-        "hilcal report --appendix": f"{HERE}what_a_report_names",
-        "hilcal refine finds": f"{HERE}what_a_report_names",
-    },
-    "present/preparing": {
-        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
-        "hilcal init writes a file.": f"{RARE}sections_of_a_cell",
-    },
-    "present/story": {
-        "run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
-        "run hilcal identify first": f"{RARE}what_a_recording_names",
-    },
+    "present/html/sections": {"hilcal report --appendix": f"{HERE}what_a_report_names",
+        "hilcal refine finds": f"{HERE}what_a_report_names"},
+    "present/preparing": {"(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
+        "hilcal init writes a file.": f"{RARE}sections_of_a_cell"},
+    "present/story": {"run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
+        "run hilcal identify first": f"{RARE}what_a_recording_names"},
     "present/verdict": {
         "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
-    "present/viewer/live_scene": {
-        "`hilcal refine` does": f"{RARE}what_a_recording_names",
-        "hilcal refine says what": f"{RARE}what_a_recording_names",
-    },
+    "present/viewer/live_scene": {"`hilcal refine` does": f"{RARE}what_a_recording_names",
+        "hilcal refine says what": f"{RARE}what_a_recording_names"},
     "procedure/state": {"hilcal info": f"{HERE}a_campaign_that_calibrate_did_not_make"},
     "procedure/next_plan": {
         "see hilcal diagnose {}, or give": f"{RARE}what_next_says_of_each_verdict",
@@ -373,21 +333,17 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal identify {} --readings": f"{RARE}deflections_are_compared_after_a_fit_of_absolute_"
         "readings"
     },
-    "workbench/cards": {
-        "hilcal compensate": f"{PAGE}a_table_becomes_a_calibration_at_one_page",
-    },
+    "workbench/cards": {"hilcal compensate": f"{PAGE}a_table_becomes_a_calibration_at_one_page"},
     "workbench/guard": {
         "hilcal workbench printed": f"{PAGE}only_the_browser_with_the_address_is_let_in",
         "start hilcal workbench again": f"{PAGE}the_token_is_good_for_one_exchange",
     },
     "workbench/session": {
-        "hilcal run CELL.toml": "tests/cli/test_next_append.py::test_the_line_that_next_prints"
+        "hilcal run CELL.toml": "tests/cli/test_next_cli.py::test_the_line_that_next_prints"
     },
-    "write_report": {
-        "hilcal info": f"{HERE}what_a_report_names",
-        "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command",
-    },
-}
+    "write_report": {"hilcal info": f"{HERE}what_a_report_names",
+        "hilcal validate": f"{RARE}a_page_with_a_validation_names_its_command"},
+}  # fmt: skip
 """By module, what tells each sentence that names a command from the others, and the test that takes
 the step."""
 NO_STEP = {
@@ -396,20 +352,20 @@ NO_STEP = {
     "present/viewer/plan",
     "procedure/procedure",
     "store/run_log",
-    "tables/guessing/proposal",
+    "tables/proposal",
     "workbench/server",
 }
 """Modules that name commands as where something comes from, or as a title."""
 
 
-def sentences(path: Path) -> Iterator[str]:
+def sentences(path):
     """Yield the strings of a module, no docstrings and no helps of options, that name a command."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     left_out = {id(s.value) for s in ast.walk(tree) if isinstance(s, ast.Expr)}
     for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             left_out.update(id(part) for part in node.values)
-        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("option", "argument"):
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("command", "_declared"):
             left_out.update(id(given) for given in node.args)
     for node in ast.walk(tree):
         parts = node.values if isinstance(node, ast.JoinedStr) else [node]
@@ -419,7 +375,7 @@ def sentences(path: Path) -> Iterator[str]:
             yield text
 
 
-def test_every_message_is_taken() -> None:
+def test_every_message_is_taken():
     package = ROOT / "hilcal"
     found = {
         name: said
@@ -436,7 +392,7 @@ def test_every_message_is_taken() -> None:
 
 
 @pytest.mark.parametrize("test", sorted({test for of in TAKEN.values() for test in of.values()}))
-def test_the_tests_that_take_them_are_there(test: str) -> None:
+def test_the_tests_that_take_them_are_there(test):
     path, _, name = test.partition("::")
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     names = {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}

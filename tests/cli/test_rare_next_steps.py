@@ -4,14 +4,12 @@ import html
 import inspect
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
 
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import change_cell
-from hilcal.diagnosis.diagnosis import Reason
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.discovery.discovery import Discovery
@@ -32,14 +30,13 @@ from tests.cli.test_next_steps import follow, imported, run
 from tests.support.cli_cases import CELL, ok, refused, rehearsal
 
 __all__ = ["run"]
-Capsys = pytest.CaptureFixture[str]
 
 
-def quiet(text: str) -> None:
+def quiet(text):
     """Take progress."""
 
 
-def test_a_revision_in_a_cell_that_was_changed(run: Path, capsys: Capsys) -> None:
+def test_a_revision_in_a_cell_that_was_changed(run, capsys):
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:
         change_cell(o, 1, o.fit(), {"tool": {"mass_kg": 1.4}}, quiet)
@@ -48,7 +45,7 @@ def test_a_revision_in_a_cell_that_was_changed(run: Path, capsys: Capsys) -> Non
     ok(capsys, "diagnose", run, "--revision", "1")
 
 
-def test_what_accept_says(run: Path, capsys: Capsys) -> None:
+def test_what_accept_says(run, capsys):
     ok(capsys, "identify", run)
     ok(capsys, "identify", run, "--effects", "joint_compliance")
     follow(capsys, ok(capsys, "accept", run, "1").out, f"hilcal accept '{run}' --release")
@@ -56,7 +53,7 @@ def test_what_accept_says(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_a_revision_of_other_targets(run: Path, capsys: Capsys) -> None:
+def test_a_revision_of_other_targets(run, capsys):
     ok(capsys, "identify", run)
     with CampaignFile.open(run) as file:
         record = file.revisions()[-1]
@@ -70,7 +67,7 @@ def test_a_revision_of_other_targets(run: Path, capsys: Capsys) -> None:
     ok(capsys, "diagnose", run)
 
 
-def test_a_bad_revision_is_set_aside_and_fitted_again(run: Path, capsys: Capsys) -> None:
+def test_a_bad_revision_is_set_aside_and_fitted_again(run, capsys):
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:
         found = o.fit()
@@ -81,7 +78,7 @@ def test_a_bad_revision_is_set_aside_and_fitted_again(run: Path, capsys: Capsys)
     ok(capsys, "diagnose", run)
 
 
-def test_what_a_file_for_others_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_file_for_others_lacks(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--effects", "joint_compliance,creep", "--readings", "absolute")
     told = ok(capsys, "export", run, "--urdf", tmp_path / "arm.urdf").out
     assert "since not constant" in told
@@ -92,7 +89,7 @@ def test_what_a_file_for_others_lacks(run: Path, tmp_path: Path, capsys: Capsys)
     ok(capsys, "compensate", run, points, "--json")
 
 
-def test_masses_that_a_description_lacks(tmp_path: Path, capsys: Capsys) -> None:
+def test_masses_that_a_description_lacks(tmp_path, capsys):
     text = (configs_dir() / "robots" / "ur10e.toml").read_text()
     arm, cell, path = tmp_path / "arm.toml", tmp_path / "cell.toml", tmp_path / "run.hilcal"
     arm.write_text(re.sub(r"(?m)^(mass_kg|com_m|weight_kg) = .*\n", "", text))
@@ -106,7 +103,7 @@ def test_masses_that_a_description_lacks(tmp_path: Path, capsys: Capsys) -> None
 
 
 @pytest.mark.long
-def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_an_effect_that_an_earlier_model_lacks(run, tmp_path, capsys):
     later = imported(capsys, tmp_path / "later.hilcal", seed=2)
     ok(capsys, "identify", run)
     said = ok(capsys, "compare", run, later).out
@@ -115,7 +112,7 @@ def test_an_effect_that_an_earlier_model_lacks(run: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.long
-def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
+def test_an_addition_that_breaks_its_promise(run, capsys):
     ok(capsys, "add", run, "hysteresis")
     with Campaign.open(run) as o:
         suspect = next(iter(diagnose(o.fit(), o.history()).suspects))
@@ -124,7 +121,7 @@ def test_an_addition_that_breaks_its_promise(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_joints_that_differ(tmp_path: Path, capsys: Capsys) -> None:
+def test_joints_that_differ(tmp_path, capsys):
     path = imported(capsys, tmp_path / "run.hilcal", "nothing")
     common = ("--effects", "base_frame,joint_compliance(joints=common)")
     ok(capsys, "identify", path, *common)
@@ -138,25 +135,19 @@ def test_joints_that_differ(tmp_path: Path, capsys: Capsys) -> None:
 PLAN_AFTER = "hilcal plan CELL.toml -o PLAN.json --after {run}"
 
 
-@pytest.mark.parametrize(
-    ("reason", "words", "step"),
-    [
-        ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
-        ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
-        *(
-            pytest.param(*further, marks=pytest.mark.long)
-            for further in (
-                ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
-                ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
-                ("background", "one by one", PLAN_AFTER),
-                ("residual_is_noise", "is adequate", PLAN_AFTER),
-            )
-        ),
-    ],
-)
-def test_what_next_says_of_each_verdict(
-    run: Path, tmp_path: Path, capsys: Capsys, reason: Reason, words: str, step: str
-) -> None:
+@pytest.mark.parametrize(("reason", "words", "step"), [
+    ("wrong_figure", "a figure of the cell", "hilcal diagnose {run}"),
+    ("one_suspect", "hysteresis alone is missing", "hilcal add {run} hysteresis"),
+    *(
+        pytest.param(*further, marks=pytest.mark.long)
+        for further in (
+            ("misjudged_noise", "the noise is misjudged", "hilcal diagnose {run}"),
+            ("no_suspect", "no effect of the catalogue explains", "hilcal diagnose {run}"),
+            ("background", "one by one", PLAN_AFTER),
+            ("residual_is_noise", "is adequate", PLAN_AFTER),
+        )
+    )])  # fmt: skip
+def test_what_next_says_of_each_verdict(run, tmp_path, capsys, reason, words, step):
     cell = tmp_path / "cell.toml"
     cell.write_text(re.sub(r"candidates = \d+", "candidates = 60\nagainst = []", CELL.read_text()))
     ok(capsys, "identify", run)
@@ -174,7 +165,7 @@ def test_what_next_says_of_each_verdict(
 
 
 @pytest.mark.long
-def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
+def test_a_law_that_effects_explain_as_well(run, capsys):
     ok(capsys, "identify", run)
     with Campaign.open(run) as o:
         said = silence(Discovery(o.fit(), "catalogue", catalogue=("hysteresis",)))
@@ -183,7 +174,7 @@ def test_a_law_that_effects_explain_as_well(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_what_a_recording_names(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_what_a_recording_names(run, tmp_path, capsys):
     assert "`hilcal refine` does, afterwards" in GUIDE
     assert "hilcal refine says what" in inspect.getsource(live_scene)
     with pytest.raises(InputError, match="run hilcal identify first"):
@@ -202,7 +193,7 @@ def test_what_a_recording_names(run: Path, tmp_path: Path, capsys: Capsys) -> No
     ok(capsys, "view", run, "--record", tmp_path / "run.rrd")
 
 
-def test_a_stream_of_several_targets(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_stream_of_several_targets(run, tmp_path, capsys):
     frame = pd.read_csv(run.with_suffix(".csv")).assign(target="one")
     frame.drop(columns=["pose", "load"]).to_parquet(path := tmp_path / "t.parquet")
     with pytest.raises(InputError, match="import a table of several with `hilcal import`"):
@@ -215,9 +206,7 @@ def test_a_stream_of_several_targets(run: Path, tmp_path: Path, capsys: Capsys) 
 
 
 @pytest.mark.long
-def test_deflections_are_compared_after_a_fit_of_absolute_readings(
-    run: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_deflections_are_compared_after_a_fit_of_absolute_readings(run, tmp_path, capsys):
     ok(capsys, "identify", run, "--readings", "deflection")
     readings = rehearsal("hysteresis", 2, 8).readings
     write_table(readings[readings.unloaded], csv := tmp_path / "bare.csv", WHOLE)
@@ -227,7 +216,7 @@ def test_deflections_are_compared_after_a_fit_of_absolute_readings(
     ok(capsys, "compare", run, bare)
 
 
-def test_sections_of_a_cell(tmp_path: Path, capsys: Capsys) -> None:
+def test_sections_of_a_cell(tmp_path, capsys):
     said = ok(capsys, "config").out
     follow(capsys, said, "hilcal config SECTION", SECTION="tracker")
     assert "hilcal init writes a file" in said
@@ -236,9 +225,7 @@ def test_sections_of_a_cell(tmp_path: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_a_page_with_a_validation_names_its_command(
-    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_with_a_validation_names_its_command(run, tmp_path, capsys, monkeypatch):
     other = imported(capsys, tmp_path / "other one.hilcal", seed=2)
     ok(capsys, "refine", run)
     page = tmp_path / "page.html"
@@ -249,7 +236,7 @@ def test_a_page_with_a_validation_names_its_command(
 
 
 @pytest.mark.long
-def test_the_page_says_how_to_be_judged(run: Path, tmp_path: Path, capsys: Capsys) -> None:
+def test_the_page_says_how_to_be_judged(run, tmp_path, capsys):
     page = tmp_path / "page.html"
     ok(capsys, "identify", run, "--scaling", "gu")
     ok(capsys, "report", run, "-o", page)

@@ -1,10 +1,11 @@
-"""The README's campaign: its blocks are one CELL.toml, and its commands run in their order.
+"""The README and the tutorials, done as they say."""
 
-Here the readings are drawn in the simulated world; `test_readme_on_devices` drives the same
-commands over wires.
-"""
-
+import os
+import re
 import shlex
+import shutil
+import subprocess
+import sys
 import tomllib
 from itertools import pairwise
 from pathlib import Path
@@ -16,22 +17,19 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.cli import planning
 from hilcal.cli.commands import COMMANDS
-from hilcal.config import CellConfig, load_config
+from hilcal.config import load_config
 from hilcal.design.planner import Request, make
 from hilcal.drivers.simulated.rehearsal import case_of_plan, read_plan
-from hilcal.measuring.connect import ConnectionResult
 from hilcal.readings.covariance import WHOLE
-from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Plan, load_plan, with_new_names
+from hilcal.store.plan import load_plan, with_new_names
 from hilcal.store.run_log import RunLog, create_run
 from hilcal.tables.columns import joint_columns
 from hilcal.tables.table import write_table
 from tests.support import readme
-from tests.support.cli_cases import Outcome, run
+from tests.support.cli_cases import run
 from tests.support.paths import ROOT
 
-Capsys = pytest.CaptureFixture[str]
 FEW = "candidates = 60\nagainst = []\n"
 """In [planning]: so that planning takes a second."""
 SEED = 3
@@ -39,7 +37,7 @@ ELSEWHERE = {"simulate", "demo", "init", "workbench"}
 """Commands of the section that other tests run."""
 
 
-def test_the_blocks_are_one_cell(tmp_path: Path) -> None:
+def test_the_blocks_are_one_cell(tmp_path):
     path = tmp_path / "CELL.toml"
     path.write_text(readme.cell(), encoding="utf-8")
     config = load_config(path)
@@ -48,13 +46,13 @@ def test_the_blocks_are_one_cell(tmp_path: Path) -> None:
     assert tomllib.loads(readme.cell())["tracker"]["driver"] == "geocom"
 
 
-def test_every_command_is_one_of_the_program() -> None:
+def test_every_command_is_one_of_the_program():
     used = {words[0] for words in readme.commands()}
     assert used <= set(COMMANDS)
     assert {"check", "plan", "run", "import", "identify", "refine", "next", "validate"} <= used
 
 
-def test_the_one_command_is_as_the_readme_says(tmp_path: Path, capsys: Capsys) -> None:
+def test_the_one_command_is_as_the_readme_says(tmp_path, capsys):
     section = (ROOT / "README.md").read_text().split("\n## A real campaign by one command\n")[1]
     lines = [x.strip() for x in section.split("\n## ")[0].splitlines() if x.startswith("    ")]
     assert len(lines) == 3
@@ -66,9 +64,7 @@ def test_the_one_command_is_as_the_readme_says(tmp_path: Path, capsys: Capsys) -
 
 
 @pytest.mark.long
-def test_every_command_in_order(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
-) -> None:
+def test_every_command_in_order(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = readme.cell().replace("[planning]\n", f"[planning]\n{FEW}")
     Path("CELL.toml").write_text(text, encoding="utf-8")
@@ -108,17 +104,17 @@ def test_every_command_in_order(
     assert "2 points compensated" in said(shown, "compensate run.hilcal")
 
 
-def said(shown: dict[str, Outcome], command: str) -> str:
+def said(shown, command):
     """What the first command that begins so has printed, on one line."""
     return " ".join(next(r for c, r in shown.items() if c.startswith(command)).out.split())
 
 
-def nobody(config: CellConfig) -> tuple[None, tuple[ConnectionResult, ...]]:
+def nobody(config):
     """No device is asked: their addresses are those of the README's author."""
     return None, ()
 
 
-def draw(config: CellConfig, words: list[str], noise: int = 1) -> None:
+def draw(config, words, noise=1):
     """Stand in for `run`: draw the readings of a plan in a world where nothing is hidden."""
     given = dict(pairwise(words))
     path = Path(given["-o"])
@@ -137,7 +133,7 @@ def draw(config: CellConfig, words: list[str], noise: int = 1) -> None:
         c.append_readings(readings(config, made, noise))
 
 
-def program(weld: Path, frames: Path) -> None:
+def program(weld, frames):
     """Write a KRL program of one point, and what the controller keeps of its tool and base."""
     Path("corrected").mkdir()
     q = np.degrees(load_plan(Path("plan.json")).q[0])
@@ -148,12 +144,12 @@ def program(weld: Path, frames: Path) -> None:
     frames.write_text(f"DEFDAT $CONFIG PUBLIC\n{tool}\n{base}\nENDDAT\n")
 
 
-def readings(config: CellConfig, plan: Plan, noise: int) -> Readings:
+def readings(config, plan, noise):
     """Readings of a plan in the one world of this file."""
     return read_plan(case_of_plan(config, plan, "nothing", SEED), plan, [SEED, noise]).readings
 
 
-def points(run: Path, path: Path) -> None:
+def points(run, path):
     """Write a table with two of the poses that were measured."""
     with CampaignFile.open(run, read_only=True) as c:
         q = c.readings().states.q[:2]
@@ -162,7 +158,7 @@ def points(run: Path, path: Path) -> None:
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
 
 
-def others(config: CellConfig, directory: Path) -> None:
+def others(config, directory):
     """Somebody else's tables: one in the exchange format, one as a spreadsheet in their units."""
 
     plan = make(cell_from_config(config), config, Request(8), np.random.default_rng(2)).ordered.plan
@@ -170,10 +166,46 @@ def others(config: CellConfig, directory: Path) -> None:
     write_table(r, directory / "readings.csv", WHOLE)
     book = openpyxl.Workbook()
     sheet = book.active
-    assert sheet is not None
     joints = [f"A{k} [deg]" for k in range(1, 7)]
     sheet.append(["pose", "load", *joints, "X [mm]", "Y [mm]", "Z [mm]"])
     for q, x, pose, load in zip(r.states.q, r.value, r.pose, r.load, strict=True):
         row = [r.pose_names[pose], r.load_names[load], *np.rad2deg(q), *(1e3 * x)]
         sheet.append([v if isinstance(v, str) else float(v) for v in row])
     book.save(directory / "theirs.xlsx")
+
+
+FOLDER = ROOT / "docs" / "tutorials"
+SHELL = re.compile(r"^# !(.+)$", re.MULTILINE)
+"""A line of a script that is a command of the shell in a notebook, as jupytext writes it."""
+
+
+def test_there_are_three():
+    assert len(list(FOLDER.glob("*.py"))) == 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("script", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
+def test_a_tutorial_runs(script, tmp_path):
+    shutil.copytree(FOLDER / "data", tmp_path / "data")
+    text, count = SHELL.subn(
+        lambda m: f"__import__('subprocess').run({m[1]!r}, shell=True, check=True)",
+        script.read_text(encoding="utf-8"),
+    )
+    assert count  # of the commands that a user would type
+    assert "assert " in text
+    (tmp_path / "cells.py").write_text(text, encoding="utf-8")
+    here = str(Path(sys.executable).parent)
+    path = {"PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-W", "error", "cells.py"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env={**os.environ, **path}, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_table_of_the_other_arm_is_what_the_simulation_gives():
+    from hilcal.cell import Cell
+    from studies.another_arm import CELL, table
+
+    kept = (FOLDER / "data" / "irb120.csv").read_bytes().decode("utf-8")
+    assert table(Cell.load(CELL)) == kept

@@ -8,25 +8,24 @@ import pytest
 from hilcal.config import load_config
 from tests.cli.test_readme import ELSEWHERE, FEW, others, points, program
 from tests.support import readme
-from tests.support.cli_cases import Outcome, run, start
+from tests.support.cli_cases import run, start
 
 FAST = "[simulation]\nclock = 20.0\n"
 """The world of the devices goes twenty times faster than a clock."""
 READY_S = 120.0
 TRIES = 5
 DEVICE_FAILED = 3
-Capsys = pytest.CaptureFixture[str]
 
 
-def words_of(result: Outcome) -> str:
+def words_of(result):
     return " ".join(result.out.split())
 
 
-def run_(capsys: Capsys, words: list[str]) -> Outcome:
+def run_(capsys, words):
     return run(capsys, *words)
 
 
-def measured(capsys: Capsys, words: list[str]) -> Outcome:
+def measured(capsys, words):
     """Measure, and go on after a lost link, as an operator would: a busy machine loses some."""
     result = run_(capsys, words)
     for _ in range(TRIES):
@@ -40,9 +39,7 @@ def measured(capsys: Capsys, words: list[str]) -> Outcome:
 
 
 @pytest.mark.slow
-def test_every_command_on_devices(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys
-) -> None:
+def test_every_command_on_devices(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     text = readme.cell().replace("[planning]\n", f"[planning]\n{FEW}") + FAST
     Path("CELL.toml").write_text(text, encoding="utf-8")

@@ -26,7 +26,7 @@ Made = Callable[[Path, Capsys], str]
 BASE = ["base_frame", "joint_compliance"]
 
 
-def done(*arguments: str | Path) -> None:
+def done(*arguments):
     """Run a command that must succeed."""
     with pytest.raises(SystemExit) as ended:
         main([str(a) for a in arguments])
@@ -34,7 +34,7 @@ def done(*arguments: str | Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def cell(tmp_path_factory):
     """The cell of the demo with few candidates, which makes plans fast."""
     path, text = tmp_path_factory.mktemp("cell") / "cell.toml", CELL.read_text(encoding="utf-8")
     path.write_text(
@@ -45,7 +45,7 @@ def cell(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def fresh(cell: Path) -> bytes:
+def fresh(cell):
     """A campaign without revisions."""
     run = cell.with_name("fresh.hilcal")
     csv = table(run.with_suffix(".csv"), "hysteresis", poses=8)
@@ -54,7 +54,7 @@ def fresh(cell: Path) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def fitted(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def fitted(fresh, tmp_path_factory):
     """The same with three revisions: the baseline, hysteresis added, another first model."""
     path = tmp_path_factory.mktemp("fitted") / "run.hilcal"
     path.write_bytes(fresh)
@@ -65,13 +65,13 @@ def fitted(fresh: bytes, tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture
-def run(fitted: bytes, tmp_path: Path) -> Path:
+def run(fitted, tmp_path):
     path = tmp_path / "run.hilcal"
     path.write_bytes(fitted)
     return path
 
 
-def state(folder: Path) -> dict[str, tuple[str, int]]:
+def state(folder):
     """Hash and time of change of every file in a folder."""
     return {
         p.name: (hashlib.sha256(p.read_bytes()).hexdigest(), p.stat().st_mtime_ns)
@@ -89,23 +89,14 @@ READING = (
 )
 
 
-@pytest.mark.parametrize(
-    ("reading", "revisions"),
-    [
-        *((c, True) for c in READING[:-1]),
-        *((c, False) for c in READING[:3]),
-        pytest.param(READING[-1], True, marks=pytest.mark.slow),
-    ],
-    ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x],
-)
+@pytest.mark.parametrize(("reading", "revisions"), [
+    *((c, True) for c in READING[:-1]),
+    *((c, False) for c in READING[:3]),
+    pytest.param(READING[-1], True, marks=pytest.mark.slow),
+], ids=lambda x: x[0] if isinstance(x, tuple) else ("fresh", "fitted")[x])  # fmt: skip
 def test_a_command_that_reads_writes_nothing_to_the_campaign(
-    reading: tuple[str, ...],
-    revisions: bool,
-    fresh: bytes,
-    fitted: bytes,
-    tmp_path: Path,
-    capsys: Capsys,
-) -> None:
+    reading, revisions, fresh, fitted, tmp_path, capsys
+):
     home, out = tmp_path / "home", tmp_path / "out"
     home.mkdir()
     out.mkdir()
@@ -120,7 +111,7 @@ def test_a_command_that_reads_writes_nothing_to_the_campaign(
     home.chmod(0o755)
 
 
-def test_a_reading_connection_can_write_nothing(run: Path) -> None:
+def test_a_reading_connection_can_write_nothing(run):
     with Campaign.open(run, read_only=True) as o:
         record = o.latest()
         assert record is not None
@@ -141,7 +132,7 @@ os._exit(9)
 """A program that is killed in the middle of a transaction."""
 
 
-def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: Path) -> None:
+def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run):
     """A journal beside the file: SQLite must undo it, which a read-only connection cannot."""
     before = run.read_bytes()
     subprocess.run([sys.executable, "-c", KILLED, str(run)], cwd=ROOT, check=False)
@@ -154,9 +145,7 @@ def test_what_a_killed_program_left_unfinished_is_undone_before_it_is_read(run: 
 
 
 @pytest.mark.long
-def test_every_command_that_reads_a_model_takes_a_revision(
-    run: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_every_command_that_reads_a_model_takes_a_revision(run, tmp_path, capsys):
     two = [*BASE, "hysteresis"]
     for name in ("compare", "diagnose"):
         assert ok(capsys, name, run, "--json").document["model"][-1] == "base_compliance"
@@ -178,9 +167,7 @@ def test_every_command_that_reads_a_model_takes_a_revision(
 
 
 @pytest.mark.slow
-def test_planning_on_takes_a_revision(
-    run: Path, cell: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_planning_on_takes_a_revision(run, cell, tmp_path, capsys):
     plan = ("plan", cell, "-o", tmp_path / "plan.json", "--poses", "2", "--quick")
     d = ok(capsys, *plan, "--after", run, "--revision", "2", "--json").document
     assert any("hysteresis" in name for name in d["predicted_std"])
@@ -188,9 +175,7 @@ def test_planning_on_takes_a_revision(
 
 
 @pytest.mark.long
-def test_a_change_of_an_earlier_revision_follows_that_one(
-    run: Path, tmp_path: Path, capsys: Capsys
-) -> None:
+def test_a_change_of_an_earlier_revision_follows_that_one(run, tmp_path, capsys):
     arguments = ("add", run, "load_point", "--revision", "2", "--json")
     before, after = ok(capsys, *arguments).document["revisions"]
     assert (before["revision"], after["revision"]) == (2, 4)
@@ -206,7 +191,7 @@ def test_a_change_of_an_earlier_revision_follows_that_one(
         assert [r.number for r in chain(o.file.revisions())] == [1, 2, 4, 5]
 
 
-def test_refining_from_a_revision_follows_it(run: Path, capsys: Capsys) -> None:
+def test_refining_from_a_revision_follows_it(run, capsys):
     d = ok(capsys, "refine", run, "--revision", "1", "--json").document
     assert [r["revision"] for r in d["revisions"]] == [1, 4]
     with Campaign.open(run, read_only=True) as o:
@@ -214,9 +199,7 @@ def test_refining_from_a_revision_follows_it(run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.long
-def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
-    run: Path, capsys: Capsys
-) -> None:
+def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(run, capsys):
     words = ok(capsys, "accept", run, "2").out
     assert "Accepted: revision 2" in words
     for name in ("compare", "diagnose"):
@@ -246,7 +229,7 @@ def test_exploring_does_not_change_what_others_use_once_a_revision_is_accepted(
             assert len(o.file.revisions()) == 6
 
 
-def outdated(run: Path, capsys: Capsys) -> str:
+def outdated(run, capsys):
     """The accepted revision has fewer readings than the campaign, as after run --append."""
     ok(capsys, "accept", run, "2")
     with Campaign.open(run) as o:
@@ -254,14 +237,14 @@ def outdated(run: Path, capsys: Capsys) -> str:
     return "revision 2 was fitted before readings were appended"
 
 
-def of_another_scaling(run: Path, capsys: Capsys) -> str:
+def of_another_scaling(run, capsys):
     """The accepted revision cannot be judged."""
     ok(capsys, "identify", run, "--scaling", "none")
     ok(capsys, "accept", run)
     return "revision 4 has scaling none"
 
 
-def take(said: str, run: Path, capsys: Capsys) -> None:
+def take(said, run, capsys):
     """Do what a message says, in its order: each command in it, as it stands."""
     commands = re.findall(r"hilcal (identify|accept)((?: --?\w+| \S+/\S+)*)", said)
     assert commands, said
@@ -270,18 +253,14 @@ def take(said: str, run: Path, capsys: Capsys) -> None:
 
 
 @pytest.mark.parametrize("made", [outdated, of_another_scaling])
-@pytest.mark.parametrize(
-    "asked",
-    [
-        ("compare",),
-        ("diagnose",),
-        pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
-    ],
-    ids=lambda x: x[0],
-)
+@pytest.mark.parametrize("asked", [
+    ("compare",),
+    ("diagnose",),
+    pytest.param(("next", "-o", "{out}/p.json"), marks=pytest.mark.long),
+], ids=lambda x: x[0])  # fmt: skip
 def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
-    run: Path, tmp_path: Path, capsys: Capsys, made: Made, asked: tuple[str, ...]
-) -> None:
+    run, tmp_path, capsys, made, asked
+):
     words = made(run, capsys)
     name, *rest = (part.format(out=tmp_path) for part in asked)
     result = command(capsys, name, run, *rest)
@@ -300,21 +279,14 @@ def test_what_is_said_of_an_accepted_revision_that_will_not_do_leads_on(
         assert len(o.fit().readings) == len(o.readings)
 
 
-@pytest.mark.parametrize(
-    "asked",
-    [
-        ("accept", "{run}"),
-        ("export", "{run}", "--urdf", "{out}/arm.urdf"),
-        ("report", "{run}", "-o", "{out}/r.html"),
-        ("compensate", "{run}", "{out}/points.csv"),
-        pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
-        ("view", "{run}", "--record", "{out}/v.rrd"),
-    ],
-    ids=lambda x: x[0],
-)
-def test_every_step_that_is_named_leads_on(
-    fresh: bytes, cell: Path, tmp_path: Path, capsys: Capsys, asked: tuple[str, ...]
-) -> None:
+@pytest.mark.parametrize("asked", [
+    ("accept", "{run}"),
+    ("export", "{run}", "--urdf", "{out}/arm.urdf"),
+    ("report", "{run}", "-o", "{out}/r.html"),
+    ("compensate", "{run}", "{out}/points.csv"),
+    pytest.param(("next", "{run}", "-o", "{out}/p.json"), marks=pytest.mark.long),
+    ("view", "{run}", "--record", "{out}/v.rrd")], ids=lambda x: x[0])  # fmt: skip
+def test_every_step_that_is_named_leads_on(fresh, cell, tmp_path, capsys, asked):
     """From a campaign without a fit: the step is taken until the command is done, or a plan is."""
     run = tmp_path / "run.hilcal"
     run.write_bytes(fresh)
@@ -342,7 +314,7 @@ def test_every_step_that_is_named_leads_on(
     pytest.fail(f"no end: {said}")
 
 
-def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Capsys) -> None:
+def test_what_cannot_be_accepted_is_refused(run, fresh, capsys):
     assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "7")
     assert "there are 1 to 3" in refused(capsys, 2, "accept", run, "0")
     assert "leave out the number" in refused(capsys, 2, "accept", run, "1", "--release")
@@ -350,12 +322,12 @@ def test_what_cannot_be_accepted_is_refused(run: Path, fresh: bytes, capsys: Cap
     assert "no revision yet" in refused(capsys, 2, "accept", run)
 
 
-def version(path: Path) -> int:
+def version(path):
     with CampaignFile.open(path, read_only=True) as file:
         return int(file.connection.execute("PRAGMA user_version").fetchone()[0])
 
 
-def test_only_a_file_that_needs_it_is_closed_to_older_programs(run: Path, capsys: Capsys) -> None:
+def test_only_a_file_that_needs_it_is_closed_to_older_programs(run, capsys):
     assert version(run) == schema.ONE_TARGET
     ok(capsys, "add", run, "load_point")  # from the one before: as always
     assert version(run) == schema.ONE_TARGET
@@ -363,7 +335,7 @@ def test_only_a_file_that_needs_it_is_closed_to_older_programs(run: Path, capsys
     assert version(run) == schema.CHOSEN_REVISION
 
 
-def test_a_record_of_an_older_program_has_no_parent(run: Path) -> None:
+def test_a_record_of_an_older_program_has_no_parent(run):
     with CampaignFile.open(run, read_only=True) as file:
         record = file.revision(2)
     assert '"parent"' not in to_text(record)

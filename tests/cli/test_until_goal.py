@@ -10,10 +10,10 @@ import pytest
 
 import hilcal.cli.running as running
 from hilcal.cli.terminal import terminal
-from hilcal.config import CellConfig, Repeatability
-from hilcal.config.template import to_toml
-from hilcal.design import goal as goal_rule
-from hilcal.design.goal import GoalRule
+from hilcal.config import Repeatability
+from hilcal.config.reference import to_toml
+from hilcal.design import goal_rule
+from hilcal.design.goal_rule import GoalRule
 from hilcal.design.nominal_model import nominal_states
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
@@ -24,7 +24,7 @@ from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, create_run
-from tests.support.campaigns import Campaign, campaign, configuration, noiseless, plan, with_noise
+from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.cli_cases import ok, quickly_planned, refused, run
 from tests.support.fake_bench import POSES, Bench
 from tests.support.fake_world import REGISTRATION
@@ -32,7 +32,7 @@ from tests.support.fake_world import REGISTRATION
 COMPLIANCE = np.array([3e-5, 4e-5, 3e-5, 6e-5, 6e-5, 8e-5])  # rad/(N·m)
 
 
-def config_of(**planning: Any) -> CellConfig:
+def config_of(**planning):
     """The demo's cell; its campaigns in the tests state the repeatability already."""
     config = configuration()
     changed = config.planning.model_copy(update=planning)
@@ -40,7 +40,7 @@ def config_of(**planning: Any) -> CellConfig:
     return config.model_copy(update={"planning": changed, "repeatability": still})
 
 
-def rule(text: str, c: Campaign, **planning: Any) -> GoalRule:
+def rule(text, c, **planning):
     """A rule for which fits take no time."""
     return GoalRule(text, c.cell, config_of(**planning), now=lambda: 0.0)
 
@@ -49,7 +49,7 @@ def rule(text: str, c: Campaign, **planning: Any) -> GoalRule:
 
 
 @pytest.mark.parametrize("mode", ["deflection", "absolute"])
-def test_it_is_what_identify_states(mode: Any) -> None:
+def test_it_is_what_identify_states(mode):
     c = campaign(mode=mode, poses=8)
     found = fit(baseline(c.cell, c.readings, mode), c.readings, mode)
     rows = found.model.slices()[found.model.names.index("joint_compliance")]
@@ -64,7 +64,7 @@ def test_it_is_what_identify_states(mode: Any) -> None:
         assert f"joint std {share:.0f} % (j6)" == status_words(status)
 
 
-def test_loaded_readings_count_from_their_unloaded_ones_on() -> None:
+def test_loaded_readings_count_from_their_unloaded_ones_on():
     """In the middle of a plan that takes half of the unloaded readings at the end."""
     c = campaign(mode="deflection", poses=8)
     lacking = c.readings[~((c.readings.pose > 4) & c.readings.unloaded)]
@@ -76,7 +76,7 @@ def test_loaded_readings_count_from_their_unloaded_ones_on() -> None:
 
 
 @pytest.mark.long
-def test_the_position_is_as_sure_as_it_says() -> None:
+def test_the_position_is_as_sure_as_it_says():
     """Over 40 campaigns the predicted positions scatter by what is stated."""
     c, p = campaign(mode="absolute", poses=6), plan(6, 1000)
     clean, rng = noiseless(c.world, p), np.random.default_rng(3)
@@ -98,7 +98,7 @@ def test_the_position_is_as_sure_as_it_says() -> None:
     assert full_words(told.status).startswith(f"standard uncertainty (rms) {where}: ")
 
 
-def test_what_is_not_determined_yet_is_not_met() -> None:
+def test_what_is_not_determined_yet_is_not_met():
     c = campaign(mode="deflection", poses=8)
     free = c.readings[c.readings.unloaded]
     told = rule("joint std < 1000 %", c)
@@ -110,7 +110,7 @@ def test_what_is_not_determined_yet_is_not_met() -> None:
     assert told(c.readings, last=False).met
 
 
-def test_no_deflection_is_predicted_before_the_loads_are_read() -> None:
+def test_no_deflection_is_predicted_before_the_loads_are_read():
     """Unloaded readings say nothing of it, and a load at one pose not enough."""
     c = campaign(mode="deflection", poses=8)
     work = plan(3, 7).states.q[::5].tolist()
@@ -136,13 +136,13 @@ def test_no_deflection_is_predicted_before_the_loads_are_read() -> None:
     ("what", "mode", "valid"),
     [("deflection", "absolute", "position"), ("position", "deflection", "deflection")],
 )
-def test_a_goal_is_of_what_the_readings_show(what: str, mode: str, valid: str) -> None:
+def test_a_goal_is_of_what_the_readings_show(what, mode, valid):
     c = campaign(mode="absolute", poses=6)
     with pytest.raises(InputError, match=f"valid: {valid}"):
         rule(f"{what} std < 20 um", c, readings=mode, work_q_rad=[[0.0] * 6])
 
 
-def test_an_estimated_uncertainty_must_do_twice() -> None:
+def test_an_estimated_uncertainty_must_do_twice():
     """With an effect that the model lacks it comes from leaving out poses, and is itself rough."""
     c = campaign("joint_tilt_compliance", mode="deflection", poses=10, strength=3.0)
     found = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
@@ -155,13 +155,13 @@ def test_an_estimated_uncertainty_must_do_twice() -> None:
 # how often
 
 
-def test_fits_take_a_tenth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fits_take_a_tenth_of_the_time(monkeypatch):
     """A fit takes 2 s, a reading 1 s: one in about twenty is judged, and the last one."""
     c = campaign(mode="deflection", poses=8)
     at, fitted = [0.0], []
     real = goal_rule.fit
 
-    def slow(*arguments: Any) -> Any:
+    def slow(*arguments):
         at[0] += 2.0
         fitted.append(len(arguments[1]))
         return real(*arguments)
@@ -176,7 +176,7 @@ def test_fits_take_a_tenth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
     assert fitted == [9, 29, 40]
 
 
-def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch):
     c = campaign(mode="deflection", poses=8)
     told = rule("joint std < 1 %", c)
     loaded = c.readings[c.readings.pose < 7]
@@ -190,16 +190,12 @@ def test_an_unloaded_reading_by_itself_is_no_news(monkeypatch: pytest.MonkeyPatc
 # goals that cannot be
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("joint < 2 %", "not understood; valid: "),
-        ("joint_tilt_compliance std < 2 %", "is not in the model; valid: position, "),
-        ("j2 std < 2 mm", r"is in rad/\(N·m\)"),
-        ("deflection std < 20 um", "work_q_rad"),
-    ],
-)
-def test_a_goal_that_cannot_be_is_refused(text: str, why: str) -> None:
+@pytest.mark.parametrize(("text", "why"), [
+    ("joint < 2 %", "not understood; valid: "),
+    ("joint_tilt_compliance std < 2 %", "is not in the model; valid: position, "),
+    ("j2 std < 2 mm", r"is in rad/\(N·m\)"),
+    ("deflection std < 20 um", "work_q_rad")])  # fmt: skip
+def test_a_goal_that_cannot_be_is_refused(text, why):
     with pytest.raises(InputError, match=why) as caught:
         rule(text, campaign(mode="deflection", poses=8))
     assert "\n" not in str(caught.value)
@@ -251,7 +247,7 @@ class Site:
 
 
 @pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
+def site(tmp_path, monkeypatch):
     made = Site(tmp_path)
     rig = made.bench.rig
     devices = [d for d in (rig.arm, rig.tracker, rig.force, rig.operator) if d is not None]
@@ -263,7 +259,7 @@ def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
 
 
 @pytest.mark.long
-def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
+def test_run_until(site, capsys):
     """It stops early, `identify` says the same, and resuming measures the rest."""
     total, path = len(site.plan.steps), site.directory / "run.hilcal"
     goal = ("--until", "j2 std < 2 %")
@@ -307,9 +303,7 @@ def test_run_until(site: Site, capsys: pytest.CaptureFixture[str]) -> None:
     ok(capsys, "refine", path)
 
 
-def test_a_wrong_goal_is_refused_before_anything_else(
-    site: Site, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_wrong_goal_is_refused_before_anything_else(site, capsys):
     line = refused(capsys, 2, *site.command(*site.fresh, "--until", "joint < 2 %"))
     assert '"joint std < 2 %"' in line
     assert site.bench.world.calls == []
@@ -317,11 +311,11 @@ def test_a_wrong_goal_is_refused_before_anything_else(
 
 
 @pytest.mark.long
-def test_a_worker_of_many_measures_in_a_thread(site: Site) -> None:
+def test_a_worker_of_many_measures_in_a_thread(site):
     """Where no signal can be handled."""
     bench, path = site.bench, site.directory / "run.hilcal"
 
-    def measured() -> int:
+    def measured():
         with create_run(path, bench.config, site.directory, site.plan) as campaign:
             return running.measure(terminal(True), bench.config, bench.cell, campaign)
 

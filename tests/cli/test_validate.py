@@ -1,7 +1,6 @@
 """`validate`: what was fitted is told from what was not; a limit by load and by pose."""
 
 import csv
-from pathlib import Path
 
 import pytest
 
@@ -9,12 +8,11 @@ from hilcal.readings.covariance import WHOLE
 from hilcal.tables.table import write_table
 from tests.support.cli_cases import CELL, ok, refused, rehearsal, run
 
-Capsys = pytest.CaptureFixture[str]
 FITTED, POSES = 10, 14
 
 
 @pytest.fixture(scope="module")
-def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tables(tmp_path_factory):
     """Tables of one campaign: the poses to fit, the others, all of them."""
     folder, r = tmp_path_factory.mktemp("tables"), rehearsal("hysteresis", poses=POSES).readings
     first = r.pose < FITTED
@@ -24,7 +22,7 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def folder(tables: Path, tmp_path: Path, capsys: Capsys) -> Path:
+def folder(tables, tmp_path, capsys):
     """The same as campaigns; the first one has a revision with hysteresis."""
     for name in ("fit", "rest", "all"):
         source = tables / f"{name}.csv"
@@ -34,7 +32,7 @@ def folder(tables: Path, tmp_path: Path, capsys: Capsys) -> Path:
     return tmp_path
 
 
-def test_fitted_data_are_never_called_unseen(folder: Path, tables: Path, capsys: Capsys) -> None:
+def test_fitted_data_are_never_called_unseen(folder, tables, capsys):
     fit = folder / "fit.hilcal"
     renamed = folder / "another name.hilcal"
     with (tables / "fit.csv").open(encoding="utf-8", newline="") as stream:
@@ -61,7 +59,7 @@ def test_fitted_data_are_never_called_unseen(folder: Path, tables: Path, capsys:
         assert "all its 50 readings were fitted by revision 1" in said
 
 
-def test_of_a_mixture_only_the_unseen_readings_are_judged(folder: Path, capsys: Capsys) -> None:
+def test_of_a_mixture_only_the_unseen_readings_are_judged(folder, capsys):
     fit = folder / "fit.hilcal"
     alone = ok(capsys, "validate", fit, folder / "rest.hilcal", "--json").document
     mixed = ok(capsys, "validate", fit, folder / "all.hilcal", "--json").document
@@ -73,7 +71,7 @@ def test_of_a_mixture_only_the_unseen_readings_are_judged(folder: Path, capsys: 
     assert "16 deflections that were never fitted" in words
 
 
-def test_readings_that_came_after_a_revision_are_unseen_by_it(folder: Path, capsys: Capsys) -> None:
+def test_readings_that_came_after_a_revision_are_unseen_by_it(folder, capsys):
     from hilcal.store.campaign_file import CampaignFile
 
     fit = folder / "fit.hilcal"
@@ -83,9 +81,7 @@ def test_readings_that_came_after_a_revision_are_unseen_by_it(folder: Path, caps
     assert (d["n_readings"], d["n_fitted"], d["n_measurements"]) == (70, 50, 16)
 
 
-def test_errors_stand_by_load_and_by_pose_beside_what_is_stated(
-    folder: Path, capsys: Capsys
-) -> None:
+def test_errors_stand_by_load_and_by_pose_beside_what_is_stated(folder, capsys):
     arguments = ("validate", folder / "fit.hilcal", folder / "rest.hilcal")
     d = ok(capsys, *arguments, "--json").document
     assert [s["load"] for s in d["loads"]] == ["5kg", "10kg", "pull x", "pull y"]
@@ -106,7 +102,7 @@ def test_errors_stand_by_load_and_by_pose_beside_what_is_stated(
     assert worst["pose"] in words
 
 
-def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder: Path, capsys: Capsys) -> None:
+def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder, capsys):
     arguments = ("validate", folder / "fit.hilcal", folder / "rest.hilcal")
     kept = ok(capsys, *arguments, "--limit", "1 mm", "--json").document
     assert kept["limit"] == {"limit_m": pytest.approx(1e-3), "passed": True, "n_over": 0}
@@ -137,7 +133,7 @@ def test_a_limit_is_kept_or_not_and_the_exit_code_says_so(folder: Path, capsys: 
 
 
 @pytest.mark.parametrize("limit", ["0.1", "0.1 in", "ten mm", "-1 mm", "0 mm", "1.2.3 mm", "inf m"])
-def test_a_limit_that_is_no_length_is_refused(limit: str, tmp_path: Path, capsys: Capsys) -> None:
+def test_a_limit_that_is_no_length_is_refused(limit, tmp_path, capsys):
     said = refused(capsys, 2, "validate", tmp_path, tmp_path, "--limit", limit)
     assert f'--limit "{limit}"' in said
     assert 'valid: a length over 0 in m, mm, um, e.g. "0.1 mm"' in said

@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from email.message import Message as Headers
@@ -21,15 +20,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from playwright.sync_api import Browser, Locator, Page, expect
+from playwright.sync_api import expect
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.import_campaign import import_campaign
 from hilcal.tables.table import write_table
 from hilcal.whole_file import replace_file
-from hilcal.workbench.guard import AccessGuard, Message, Receive, Scope, Send
+from hilcal.workbench.guard import AccessGuard, Message
 from tests.support.bench_cases import BASE, TILT, stored
 from tests.support.browser import CHROMIUM, DESKTOP, PHONE, needs_chromium, open_browser
 from tests.support.cli_cases import refused, start
@@ -96,13 +95,12 @@ class Served:
 
 
 @contextmanager
-def workbench(folder: Path, browser: bool = False, *given: str | Path) -> Iterator[Served]:
+def workbench(folder, browser=False, *given):
     """Serve a campaign, or what is given in its place."""
     begun = given or (stored(folder / "run.hilcal"),)
     options = () if browser else ("--no-browser",)
     process = start("workbench", *begun, *options, "--port", "0", "--json", cwd=folder)
     try:
-        assert process.stdout is not None
         told = json.loads("".join(iter(process.stdout.readline, "}\n")) + "}")
         yield Served(folder / told["run"], told["url"], process)
     finally:
@@ -111,18 +109,18 @@ def workbench(folder: Path, browser: bool = False, *given: str | Path) -> Iterat
 
 
 @pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+def served(tmp_path_factory):
     with workbench(tmp_path_factory.mktemp("bench")) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
+def browser():
     with open_browser() as found:
         yield found
 
 
-def test_only_the_browser_with_the_address_is_let_in(served: Served) -> None:
+def test_only_the_browser_with_the_address_is_let_in(served):
     cookie, host = served.cookie, f"127.0.0.1:{served.port}"
     here = {"Cookie": cookie}
     page = served.ask(**here)
@@ -158,7 +156,7 @@ def test_only_the_browser_with_the_address_is_let_in(served: Served) -> None:
     assert (again.status, again.headers["Set-Cookie"]) == (303, None)
 
 
-def test_the_token_is_good_for_one_exchange(served: Served) -> None:
+def test_the_token_is_good_for_one_exchange(served):
     assert served.token not in served.cookie
     again = served.ask(f"/?token={served.token}")
     assert (again.status, again.headers["Set-Cookie"]) == (403, None)
@@ -178,7 +176,7 @@ def test_the_token_is_good_for_one_exchange(served: Served) -> None:
     assert [asked(guard, "/?token=secret") for _ in range(3)] == [200, 403, 403]
 
 
-def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_token_that_nobody_uses_dies(monkeypatch):
     monkeypatch.setattr("hilcal.workbench.guard.UNUSED_S", 0.1)
     unused, used = (AccessGuard(nothing, 8787, "secret") for _ in range(2))
     assert asked(used, "/?token=secret") == 200
@@ -190,7 +188,7 @@ def test_the_token_that_nobody_uses_dies(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 @pytest.mark.long
-def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path: Path) -> None:
+def test_the_session_ends_with_the_token_that_nobody_uses(tmp_path):
     run = stored(tmp_path / "run.hilcal")
     code = f"""
 from hilcal.workbench import guard
@@ -206,18 +204,18 @@ main(["workbench", {str(run)!r}, "--no-browser", "--port", "0", "--json"])
     assert "token=" in json.loads(done.stdout)["url"]
 
 
-async def nothing(scope: Scope, receive: Receive, send: Send) -> None:
+async def nothing(scope, receive, send):
     """An application that answers nothing."""
 
 
-def asked(guard: AccessGuard, path: str, method: str = "GET", **heads: str) -> int:
+def asked(guard, path, method="GET", **heads):
     """The status of an answer."""
     told: list[Message] = []
 
-    async def send(message: Message) -> None:
+    async def send(message):
         told.append(message)
 
-    async def receive() -> Message:
+    async def receive():
         raise AssertionError
 
     where, _, query = path.partition("?")
@@ -232,9 +230,7 @@ def asked(guard: AccessGuard, path: str, method: str = "GET", **heads: str) -> i
 
 @needs_chromium
 @pytest.mark.slow
-def test_no_other_user_sees_the_token(
-    tmp_path: Path, browser: Browser, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_other_user_sees_the_token(tmp_path, browser, monkeypatch):
     """The command opens a real browser; meanwhile the arguments of all processes are read."""
     opener = tmp_path / "opener"
     opener.write_text(
@@ -258,9 +254,7 @@ def test_no_other_user_sees_the_token(
     assert not any(served.token.encode() in line for line in seen)
 
 
-def test_what_opens_the_page_is_of_its_user_alone(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_opens_the_page_is_of_its_user_alone(tmp_path, monkeypatch):
     opener = tmp_path / "opener"
     opener.write_text(f'#!/bin/sh\nprintf %s "$1" > {tmp_path}/given\n')
     opener.chmod(0o700)
@@ -278,7 +272,7 @@ def test_what_opens_the_page_is_of_its_user_alone(
         assert not file.parent.exists()
 
 
-def waited_for(file: Path) -> str:
+def waited_for(file):
     """What another process writes into a file."""
     end = time.monotonic() + WAIT / 1000
     while not (file.exists() and file.read_text()):
@@ -288,12 +282,12 @@ def waited_for(file: Path) -> str:
 
 
 @contextmanager
-def every_command_line() -> Iterator[set[bytes]]:
+def every_command_line():
     """Collect the arguments of all processes of the machine, as any user can read them."""
     seen: set[bytes] = set()
     ended = threading.Event()
 
-    def look() -> None:
+    def look():
         while not ended.wait(0.01):
             for path in glob.glob("/proc/[0-9]*/cmdline"):
                 with suppress(OSError):
@@ -308,7 +302,7 @@ def every_command_line() -> Iterator[set[bytes]]:
         thread.join()
 
 
-def test_a_socket_is_opened_by_its_own_page_alone(served: Served) -> None:
+def test_a_socket_is_opened_by_its_own_page_alone(served):
     own = {"Cookie": served.cookie, "Origin": f"http://127.0.0.1:{served.port}"}
     assert served.handshake(**own) == 101
     name = served.cookie.partition("=")[0]
@@ -330,7 +324,7 @@ def test_a_socket_is_opened_by_its_own_page_alone(served: Served) -> None:
     assert served.ask(poll).status == 403
 
 
-def test_no_file_of_the_machine_is_served(served: Served) -> None:
+def test_no_file_of_the_machine_is_served(served):
     for path in (
         "/run.hilcal",
         "/etc/passwd",
@@ -349,9 +343,9 @@ def test_no_file_of_the_machine_is_served(served: Served) -> None:
 
 
 def test_what_is_wrong_is_one_line(
-    tmp_path: Path, served: Served, capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+    tmp_path, served, capsys,
+    monkeypatch,
+):  # fmt: skip
     assert "no such campaign file" in refused(capsys, 2, "workbench", tmp_path / "none.hilcal")
     taken = ("workbench", served.run, "--no-browser", "--port", str(served.port))
     assert "choose a free port" in refused(capsys, 2, *taken)
@@ -364,7 +358,7 @@ REPLACED = "Resize must be passed a displayed plot div element."
 """Said by Plotly where a chart is replaced between its change of size and the redrawing of it."""
 
 
-def opened(browser: Browser, served: Served, told: list[str], **options: object) -> Page:
+def opened(browser, served, told, **options):
     """Open the page, and collect what its console says."""
     context = browser.new_context(**options)  # type: ignore[arg-type]
     page = context.new_page()
@@ -386,16 +380,14 @@ def opened(browser: Browser, served: Served, told: list[str], **options: object)
     return page
 
 
-def number(page: Page, what: str) -> float:
+def number(page, what):
     """Read a number with its unit, µm."""
     return float(page.locator(".number", has_text=what).locator("b").inner_text().split()[0])
 
 
 @needs_chromium
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.long)])
-def test_the_page_fits_desktop_and_phone(
-    browser: Browser, served: Served, scheme: str, tmp_path: Path
-) -> None:
+def test_the_page_fits_desktop_and_phone(browser, served, scheme, tmp_path):
     told: list[str] = []
     with Campaign.open(served.run, read_only=True) as o:
         readings = int((o.file.readings().load > 0).sum())
@@ -406,11 +398,9 @@ def test_the_page_fits_desktop_and_phone(
         page.screenshot(path=tmp_path / f"{scheme}-{size['width']}.png", full_page=True)
         assert page.evaluate("document.documentElement.scrollWidth") <= size["width"]
         first = page.locator("[data-part=verdict]").bounding_box()
-        assert first is not None
         assert first["y"] + first["height"] < size["height"]  # the verdict is on the first screen
         for part in ("verdict", "fails", "missing", "fell", "readings"):
             box = page.locator(f"[data-part={part}]").first.bounding_box()
-            assert box is not None, part
             assert box["x"] >= 0, part
             assert box["x"] + box["width"] <= size["width"], part
         expect(page.locator("[data-part=missing] tbody tr").filter(has_text=TILT)).to_be_visible()
@@ -423,7 +413,7 @@ def test_the_page_fits_desktop_and_phone(
 
 @pytest.mark.long
 @needs_chromium
-def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: Served) -> None:
+def test_an_operator_sees_adds_removes_and_goes_back(browser, served):
     told: list[str] = []
     before = served.run.read_bytes()
     page = opened(browser, served, told, viewport=DESKTOP)
@@ -432,7 +422,6 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     assert served.run.read_bytes() == before  # opening it wrote nothing
 
     bar = page.locator("[data-part=fails] .bars .point path").nth(1).bounding_box()
-    assert bar is not None
     x, y = bar["x"] + bar["width"] / 2, bar["y"] + bar["height"] / 2
     picked = page.locator("[data-part=picked] tbody tr").first
     for _ in range(20):  # Plotly takes a click for one of a bar once it has seen the pointer there
@@ -475,7 +464,6 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
         made = [(r.added, r.removed) for r in o.file.revisions()]
         assert made == [(None, None), (BASE, None), (None, BASE)]  # each click once, none lost
         used = o.in_use()
-        assert used is not None
         assert used.number == 2
 
     os.utime(served.run)  # as another command leaves it
@@ -488,11 +476,11 @@ def test_an_operator_sees_adds_removes_and_goes_back(browser: Browser, served: S
     assert told == []
 
 
-def field(page: Page, name: str) -> Locator:
+def field(page, name):
     return page.get_by_label(name, exact=True)
 
 
-def came(page: Page, place: str, how: str, words: str) -> None:
+def came(page, place, how, words):
     """Wait for an answer at a place of the page."""
     answer = page.locator(f"[data-answer={place}]")
     expect(answer).to_have_attribute("data-came", how, timeout=WAIT)
@@ -502,9 +490,7 @@ def came(page: Page, place: str, how: str, words: str) -> None:
 
 @pytest.mark.long
 @needs_chromium
-def test_a_table_becomes_a_calibration_at_one_page(
-    browser: Browser, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_table_becomes_a_calibration_at_one_page(browser, tmp_path, capsys):
     told: list[str] = []
     table, config = unstated(tmp_path / "t.csv"), tmp_path / "CELL.toml"
     replace_file(config, to_toml(SMALL).replace("[tracker]", "[tracker]\nrange_std_m = 5e-6"))
@@ -573,7 +559,7 @@ def test_a_table_becomes_a_calibration_at_one_page(
     assert "are of a table" in refused(capsys, 2, "workbench", served.run, "--format", "ipa-ur10")
 
 
-def unstated(path: Path) -> Path:
+def unstated(path):
     """Write readings as a table that does not state their covariances."""
     write_table(doubtful(BASE, 2).rehearsal.readings, path)
     rows = [line.split(",") for line in path.read_text().splitlines()]
@@ -584,9 +570,7 @@ def unstated(path: Path) -> Path:
 
 @needs_chromium
 @pytest.mark.slow
-def test_the_next_measurement_is_planned_and_the_arm_is_seen(
-    browser: Browser, tmp_path: Path
-) -> None:
+def test_the_next_measurement_is_planned_and_the_arm_is_seen(browser, tmp_path):
     told: list[str] = []
     with workbench(tmp_path) as served:
         page = opened(browser, served, told, viewport=DESKTOP)
@@ -604,7 +588,7 @@ def test_the_next_measurement_is_planned_and_the_arm_is_seen(
 
 
 @pytest.mark.long
-def test_ctrl_c_ends_it_and_leaves_nothing(served: Served) -> None:
+def test_ctrl_c_ends_it_and_leaves_nothing(served):
     """The last one: whatever the others have done there."""
     served.process.send_signal(signal.SIGINT)
     _, err = served.process.communicate(timeout=60)

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from hilcal.config import load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.store.campaign_file import CampaignFile
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, Capsys, quickly_planned, run

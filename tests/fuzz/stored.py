@@ -26,8 +26,8 @@ from hilcal.store import revision, run_log
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview, to_json
 from hilcal.store.rows import _reading_crc, text_crc
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.parquet_stream import open_stream
+from hilcal.tables.propose import propose
 from hilcal.tables.write import revision_table
 from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import Bench

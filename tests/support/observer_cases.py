@@ -7,7 +7,7 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.drivers.simulated.injected_effects import hide
 from hilcal.drivers.simulated.world import World
 from hilcal.readings.covariance import WHOLE  # noqa: F401 - for the tests

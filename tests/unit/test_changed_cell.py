@@ -10,7 +10,7 @@ import pytest
 from hilcal.campaign.campaign import Campaign
 from hilcal.campaign.changes import change_cell
 from hilcal.config.changes import Changes, changed, read_value, write_value
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.errors import InputError
 from hilcal.import_campaign import import_campaign
 from hilcal.robot.se3 import rotation_vector

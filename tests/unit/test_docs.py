@@ -13,7 +13,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import CellConfig, load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.effects.catalogue import ENTRY_POINT_GROUP
 from hilcal.measuring.devices import TRACKERS
 from hilcal.readings.covariance import WHOLE

@@ -16,7 +16,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.config import load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.readings.covariance import WHOLE
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile

@@ -1,7 +1,5 @@
 """Cell files: what is read, and one clear line for everything that is wrong."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,7 +7,7 @@ from hypothesis import strategies as st
 
 from hilcal.cell import STANDARD_GRAVITY, cell_from_config
 from hilcal.config import CellConfig, CellLoad, load_config
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.errors import InputError
 from hilcal.names import escaped
 from hilcal.robot.catalogue import configs_dir
@@ -18,13 +16,13 @@ from tests.support.refusals import check, refusals
 ROBOT = '[robot]\nmodel = "ur10e"\n'
 
 
-def load(tmp_path: Path, text: str) -> CellConfig:
+def load(tmp_path, text):
     path = tmp_path / "cell.toml"
     path.write_text(text, encoding="utf-8")
     return load_config(path)
 
 
-def test_the_least_that_is_needed(tmp_path: Path) -> None:
+def test_the_least_that_is_needed(tmp_path):
     config = load(tmp_path, ROBOT)
     cell = cell_from_config(config, tmp_path)
     assert cell.arm.name == "ur10e"
@@ -38,7 +36,7 @@ def test_the_least_that_is_needed(tmp_path: Path) -> None:
     assert config.loads == ()
 
 
-def test_everything_is_taken_over(tmp_path: Path) -> None:
+def test_everything_is_taken_over(tmp_path):
     config = load(
         tmp_path,
         """
@@ -88,7 +86,7 @@ def test_everything_is_taken_over(tmp_path: Path) -> None:
     assert (config.simulation.seed, config.simulation.hide) == (7, "hysteresis")
 
 
-def test_readings_in_base_axes_need_no_registration(tmp_path: Path) -> None:
+def test_readings_in_base_axes_need_no_registration(tmp_path):
     config = load(tmp_path, ROBOT + '[tracker]\nframe = "base"\nstation_m = [3, 0, 1]\n')
     cell = cell_from_config(config, tmp_path)
     assert cell.registration_known
@@ -96,12 +94,12 @@ def test_readings_in_base_axes_need_no_registration(tmp_path: Path) -> None:
     assert config.tracker.station_m == (3.0, 0.0, 1.0)
 
 
-def test_one_repeatability_holds_for_all_joints(tmp_path: Path) -> None:
+def test_one_repeatability_holds_for_all_joints(tmp_path):
     config = load(tmp_path, ROBOT + "[repeatability]\njoint_std_rad = 1e-5\n")
     np.testing.assert_array_equal(config.repeatability.per_joint(6), np.full(6, 1e-5))
 
 
-def test_a_robot_file_is_found_beside_the_cell_file(tmp_path: Path) -> None:
+def test_a_robot_file_is_found_beside_the_cell_file(tmp_path):
     (tmp_path / "arms").mkdir()
     text = (configs_dir() / "robots" / "ur3.toml").read_text()
     (tmp_path / "arms" / "mine.toml").write_text(text)
@@ -112,12 +110,12 @@ def test_a_robot_file_is_found_beside_the_cell_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "path", sorted((configs_dir() / "cells").glob("*.toml")), ids=lambda p: p.stem
 )
-def test_example_cells(path: Path) -> None:
+def test_example_cells(path):
     cell = cell_from_config(load_config(path), path.parent)
     assert cell.arm.n == 6
 
 
-def test_the_demo_cell_stays_within_the_payload() -> None:
+def test_the_demo_cell_stays_within_the_payload():
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     cell = cell_from_config(config)
     for load in config.loads:
@@ -137,7 +135,7 @@ LOAD = st.text(min_size=1).filter(lambda name: escaped(name) == name)
     joint_std=st.floats(0, 1e-3) | st.tuples(*[st.floats(0, 1e-3)] * 6),
     base=st.none() | st.tuples(vector, vector),
 )
-def test_json_round_trip(target, mass, loads, joint_std, base) -> None:  # type: ignore[no-untyped-def]
+def test_json_round_trip(target, mass, loads, joint_std, base):  # type: ignore[no-untyped-def]
     tracker = {} if base is None else {"base_xyz_m": base[0], "base_rotvec_rad": base[1]}
     config = CellConfig.model_validate(
         {
@@ -154,7 +152,7 @@ def test_json_round_trip(target, mass, loads, joint_std, base) -> None:  # type:
     assert CellConfig.from_json(config.to_json()) == config
 
 
-def test_a_configuration_cannot_be_changed(tmp_path: Path) -> None:
+def test_a_configuration_cannot_be_changed(tmp_path):
     config = load(tmp_path, ROBOT)
     with pytest.raises(ValueError, match="frozen"):
         config.tool.mass_kg = 1.0
@@ -164,7 +162,7 @@ LOAD = '[[loads]]\nname = "a"\nmass_kg = 1.0\n'
 
 
 @refusals("cell")
-def test_wrong_cell_file(tmp_path: Path, case: tuple[str, str], given: str) -> None:
+def test_wrong_cell_file(tmp_path, case, given):
     with pytest.raises(InputError) as raised:
         load(tmp_path, given)
     assert raised.value.exit_code == 2
@@ -175,30 +173,26 @@ def test_wrong_cell_file(tmp_path: Path, case: tuple[str, str], given: str) -> N
     ("text", "place"),
     [("[tool\n", "line 3"), ("[tool]\nmass_kg =", "line 4"), ('model = "ur5"\n', "line 3")],
 )
-def test_what_is_not_toml_is_told_by_its_place(tmp_path: Path, text: str, place: str) -> None:
+def test_what_is_not_toml_is_told_by_its_place(tmp_path, text, place):
     with pytest.raises(InputError, match=rf"^cell.toml: TOML syntax error: .*{place}"):
         load(tmp_path, ROBOT + text)
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
-        ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
-        ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
-        (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
-        (
-            ROBOT + "[repeatability]\njoint_std_rad = [1e-5, 1e-5]\n",
-            r"joint_std_rad has 2 values; it must be one number or 6, one per joint",
-        ),
-    ],
-)
-def test_wrong_cell(tmp_path: Path, text: str, message: str) -> None:
+@pytest.mark.parametrize(("text", "message"), [
+    ('[robot]\nmodel = "ur11"\n', r'unknown robot "ur11".*valid: .*ur10, ur10e, ur12e, ur15'),
+    ('[robot]\nmodel = "none.urdf"\n', r"none\.urdf: No such file"),
+    ('[robot]\nmodel = "none.toml"\n', r"none\.toml: no such file"),
+    (ROBOT + "base_link = 'a'\n", r'base_link = "a" is only for a URDF'),
+    (
+        ROBOT + "[repeatability]\njoint_std_rad = [1e-5, 1e-5]\n",
+        r"joint_std_rad has 2 values; it must be one number or 6, one per joint",
+    )])  # fmt: skip
+def test_wrong_cell(tmp_path, text, message):
     with pytest.raises(InputError, match=message):
         cell_from_config(load(tmp_path, text), tmp_path)
 
 
-def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+def test_files_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"absent\.toml: no such file; expected a TOML file"):
         load_config(tmp_path / "absent.toml")
     with pytest.raises(InputError, match="cannot be read"):
@@ -208,15 +202,11 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         load_config(tmp_path / "binary.toml")
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", r"stored cell configuration: not JSON.*line 1"),
-        ("[]", "stored cell configuration: "),
-        ('{"robot": {"model": "ur10", "x": 1}}', r'\[robot\] has no key "x"'),
-    ],
-)
-def test_wrong_json(text: str, message: str) -> None:
+@pytest.mark.parametrize(("text", "message"), [
+    ("{", r"stored cell configuration: not JSON.*line 1"),
+    ("[]", "stored cell configuration: "),
+    ('{"robot": {"model": "ur10", "x": 1}}', r'\[robot\] has no key "x"')])  # fmt: skip
+def test_wrong_json(text, message):
     with pytest.raises(InputError, match=message) as raised:
         CellConfig.from_json(text)
     assert "\n" not in str(raised.value)
@@ -265,7 +255,7 @@ clearance_m = 0.02
 )
 
 
-def test_defaults(tmp_path: Path) -> None:
+def test_defaults(tmp_path):
     config = load(tmp_path, ROBOT)
     planning, sight = config.planning, config.sight
     assert planning.model == ("joint_compliance",)
@@ -283,7 +273,7 @@ def test_defaults(tmp_path: Path) -> None:
     assert (sight.incidence_max_rad, sight.clearance_m) == (0.5, 0.03)
 
 
-def test_everything_is_taken_over_and_written_back(tmp_path: Path) -> None:
+def test_everything_is_taken_over_and_written_back(tmp_path):
     config = load(tmp_path, EVERYTHING)
     assert config.planning.against == ("thermal",)
     assert config.planning.work_q_rad[1] == (0.1, -1.5, 1.5, 0, 0, 0)
@@ -297,7 +287,7 @@ def test_everything_is_taken_over_and_written_back(tmp_path: Path) -> None:
     assert CellConfig.from_json(config.to_json()) == config
 
 
-def test_the_work_may_be_a_box(tmp_path: Path) -> None:
+def test_the_work_may_be_a_box(tmp_path):
     text = ROBOT + (
         '[planning]\ncriterion = "test"\nwork_min_m = [0, 0, 0]\nwork_max_m = [1, 1, 1]\nagainst=[]'
     )
@@ -307,14 +297,10 @@ def test_the_work_may_be_a_box(tmp_path: Path) -> None:
     assert planning.against == ()
 
 
-@pytest.mark.parametrize(
-    ("load", "hangs"),
-    [
-        (CellLoad(name="a", mass_kg=1.0), 0.3),
-        (CellLoad(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
-        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
-        (CellLoad(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1),
-    ],
-)
-def test_only_a_load_with_a_mass_hangs_unless_told(load: CellLoad, hangs: float) -> None:
+@pytest.mark.parametrize(("load", "hangs"), [
+    (CellLoad(name="a", mass_kg=1.0), 0.3),
+    (CellLoad(name="a", mass_kg=1.0, hang_m=0.0), 0.0),
+    (CellLoad(name="a", force_N=(1.0, 0.0, 0.0)), 0.0),
+    (CellLoad(name="a", force_N=(1.0, 0.0, 0.0), hang_m=0.1), 0.1)])  # fmt: skip
+def test_only_a_load_with_a_mass_hangs_unless_told(load, hangs):
     assert load.hanging_m == hangs

@@ -1,25 +1,23 @@
 """`hilcal config` and its page in the documents: every key, with what a reader needs."""
 
 import tomllib
-from collections.abc import Iterator
 from typing import Annotated, Any, get_args
 
 import pytest
 from pydantic import TypeAdapter
-from pydantic.fields import FieldInfo
 
 from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
-from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
+from hilcal.config.reference import NOT_SET, REQUIRED, tables
 from hilcal.present.preparing import reference_page
-from hilcal.toml import Section, section_of
-from tests.support.cli_cases import Capsys, ok, refused
+from hilcal.toml import section_of
+from tests.support.cli_cases import ok, refused
 from tests.support.paths import ROOT
 
 TABLES = {t.name: t for t in tables(DRIVERS_OWN)}
 
 
-def fields(section: type[Section], name: str) -> Iterator[tuple[str, str, FieldInfo]]:
+def fields(section, name):
     """All keys, found without the code under test: section, key, field."""
     for key, field in section.model_fields.items():
         if name:
@@ -35,12 +33,12 @@ FIELDS = [
 ]
 
 
-def key_of(section: str, key: str) -> Key:
+def key_of(section, key):
     (found,) = [k for k in TABLES[section].keys if k.name == key]
     return found
 
 
-def numeric(annotation: Any) -> bool:
+def numeric(annotation):
     """Whether a value is a number or made of numbers."""
     parts = get_args(annotation)
     if annotation in (int, float):
@@ -49,9 +47,7 @@ def numeric(annotation: Any) -> bool:
 
 
 @pytest.mark.parametrize(("section", "key", "field"), FIELDS, ids=lambda x: str(x)[:30])
-def test_every_key_has_unit_default_and_an_example_that_is_valid(
-    section: str, key: str, field: FieldInfo
-) -> None:
+def test_every_key_has_unit_default_and_an_example_that_is_valid(section, key, field):
     found = key_of(section, key)
     assert found.valid == field.description
     adapter: TypeAdapter[Any] = TypeAdapter(Annotated[field.annotation, *field.metadata, field])
@@ -77,7 +73,7 @@ def test_every_key_has_unit_default_and_an_example_that_is_valid(
         assert found.unit
 
 
-def test_the_example_of_a_section_is_a_section() -> None:
+def test_the_example_of_a_section_is_a_section():
     """The keys of a section together, but for those that exclude each other."""
     apart = {"targets", "station_m", "work_q_rad", "options", "model", "joint_coupling"}
     apart |= {"center_m", "size_m", "base_link", "tip_link", "tracker_m"}
@@ -92,20 +88,20 @@ def test_the_example_of_a_section_is_a_section() -> None:
     assert config.plausible == {"link_geometry": 4.0}
 
 
-def test_no_key_is_invented() -> None:
+def test_no_key_is_invented():
     real = {(section, key) for section, key, _ in FIELDS}
     real |= {("plausible", "NAME"), ("ordinary", "NAME")}
     assert {(t.name, k.name) for t in TABLES.values() for k in t.keys} == real
 
 
-def test_the_page_of_the_reference_is_what_the_program_writes() -> None:
+def test_the_page_of_the_reference_is_what_the_program_writes():
     path = ROOT / "docs" / "reference" / "cell-configuration.md"
     assert path.read_text(encoding="utf-8") == reference_page(list(TABLES.values())), (
         "write it anew: python -c 'from hilcal.cli.looking_up import write_page; write_page()'"
     )
 
 
-def test_config_in_the_terminal(capsys: Capsys) -> None:
+def test_config_in_the_terminal(capsys):
     words = ok(capsys, "config").out
     for t in TABLES.values():
         assert t.header in words

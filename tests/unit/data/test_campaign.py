@@ -1,5 +1,7 @@
-"""The campaign file: nothing committed is lost, nothing can be changed, damage is noticed."""
+"""The campaign file: readings that never change, moves, power losses, older versions."""
 
+import gzip
+import os
 import random
 import shutil
 import signal
@@ -7,7 +9,6 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,13 +17,22 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hilcal.errors import InputError
-from hilcal.readings.readings import Readings
+from hilcal.campaign.campaign import Campaign
+from hilcal.campaign.revisions import restore
+from hilcal.cli import main
+from hilcal.errors import HilcalError, InputError, MovedFileError
+from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.records import content_hash
-from hilcal.store.revision import RevisionRecord
+from hilcal.store.revision import STORED, RevisionRecord
+from hilcal.store.rows import _reading_crc
+from hilcal.store.run_log import RunLog
 from hilcal.store.schema import sqlite_errors
+from tests.support import power_loss
+from tests.support.paths import ROOT
 from tests.support.readings_cases import assert_same, readings, simple
+from tests.support.unguarded import unguarded
+from tests.unit.data.test_run_log import STEPS, _campaign, _reading
 
 per_example_file = settings(
     deadline=None, max_examples=15, suppress_health_check=[HealthCheck.function_scoped_fixture]
@@ -48,7 +58,7 @@ REVISION = RevisionRecord(
 )
 
 
-def make(path: Path, x: Readings | None = None) -> Path:
+def make(path, x=None):
     with CampaignFile.create(path, '{"robot": "ur10"}', "base/dir", "a test") as campaign:
         if x is not None:
             campaign.append_readings(x)
@@ -56,14 +66,14 @@ def make(path: Path, x: Readings | None = None) -> Path:
 
 
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[CampaignFile]:
+def run(tmp_path):
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "a test") as campaign:
         yield campaign
 
 
 @per_example_file
 @given(x=readings())
-def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
+def test_round_trip_is_exact(tmp_path, x):
     path = tmp_path / "run.hilcal"
     with CampaignFile.create(path, "{}", "", "", overwrite=True) as campaign:
         assert campaign.append_readings(x) == len(x)
@@ -73,7 +83,7 @@ def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
     assert [p.name for p in tmp_path.iterdir()] == ["run.hilcal"]
 
 
-def test_description_is_kept(tmp_path: Path) -> None:
+def test_description_is_kept(tmp_path):
     path = make(tmp_path / "run.hilcal")
     with CampaignFile.open(path) as campaign:
         assert campaign.config_json == '{"robot": "ur10"}'
@@ -87,9 +97,7 @@ def test_description_is_kept(tmp_path: Path) -> None:
 
 @per_example_file
 @given(cuts=st.lists(st.integers(0, 12), max_size=4).map(sorted))
-def test_hash_does_not_depend_on_how_readings_were_appended(
-    tmp_path: Path, cuts: list[int]
-) -> None:
+def test_hash_does_not_depend_on_how_readings_were_appended(tmp_path, cuts):
     x = simple(12)
     with CampaignFile.create(tmp_path / "run.hilcal", "{}", "", "", overwrite=True) as campaign:
         for start, stop in zip([0, *cuts], [*cuts, 12], strict=True):
@@ -98,13 +106,13 @@ def test_hash_does_not_depend_on_how_readings_were_appended(
         assert campaign.data_hash() == content_hash(x)
 
 
-def test_hash_does_not_depend_on_the_numbers_of_names() -> None:
+def test_hash_does_not_depend_on_the_numbers_of_names():
     x = simple(3)
     other = replace(x, pose=np.array([3, 1, 0]), pose_names=("p2", "p1", "unused", "p0"))
     assert content_hash(other) == content_hash(x)
 
 
-def test_hash_sees_every_change() -> None:
+def test_hash_sees_every_change():
     x = simple(3)
     value = x.value.copy()
     value[2, 1] = np.nextafter(value[2, 1], 9.0)
@@ -125,7 +133,7 @@ def test_hash_sees_every_change() -> None:
     assert len(hashes) == len(others) + 1
 
 
-def test_later_readings_bring_new_poses_and_loads(run: CampaignFile) -> None:
+def test_later_readings_bring_new_poses_and_loads(run):
     x, y = simple(2), simple(3, seed=1)
     y = replace(y, pose_names=("p1", "new", "p0"), load_names=("plate",))
     q = y.states.q.copy()
@@ -141,7 +149,7 @@ def test_later_readings_bring_new_poses_and_loads(run: CampaignFile) -> None:
     np.testing.assert_array_equal(z.value, np.vstack([x.value, y.value]))
 
 
-def test_readings_that_do_not_fit_are_refused_whole(run: CampaignFile) -> None:
+def test_readings_that_do_not_fit_are_refused_whole(run):
     x = simple(4)
     run.append_readings(x[:2])
     nan = x.value.copy()
@@ -164,7 +172,7 @@ def test_readings_that_do_not_fit_are_refused_whole(run: CampaignFile) -> None:
 
 
 @pytest.mark.parametrize("table", ["readings", "revisions", "poses", "loads", "meta"])
-def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) -> None:
+def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path, table):
     path = make(tmp_path / "run.hilcal", simple(3))
     with CampaignFile.open(path) as campaign:
         campaign.append_revision(REVISION)
@@ -183,7 +191,7 @@ def test_rows_cannot_be_changed_deleted_or_replaced(tmp_path: Path, table: str) 
         assert len(campaign.revisions()) == 1
 
 
-def test_revisions_are_numbered_and_come_back(run: CampaignFile) -> None:
+def test_revisions_are_numbered_and_come_back(run):
     first = replace(REVISION, added=None, number=99)
     assert run.append_revision(first) == 1
     assert run.append_revision(REVISION) == 2
@@ -196,7 +204,7 @@ def test_revisions_are_numbered_and_come_back(run: CampaignFile) -> None:
     assert len(run.revisions()) == 2
 
 
-def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
+def test_an_existing_file_is_not_overwritten_unasked(tmp_path):
     path = make(tmp_path / "run.hilcal", simple(2))
     with pytest.raises(InputError, match="the file exists"):
         make(path)
@@ -213,7 +221,7 @@ def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
         CampaignFile.create(tmp_path / "absent" / "run.hilcal", "{}", "", "")
 
 
-def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: Path) -> None:
+def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path):
     path = tmp_path / "run.hilcal"
     stray = tmp_path / "run.hilcal-journal"
     stray.write_bytes(b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7" + bytes(1000))
@@ -223,8 +231,8 @@ def test_a_journal_left_by_another_file_is_not_rolled_into_a_new_one(tmp_path: P
         assert_same(campaign.readings(), simple(2))
 
 
-def test_files_that_are_no_campaign(tmp_path: Path) -> None:
-    def refused(path: Path, message: str) -> None:
+def test_files_that_are_no_campaign(tmp_path):
+    def refused(path, message):
         with pytest.raises(InputError, match=message) as error:
             CampaignFile.open(path)
         assert "\n" not in str(error.value)
@@ -248,7 +256,7 @@ def test_files_that_are_no_campaign(tmp_path: Path) -> None:
     refused(path, "newer hilcal")
 
 
-def test_every_truncation_is_noticed(tmp_path: Path) -> None:
+def test_every_truncation_is_noticed(tmp_path):
     whole = make(tmp_path / "run.hilcal", simple(60)).read_bytes()
     cut = tmp_path / "cut.hilcal"
     rng = random.Random(3)
@@ -264,7 +272,7 @@ def test_every_truncation_is_noticed(tmp_path: Path) -> None:
         assert_same(campaign.readings(), simple(60))
 
 
-def test_damaged_bytes_never_give_wrong_data(tmp_path: Path) -> None:
+def test_damaged_bytes_never_give_wrong_data(tmp_path):
     x = simple(40)
     path = make(tmp_path / "run.hilcal", x)
     with CampaignFile.open(path) as campaign:
@@ -297,7 +305,7 @@ with CampaignFile.open(sys.argv[2]) as run:
 """
 
 
-def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
+def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path):
     x = simple(400)
     source = make(tmp_path / "source.hilcal", x)
     path = make(tmp_path / "run.hilcal")
@@ -308,7 +316,6 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
             stdout=subprocess.PIPE,
             text=True,
         )
-        assert process.stdout is not None
         for _ in range(rng.randrange(1, 30)):
             acknowledged = int(process.stdout.readline())
         time.sleep(rng.random() * 0.01)
@@ -335,7 +342,7 @@ def test_a_kill_at_any_moment_loses_nothing_committed(tmp_path: Path) -> None:
     connection.close()
 
 
-def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
+def test_a_second_writer_waits_or_is_told(tmp_path):
     path = make(tmp_path / "run.hilcal", simple(2))
     with CampaignFile.open(path) as one, CampaignFile.open(path) as two:
         one.append_readings(replace(simple(1), pose_names=("a",)))
@@ -346,7 +353,7 @@ def test_a_second_writer_waits_or_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "words", ["attempt to write a readonly database", "unable to open database file"]
 )
-def test_a_read_only_file_or_folder_is_said(words: str) -> None:
+def test_a_read_only_file_or_folder_is_said(words):
     """As SQLite words them: for the superuser, who may run the tests, nothing is read-only."""
     with (
         pytest.raises(
@@ -355,3 +362,307 @@ def test_a_read_only_file_or_folder_is_said(words: str) -> None:
         sqlite_errors(Path("run.hilcal")),
     ):
         raise sqlite3.OperationalError(words)
+
+
+def _replace(path):
+    other = path.with_name("other")
+    _campaign(other).close()
+    other.replace(path)
+
+
+def _rename_folder(path):
+    path.parent.rename(path.parent.with_name("renamed"))
+
+
+LOST = {
+    "deleted": Path.unlink,
+    "replaced by another campaign": _replace,
+    "replaced by a text": lambda p: (p.unlink(), p.write_text("x")),
+    "moved": lambda p: p.rename(p.with_name("moved.hilcal")),
+    "its folder moved": _rename_folder,
+    "its folder deleted": lambda p: shutil.rmtree(p.parent),
+}
+
+
+def _found(error):
+    return Path(str(error).partition(" are in ")[2].partition(": move that back")[0])
+
+
+@pytest.mark.parametrize("how", LOST)
+@pytest.mark.parametrize("when", ["before a store", "at the end"])
+def test_what_was_measured_is_found_again(how, when, tmp_path, monkeypatch):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    path = tmp_path / "folder" / "run.hilcal"
+    path.parent.mkdir()
+
+    def measure():
+        with _campaign(path) as file:
+            log = RunLog(file)
+            for step in STEPS[:2]:
+                log.record(_reading(step), step, {})
+            LOST[how](path)
+            if when == "before a store":
+                log.record(_reading(STEPS[2]), STEPS[2], {})
+
+    with pytest.raises(MovedFileError) as told:
+        measure()
+    assert str(told.value).startswith(f"{path}: deleted, replaced or moved")
+    assert "all 2 readings" in str(told.value)
+    place = _found(told.value)
+    assert place != path
+    with CampaignFile.open(place) as file:
+        assert RunLog(file).done() == frozenset(STEPS[:2])
+        log = RunLog(file)
+        log.record(_reading(STEPS[2]), STEPS[2], {})  # and it goes on
+    if how == "replaced by a text":
+        assert path.read_text() == "x"
+
+
+def test_a_rescued_copy_replaces_no_file(tmp_path):
+    path, there = tmp_path / "run.hilcal", tmp_path / "run.rescued.hilcal"
+    there.write_text("kept")
+    file = _campaign(path)
+    log = RunLog(file)
+    log.record(_reading(STEPS[0]), STEPS[0], {})
+    path.unlink()
+    with pytest.raises(MovedFileError) as told, file:
+        pass
+    assert there.read_text() == "kept"
+    assert _found(told.value).name == "run.rescued-2.hilcal"
+
+
+def test_a_link_to_a_campaign_is_its_place(tmp_path):
+    real, link = tmp_path / "real.hilcal", tmp_path / "link.hilcal"
+    _campaign(real).close()
+    link.symlink_to(real)
+    with CampaignFile.open(link) as file:
+        log = RunLog(file)
+        log.record(_reading(STEPS[0]), STEPS[0], {})
+        real.rename(tmp_path / "renamed.hilcal")
+        with pytest.raises(MovedFileError, match=r"renamed\.hilcal"):
+            log.event("x", {})
+    assert link.is_symlink()
+
+
+def test_a_killed_transaction_of_a_linked_campaign_is_undone(tmp_path):
+    """Its journal lies beside the file, not beside the link."""
+    real, link = tmp_path / "a" / "real.hilcal", tmp_path / "link.hilcal"
+    real.parent.mkdir()
+    _campaign(real).close()
+    link.symlink_to(real)
+    pid = os.fork()
+    if pid == 0:  # dies within a transaction that has reached the file
+        file = CampaignFile.open(link)
+        file.connection.execute("PRAGMA cache_size = 1")
+        file.connection.execute("BEGIN IMMEDIATE")
+        for k in range(200):
+            file.connection.execute("INSERT INTO loads VALUES (?, ?)", (k, "x" * 1000 + str(k)))
+        os._exit(0)
+    os.waitpid(pid, 0)
+    assert real.with_name("real.hilcal-journal").exists()
+    with CampaignFile.open(link, read_only=True) as file:
+        assert file.connection.execute("SELECT count(*) FROM loads").fetchone() == (0,)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="for the superuser nothing is read-only")
+def test_a_folder_made_read_only_is_said(tmp_path):
+    path = tmp_path / "run.hilcal"
+    with _campaign(path) as file:
+        log = RunLog(file)
+        log.record(_reading(STEPS[0]), STEPS[0], {})
+        tmp_path.chmod(0o555)
+        try:
+            with pytest.raises(HilcalError, match="read-only"):
+                log.record(_reading(STEPS[1]), STEPS[1], {})
+        finally:
+            tmp_path.chmod(0o755)
+        assert file.n_readings == 1
+
+
+WRITER = """
+import os, sys
+from pathlib import Path
+from hilcal.store.campaign_file import CampaignFile
+from tests.support.readings_cases import simple
+from tests.unit.data.test_campaign import REVISION
+folder = Path(sys.argv[1])
+ack = os.open(str(folder / "ack"), os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+with CampaignFile.create(folder / "run.hilcal", "{}", "", "a test") as run:
+    x = simple(BATCHES)
+    for k in range(BATCHES):
+        if k == 2:
+            run.append_revision(REVISION)
+            run.accept(1)
+        run.append_readings(x[k : k + 1])
+        os.write(ack, b".")
+"""
+"""Readings go in one by one; a revision comes after the second, is accepted, and is not counted."""
+
+
+def _lost(tmp_path, batches, tries, writer=WRITER, syncs=4):
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    recorder = power_loss.compiled(tmp_path)
+    ops = power_loss.recorded(writer.replace("BATCHES", str(batches)), folder, recorder, ROOT)
+    assert sum(op.kind == "sync" for op in ops) >= syncs * batches, "the recorder sees no syncs"
+    whole, count, seen = simple(batches), 0, set()
+    after = tmp_path / "after"
+    for acknowledged, state in power_loss.crashes(ops, folder, "ack", 1, tries):
+        content = tuple(sorted(state.items()))
+        if (acknowledged, content) in seen:
+            continue
+        seen.add((acknowledged, content))
+        count += 1
+        shutil.rmtree(after, ignore_errors=True)
+        after.mkdir()
+        for path, data in state.items():
+            (after / Path(path).name).write_bytes(data)
+        run = after / "run.hilcal"
+        if not run.exists():
+            assert acknowledged == 0, "a campaign with stored readings is gone"
+            continue
+        with CampaignFile.open(run) as file:
+            there = file.n_readings
+            assert acknowledged <= there <= acknowledged + 1
+            if there:
+                assert_same(file.readings(), whole[:there])
+            revisions = file.revisions()
+            assert len(revisions) == 1 or acknowledged <= 2
+            if file.accepted():
+                assert len(revisions) == 1
+            if there < batches:  # and it goes on
+                file.append_readings(whole[there : there + 1])
+                assert file.n_readings == there + 1
+    return count
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
+def test_power_loss_at_every_write(tmp_path):
+    assert _lost(tmp_path, 3, tries=2) > 50
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
+def test_power_loss_in_many_orders(tmp_path):
+    assert _lost(tmp_path, 6, tries=30) > 1000
+
+
+def test_the_model_loses_what_was_never_synced(tmp_path):
+    folder = tmp_path / "disk"
+    make = power_loss.Op
+    path = str(folder / "a")
+    ops = [
+        make("create", path, 0, b""),
+        make("write", path, 0, b"x"),
+        make("sync", path, 0, b""),
+        make("sync", str(folder), 0, b""),
+        make("write", path, 1, b"y"),
+    ]
+    states = [state for _, state in power_loss.crashes(ops, folder, "ack", 0)]
+    assert {} in states  # the name was not synced
+    assert {path: b"x"} in states[-4:]
+    assert {path: b"xy"} in states[-4:]
+    assert {} not in states[-4:]
+
+
+@pytest.mark.skipif(shutil.which("gcc") is None, reason="the recorder needs gcc")
+def test_a_program_that_does_not_sync_is_found_out(tmp_path):
+    careless = WRITER.replace("    x = simple", "    run.connection.execute(OFF)\n    x = simple")
+    careless = 'OFF = "PRAGMA synchronous = OFF"\n' + careless
+    with pytest.raises((AssertionError, InputError)):
+        _lost(tmp_path, 3, tries=3, writer=careless, syncs=0)
+
+
+FILES = sorted((ROOT / "tests" / "data" / "campaigns").glob("*.hilcal.gz"))
+HASHED = next(path for path in FILES if "hashed" in path.name)
+"""Its revision names the hash of the readings as they are stored."""
+HASHES = {
+    "version-7": "19cdcf16d7a45f38ddddae06b85eb02e09e42f7bcecf239add2f41c3a4091221",
+    "version-5-hashed": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-6": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-1": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
+    "version-2": "dfcb9facd5eab32baa432c85c7a0255fbf2af611ee13ac62efa29595dd3d3874",
+    "version-3": "167ca0438879f2c498270598303a9f81fb5d5bf701de512ebabe23992d484fc6",
+    "version-4": "f91c9c4b17595fd06c9913893dded67c902babcea3f5cb885cd6e043b3e1034f",
+    "version-5": "15e697bb8aa02ccf9025c82e5d80b2571a85f38b6de0e1a9a352eccdeb66aa73",
+}
+
+
+def unpacked(path, folder):
+    out = folder / path.stem
+    out.write_bytes(gzip.decompress(path.read_bytes()))
+    return out
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name.split(".")[0])
+def test_a_file_of_an_older_program(path, tmp_path):
+    old = unpacked(path, tmp_path)
+    before = old.read_bytes()
+    with Campaign.open(old, read_only=True) as run:
+        assert len(run.readings) == 30
+        assert run.file.data_hash() == HASHES[path.name.split(".")[0]]
+        (record,) = run.file.revisions()
+        found = run.fit()
+        stored = np.array(record.parameters_json["theta"])
+        assert np.allclose(found.theta, stored, rtol=1e-6, atol=2e-7)  # m, rad, rad/(N·m)
+        assert found.model.names == record.effects
+    assert old.read_bytes() == before, "reading an old file must not change it"
+
+
+def test_a_revision_that_another_processor_hashed(tmp_path):
+    """Its hash is of computed covariances, whose last bits differ there."""
+    (path,) = (p for p in FILES if p.name.startswith("version-5.hilcal"))
+    with Campaign.open(unpacked(path, tmp_path), read_only=True) as run:
+        (record,) = run.file.revisions()
+        assert STORED not in record.options
+        elsewhere = replace(record, data_hash="0" * 64)
+        found = restore(elsewhere, run.cell, run.readings)
+        assert found.model.names == record.effects
+        with pytest.raises(InputError, match="fitted before readings were appended"):
+            restore(elsewhere, run.cell, run.readings[:29])
+        today = replace(elsewhere, options={**record.options, STORED: "1" * 64})
+        with pytest.raises(InputError, match="fitted before readings were appended"):
+            restore(today, run.cell, run.readings, stored="2" * 64)
+
+
+def test_every_version_is_there():
+    versions = {int(path.name.split("-")[1].split(".")[0]) for path in FILES}
+    assert versions == set(range(1, schema.VERSION + 1)), "keep a file of the new version, too"
+
+
+def test_a_newer_version_is_refused_in_words(tmp_path, capsys):
+    path = unpacked(FILES[-1], tmp_path)
+    with sqlite3.connect(path) as db:
+        db.execute(f"PRAGMA user_version = {schema.VERSION + 1}")
+    db.close()
+    before = path.read_bytes()
+    for command in (["info"], ["identify"], ["compare"], ["accept", "1"]):
+        with pytest.raises(SystemExit) as end:
+            main([command[0], str(path), *command[1:]])
+        assert end.value.code == 2
+        assert "made by a newer hilcal" in capsys.readouterr().err
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("command", ["info", "identify", "export"])
+def test_changed_readings_are_found_by_their_hash(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    """One coordinate moved by 1 µm, and its checksum mended."""
+    path = unpacked(HASHED, tmp_path)
+    with sqlite3.connect(path) as db, unguarded(db):
+        row = db.execute("SELECT id, pose, load, cycle, record FROM readings WHERE id = 7")
+        number, *where, record = row.fetchone()
+        values = np.frombuffer(record, "<f8").copy()
+        values[-10] += 1e-6  # of x, y, z before the covariance
+        changed = values.tobytes()
+        crc = _reading_crc(number, where, changed)
+        db.execute("UPDATE readings SET record = ?, crc = ? WHERE id = 7", (changed, crc))
+    db.close()
+    with pytest.raises(InputError, match="the readings were changed after revision 1"):
+        CampaignFile.open(path)
+    arguments = {"export": ["--readings", str(tmp_path / "t.csv")]}
+    with pytest.raises(SystemExit) as end:
+        main([command, str(path), *arguments.get(command, [])])
+    assert end.value.code == 2
+    assert "SHA-256" in " ".join(capsys.readouterr().err.split())

@@ -11,7 +11,6 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import tracker_covariance
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping, find_mapping
-from hilcal.tables.table import ImportResult
 from tests.support.readings_cases import make_arm
 
 ARM = make_arm()
@@ -33,7 +32,7 @@ HEADER = ("Timestamp", "Goal x", *COLUMNS)
 Row = dict[str, float | str]
 
 
-def row(q: tuple[float, ...], p_mm: tuple[float, ...], angles: tuple[float, ...]) -> Row:
+def row(q, p_mm, angles):
     cells: Row = {"Timestamp": "2,02011E+13", "Goal x": 0.4}
     cells |= dict(zip(JOINTS, q, strict=True))
     cells["measurement_temperature"] = 21.5
@@ -43,7 +42,7 @@ def row(q: tuple[float, ...], p_mm: tuple[float, ...], angles: tuple[float, ...]
     return cells
 
 
-def rows() -> list[Row]:
+def rows():
     """Five poses; joint 1 goes up, down, stands still, stands still but for rounding."""
     first = (0.0, 0.5, 0.2, 0.5, 0.00005)
     return [
@@ -54,8 +53,8 @@ def rows() -> list[Row]:
     ]
 
 
-def write(path: Path, table: list[Row]) -> Path:
-    def text(cell: float | str) -> str:
+def write(path, table):
+    def text(cell):
         return cell if isinstance(cell, str) else repr(cell).replace(".", ",")
 
     lines = [";".join(HEADER), *(";".join(text(r[name]) for name in HEADER) for r in table)]
@@ -63,21 +62,20 @@ def write(path: Path, table: list[Row]) -> Path:
     return path
 
 
-def read(tmp_path: Path, table: list[Row]) -> ImportResult:
+def read(tmp_path, table):
     return imported(write(tmp_path / "m.csv", table))
 
 
-def imported(path: Path) -> ImportResult:
+def imported(path):
     return import_mapped(path, MAPPING, ARM, None)
 
 
-def test_values_in_si(tmp_path: Path) -> None:
+def test_values_in_si(tmp_path):
     x = read(tmp_path, rows()).readings
     assert (len(x), x.m) == (5, 6)
     np.testing.assert_allclose(x.value[1, :3], [-0.4005, -2.91, 0.005], rtol=1e-15)
     expected = Rotation.from_euler("XYZ", [-90, 20, 10], degrees=True).as_rotvec()
     np.testing.assert_allclose(x.value[1, 3:], expected, atol=1e-14)
-    assert x.states.air_temperature is not None
     assert x.states.air_temperature.tolist() == [21.5] * 5
     assert x.states.time is None
     assert not x.states.wrench.any()
@@ -87,7 +85,7 @@ def test_values_in_si(tmp_path: Path) -> None:
     assert x.cycle.tolist() == [0] * 5
 
 
-def test_covariance_is_that_of_the_mean_and_of_the_instrument(tmp_path: Path) -> None:
+def test_covariance_is_that_of_the_mean_and_of_the_instrument(tmp_path):
     x = read(tmp_path, rows()).readings
     own = x.covariance - tracker_covariance(x.value[:, :3], TRACKER, m=6)
     spread = np.array([1e-5, 2e-5, 3e-5])
@@ -103,7 +101,7 @@ def test_covariance_is_that_of_the_mean_and_of_the_instrument(tmp_path: Path) ->
     np.testing.assert_allclose(own[3, 3:, 3:], np.cov(turned.T), atol=0.02 * sigma.max() ** 2)
 
 
-def test_a_spread_of_zero_gets_a_floor(tmp_path: Path) -> None:
+def test_a_spread_of_zero_gets_a_floor(tmp_path):
     table = rows()
     table[1] |= {f"measurement_std_{e}": 0.0 for e in ("x", "y", "z", "rx", "ry", "rz")}
     cov = read(tmp_path, table).readings.covariance
@@ -115,19 +113,17 @@ def test_a_spread_of_zero_gets_a_floor(tmp_path: Path) -> None:
     assert np.linalg.eigvalsh(cov)[:, 0].min() > 0
 
 
-def test_approach_is_the_side_of_the_last_real_move(tmp_path: Path) -> None:
+def test_approach_is_the_side_of_the_last_real_move(tmp_path):
     approach = read(tmp_path, rows()).readings.states.approach
-    assert approach is not None
     assert approach[:, 0].tolist() == [1, 1, -1, 1, -1]
     assert approach[:, 1].tolist() == [1] * 5
     still = rows()
     still[4]["shoulder_pan_joint"] = 0.50005
     approach = read(tmp_path, still).readings.states.approach
-    assert approach is not None
     assert approach[:, 0].tolist() == [1, 1, -1, 1, 1]
 
 
-def test_rows_with_empty_cells_are_left_out_and_named(tmp_path: Path) -> None:
+def test_rows_with_empty_cells_are_left_out_and_named(tmp_path):
     table = [*rows(), *rows(), *rows()]
     for k, r in enumerate(table):
         r["wrist_3_joint"] = 0.1 * k
@@ -137,11 +133,10 @@ def test_rows_with_empty_cells_are_left_out_and_named(tmp_path: Path) -> None:
     assert len(result.readings) == 14
     assert result.notes[1] == "1 of 15 rows left out (5): no value in measurement_ry"
     approach = result.readings.states.approach
-    assert approach is not None
     assert approach[3, 0] == -1  # from 0.5 in the row left out to 0.00005
 
 
-def test_a_reading_that_was_not_taken_again_is_left_out(tmp_path: Path) -> None:
+def test_a_reading_that_was_not_taken_again_is_left_out(tmp_path):
     table = rows()
     for name in ("x", "y", "z", "rx", "ry", "rz"):
         table[2][f"measurement_{name}"] = table[1][f"measurement_{name}"]
@@ -150,7 +145,7 @@ def test_a_reading_that_was_not_taken_again_is_left_out(tmp_path: Path) -> None:
     assert result.notes[1].startswith("1 of 5 rows left out (4): the same reading")
 
 
-def test_repeats_that_cannot_both_be_right_are_left_out(tmp_path: Path) -> None:
+def test_repeats_that_cannot_both_be_right_are_left_out(tmp_path):
     table = [*rows(), rows()[1]]
     assert len(read(tmp_path, table).readings) == 6
     table[5]["measurement_z"] = 7.0
@@ -159,27 +154,23 @@ def test_repeats_that_cannot_both_be_right_are_left_out(tmp_path: Path) -> None:
     assert result.notes[1].startswith("2 of 6 rows left out (3, 7): they repeat a pose")
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"elbow_joint": "abc"}, r"row 3, column 'elbow_joint': 'abc' is not a number with ','"),
-        ({"elbow_joint": "0.5"}, r"row 3, column 'elbow_joint': '0.5' is not a number with ','"),
-        ({"elbow_joint": "inf"}, r"row 3, column 'elbow_joint': 'inf' is not a number"),
-        ({"elbow_joint": 90.0}, r"row 3, column 'elbow_joint': 90 rad .* looks like degrees"),
-        ({"measurement_rx": 1e4}, r"row 3, column 'measurement_rx': 10000 deg is more than a turn"),
-        ({"measurement_x": 1e9}, r"row 3, column 'measurement_x': 1e\+06 m cannot be right"),
-        ({"measurement_std_x": -1.0}, r"row 3, column 'measurement_std_x': -1: a standard dev"),
-        ({"measurement_std_x": 50.0}, r"row 3: a standard deviation of 0.05 m cannot"),
-    ],
-)
-def test_bad_cells(tmp_path: Path, change: Row, message: str) -> None:
+@pytest.mark.parametrize(("change", "message"), [
+    ({"elbow_joint": "abc"}, r"row 3, column 'elbow_joint': 'abc' is not a number with ','"),
+    ({"elbow_joint": "0.5"}, r"row 3, column 'elbow_joint': '0.5' is not a number with ','"),
+    ({"elbow_joint": "inf"}, r"row 3, column 'elbow_joint': 'inf' is not a number"),
+    ({"elbow_joint": 90.0}, r"row 3, column 'elbow_joint': 90 rad .* looks like degrees"),
+    ({"measurement_rx": 1e4}, r"row 3, column 'measurement_rx': 10000 deg is more than a turn"),
+    ({"measurement_x": 1e9}, r"row 3, column 'measurement_x': 1e\+06 m cannot be right"),
+    ({"measurement_std_x": -1.0}, r"row 3, column 'measurement_std_x': -1: a standard dev"),
+    ({"measurement_std_x": 50.0}, r"row 3: a standard deviation of 0.05 m cannot")])  # fmt: skip
+def test_bad_cells(tmp_path, change, message):
     table = rows()
     table[1] |= change
     with pytest.raises(InputError, match=message.replace(".* looks", ".*looks")):
         read(tmp_path, table)
 
 
-def test_positions_in_metres(tmp_path: Path) -> None:
+def test_positions_in_metres(tmp_path):
     table = rows()
     for r in table:
         for e in ("x", "y", "z"):
@@ -188,7 +179,7 @@ def test_positions_in_metres(tmp_path: Path) -> None:
         read(tmp_path, table)
 
 
-def test_too_much_is_missing(tmp_path: Path) -> None:
+def test_too_much_is_missing(tmp_path):
     table = rows()
     for row in table[2:]:
         row["measurement_x"] = ""
@@ -196,7 +187,7 @@ def test_too_much_is_missing(tmp_path: Path) -> None:
         read(tmp_path, table)
 
 
-def test_a_series_without_standard_deviations_and_temperature(tmp_path: Path) -> None:
+def test_a_series_without_standard_deviations_and_temperature(tmp_path):
     whole = read(tmp_path, rows()).readings
     path = tmp_path / "m.csv"
     kept = [k for k, name in enumerate(HEADER) if "_std_" not in name and "temperature" not in name]
@@ -211,14 +202,14 @@ def test_a_series_without_standard_deviations_and_temperature(tmp_path: Path) ->
     assert any("no air temperature" in note for note in result.notes)
 
 
-def test_some_of_the_standard_deviations(tmp_path: Path) -> None:
+def test_some_of_the_standard_deviations(tmp_path):
     path = write(tmp_path / "m.csv", rows())
     path.write_text(path.read_text().replace("measurement_std_rx", "std"))
     with pytest.raises(InputError, match="no column 'measurement_std_rx'"):
         imported(path)
 
 
-def test_other_formats(tmp_path: Path) -> None:
+def test_other_formats(tmp_path):
     path = tmp_path / "m.csv"
     path.write_text("pose;load;q1_rad\na;none;1\n")
     with pytest.raises(InputError, match="no column 'shoulder_pan_joint'; it has pose, load"):
@@ -232,7 +223,7 @@ def test_other_formats(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("series", SERIES)
-def test_the_measured_series(series: str) -> None:
+def test_the_measured_series(series):
     path = SERIES[series]
     if not path.exists():
         pytest.skip(f"needs the UR10 data, {path.name}, in HILCAL_DATA/ipa_ur10/Series_{series}")

@@ -5,7 +5,6 @@ import io
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,10 @@ from scipy.spatial.transform import Rotation
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.robot.se3 import rotation
-from hilcal.tables.guessing.propose import propose
-from hilcal.tables.guessing.sniff import sniff
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import Mapping
-from hilcal.tables.table import ImportResult
+from hilcal.tables.propose import propose
+from hilcal.tables.sniff import sniff
 from hilcal.toml import check_section
 from tests.support.readings_cases import make_arm
 
@@ -65,7 +63,7 @@ class Written:
 
 
 @st.composite
-def written(draw: st.DrawFn) -> Written:
+def written(draw):
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     count = draw(st.integers(2, 12))
     q = rng.uniform(-3, 3, (count, 6))
@@ -82,8 +80,8 @@ def written(draw: st.DrawFn) -> Written:
     columns: dict[str, list[str]] = {"Punkt": [f"P{k}" for k in range(count)]}
     mapping: dict[str, Any] = {"pose": {"column": "Punkt"}}
 
-    def numbers(name: str, values: np.ndarray) -> None:
-        def cell(v: float) -> str:
+    def numbers(name, values):
+        def cell(v):
             text = f"{v:.18f}"
             if thousands and abs(v) >= 1000:
                 text = f"{v:,.18f}".replace(",", thousands)
@@ -156,7 +154,7 @@ def written(draw: st.DrawFn) -> Written:
     return Written(text.encode(encoding), mapping, q, position, used, std, load, time)
 
 
-def numbered(mapping: dict[str, Any], order: dict[str, int]) -> dict[str, Any]:
+def numbered(mapping, order):
     """The mapping with columns by number."""
     out: dict[str, Any] = {}
     for key, section in mapping.items():
@@ -169,7 +167,7 @@ def numbered(mapping: dict[str, Any], order: dict[str, int]) -> dict[str, Any]:
     return out
 
 
-def mapped(path: Path, mapping: dict[str, Any], **options: Any) -> ImportResult:
+def mapped(path, mapping, **options):
     return import_mapped(path, check_section(mapping, Mapping, "m.toml"), ARM, NOISE, **options)
 
 
@@ -177,7 +175,7 @@ def mapped(path: Path, mapping: dict[str, Any], **options: Any) -> ImportResult:
     deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(w=written())
-def test_round_trip(tmp_path: Path, w: Written) -> None:
+def test_round_trip(tmp_path, w):
     path = tmp_path / "t.txt"
     path.write_bytes(w.content)
     x = mapped(path, w.mapping).readings
@@ -197,7 +195,7 @@ def test_round_trip(tmp_path: Path, w: Written) -> None:
     np.testing.assert_allclose(x.states.time, w.time, atol=1e-5)
 
 
-def test_damaged_bytes_give_one_line_or_sound_readings(tmp_path: Path) -> None:
+def test_damaged_bytes_give_one_line_or_sound_readings(tmp_path):
     """Whatever is damaged, readings are finite or one line says what is wrong."""
     rng = np.random.default_rng(8)
     columns = [f"A{k}" for k in range(1, 7)]
@@ -233,7 +231,7 @@ def test_damaged_bytes_give_one_line_or_sound_readings(tmp_path: Path) -> None:
     assert all("t.csv" in m and "\n" not in m for m in messages)
 
 
-def test_three_targets_side_by_side(tmp_path: Path) -> None:
+def test_three_targets_side_by_side(tmp_path):
     rng = np.random.default_rng(3)
     q, p = rng.uniform(-2, 2, (11, 6)), rng.uniform(-0.9, 0.9, (11, 3, 3)) + 1.5
     sigma = rng.uniform(0.01, 0.03, (11, 3, 3))
@@ -267,7 +265,7 @@ def test_three_targets_side_by_side(tmp_path: Path) -> None:
         mapped(path, mapping)
 
 
-def test_angles_that_the_encoders_reported(tmp_path: Path) -> None:
+def test_angles_that_the_encoders_reported(tmp_path):
     rng = np.random.default_rng(3)
     q = np.repeat(rng.uniform(-2, 2, (6, 6)), 2, axis=0) + rng.uniform(-1e-4, 1e-4, (12, 6))
     p = rng.uniform(-0.9, 0.9, (12, 3)) + 1.5
@@ -293,7 +291,7 @@ def test_angles_that_the_encoders_reported(tmp_path: Path) -> None:
     deadline=None, max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(w=written())
-def test_the_dialect_is_seen(tmp_path: Path, w: Written) -> None:
+def test_the_dialect_is_seen(tmp_path, w):
     """However a table is written, the preview reads the same numbers from it."""
     path = tmp_path / "t.txt"
     path.write_bytes(w.content)

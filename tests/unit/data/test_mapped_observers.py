@@ -1,7 +1,6 @@
 """Foreign tables of distances, heights, stations and torques, by a mapping and by its proposal."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,14 +13,13 @@ from hilcal.identification.fit import fit
 from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
-from hilcal.readings.readings import Readings
 from hilcal.tables.importing import import_readings
 from hilcal.tables.mapping import Mapping
 from hilcal.toml import check_section
 from tests.support.campaigns import cell_of, configuration, true_parameters
-from tests.support.cli_cases import CELL, Capsys, ok
+from tests.support.cli_cases import CELL, ok
 from tests.support.fit_cases import named
-from tests.support.observer_cases import Observed, observed
+from tests.support.observer_cases import observed
 
 JOINTS = [f"Achse {k} [°]" for k in range(1, 7)]
 MOMENTS = [f"Drehmoment A{k} [Nmm]" for k in range(1, 7)]
@@ -32,17 +30,12 @@ BAR: dict[str, Any] = {
     "joints": {"columns": JOINTS, "unit": "deg"},
     "pose": {"column": "Messpunkt"},
     "load": {"column": "Last"},
-    "distance": {
-        "column": "Abstand [mm]",
-        "unit": "mm",
-        "name_column": "Kugel",
-        "std_column": "Unsicherheit Abstand [µm]",
-        "std_unit": "um",
-    },
-}
+    "distance": {"column": "Abstand [mm]", "unit": "mm", "name_column": "Kugel",
+        "std_column": "Unsicherheit Abstand [µm]", "std_unit": "um"},
+}  # fmt: skip
 
 
-def measured(who: list[str], seed: int) -> Observed:
+def measured(who, seed):
     """Readings with the torques that hold the arm, N·m."""
     c = observed(who, seed, base=who[0] in "ABCD")
     torque = -c.world.drive_torque(c.readings.states)
@@ -51,14 +44,13 @@ def measured(who: list[str], seed: int) -> Observed:
     )
 
 
-def german(r: Readings) -> str:
+def german(r):
     """The table as a German program writes it: torques are those of the load, in N·mm."""
     kinds = [o.kind for o in r.observers]
     head = ["Messpunkt", "Last", *JOINTS, *MOMENTS]
     head += ["Standpunkt", *POSITION] * ("station" in kinds)
     head += ["Abstand [mm]", "Kugel", "Unsicherheit Abstand [µm]"] * ("point" in kinds)
     head += ["Messuhr [mm]", "Ebene"] * ("gauge" in kinds)
-    assert r.states.torque is not None
     lines = [";".join(head)]
     for i in range(len(r)):
         of, load = r.observers[r.observer[i]], r.load_names[r.load[i]]
@@ -77,12 +69,12 @@ def german(r: Readings) -> str:
     return "\n".join(lines) + "\n"
 
 
-def imported(path: Path, sections: dict[str, Any], cell: Path = CELL) -> Readings:
+def imported(path, sections, cell=CELL):
     mapping = check_section(sections, Mapping, "mapping")
     return import_readings(path, mapping, load_config(cell), cell_of().arm).readings
 
 
-def same(found: Readings, true: Readings) -> None:
+def same(found, true):
     by = [found.observers[k].name for k in found.observer]
     assert by == [true.observers[k].name for k in true.observer]
     np.testing.assert_allclose(found.value, true.value, atol=1e-9)
@@ -91,7 +83,7 @@ def same(found: Readings, true: Readings) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_ball_bars_table_gives_the_true_compliances(seed: int, tmp_path: Path) -> None:
+def test_a_ball_bars_table_gives_the_true_compliances(seed, tmp_path):
     c = measured(["A", "B", "C"], seed)
     (tmp_path / "t.csv").write_text(german(c.readings))
     found = imported(tmp_path / "t.csv", BAR | {"torques": TORQUES})
@@ -107,11 +99,10 @@ def test_a_ball_bars_table_gives_the_true_compliances(seed: int, tmp_path: Path)
     assert np.sqrt(np.mean(z**2)) < 2.5
     assert 0.75 < fitted.variance_factor < 1.3
     torques = check_torques(c.cell, readings)
-    assert torques is not None
     assert not any(f.differs for f in torques.factors)
 
 
-def test_stations_and_heights_beside_distances(tmp_path: Path) -> None:
+def test_stations_and_heights_beside_distances(tmp_path):
     c = measured(["S1", "S2", "A", "G"], 1)
     (tmp_path / "t.csv").write_text(german(c.readings))
     (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
@@ -131,7 +122,7 @@ def test_stations_and_heights_beside_distances(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("who", [["A", "B", "C"], ["S1", "S2", "A", "G"]])
-def test_a_preview_proposes_the_mapping(who: list[str], tmp_path: Path, capsys: Capsys) -> None:
+def test_a_preview_proposes_the_mapping(who, tmp_path, capsys):
     c = measured(who, 2)
     (tmp_path / "t.csv").write_text(german(c.readings))
     (tmp_path / "c.toml").write_text(CELL.read_text() + "\n[gauges.G]\nstd_m = 1e-5\n")
@@ -148,25 +139,20 @@ def test_a_preview_proposes_the_mapping(who: list[str], tmp_path: Path, capsys: 
     )
 
 
-@pytest.mark.parametrize(
-    ("sections", "message"),
-    [
-        ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
-        ({"distance": None}, r"no reading: it must be a section \[position\]"),
-        ({"std": {"values": [0.1]}}, r"\[std\], .* need \[position\]"),
-        ({"rows": {"plausible_only": True}}, "give those in a table of their own"),
-        ({"torques": TORQUES | {"columns": MOMENTS[:4]}}, "4 columns of torques; .* has 6 joints"),
-    ],
-)
-def test_mappings_that_cannot_be(sections: dict[str, Any], message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("sections", "message"), [
+    ({"distance": {"column": "d", "unit": "mm"}}, "name_column or name: give one"),
+    ({"distance": None}, r"no reading: it must be a section \[position\]"),
+    ({"std": {"values": [0.1]}}, r"\[std\], .* need \[position\]"),
+    ({"rows": {"plausible_only": True}}, "give those in a table of their own"),
+    ({"torques": TORQUES | {"columns": MOMENTS[:4]}}, "4 columns of torques; .* has 6 joints"),
+])  # fmt: skip
+def test_mappings_that_cannot_be(sections, message, tmp_path):
     (tmp_path / "t.csv").write_text(german(measured(["A", "B", "C"], 0).readings))
     with pytest.raises(InputError, match=message):
         imported(tmp_path / "t.csv", {k: v for k, v in (BAR | sections).items() if v is not None})
 
 
-def test_rows_without_a_reading_are_left_out_and_a_negative_deviation_is_named(
-    tmp_path: Path,
-) -> None:
+def test_rows_without_a_reading_are_left_out_and_a_negative_deviation_is_named(tmp_path):
     c = measured(["A", "B", "C"], 0)
     lines = german(c.readings).splitlines()
     cells = lines[5].split(";")

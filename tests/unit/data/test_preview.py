@@ -2,15 +2,14 @@
 
 from collections.abc import Callable
 from datetime import datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from hilcal.errors import InputError
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import Mapping, load_mapping
+from hilcal.tables.propose import propose
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign, lines, write
 
@@ -23,11 +22,11 @@ SIGMA = np.random.default_rng(1).uniform(0.01, 0.03, (N, 6))
 Case = tuple[str, dict[str, Any]]
 
 
-def joints(names: list[str], unit: str) -> dict[str, Any]:
+def joints(names, unit):
     return {"joints": {"columns": names, "unit": unit}}
 
 
-def german() -> Case:
+def german():
     names = [f"Achse {k} [°]" for k in range(1, 7)]
     xyz = ["Mess X [mm]", "Mess Y [mm]", "Mess Z [mm]"]
     header = ["Punkt", *names, *xyz, "Zuladung", "Lufttemperatur [°C]", "Bemerkung"]
@@ -46,7 +45,7 @@ def german() -> Case:
     }
 
 
-def kuka() -> Case:
+def kuka():
     names = [f"A{k}" for k in range(1, 7)]
     header = ["Nr", *names, "X", "Y", "Z", "A", "B", "C"]
     text = lines(header, np.arange(1, N + 1), DEG, MM, C.angles("ZYX"), separator="\t")
@@ -59,7 +58,7 @@ def kuka() -> Case:
     }
 
 
-def fanuc() -> Case:
+def fanuc():
     names = [f"J{k}" for k in range(1, 7)]
     header = ["point", "x", "y", "z", "w", "p", "r", *names]
     text = lines(header, np.arange(1, N + 1), MM, C.angles("xyz"), DEG, separator=",")
@@ -71,7 +70,7 @@ def fanuc() -> Case:
     }
 
 
-def abb() -> Case:
+def abb():
     names = [f"rax_{k}" for k in range(1, 7)]
     header = [*names, "x", "y", "z", "q1", "q2", "q3", "q4"]
     quaternion = C.attitude.as_quat()[:, [3, 0, 1, 2]]
@@ -83,7 +82,7 @@ def abb() -> Case:
     }
 
 
-def rtde() -> Case:
+def rtde():
     names = [f"target_q_{k}" for k in range(6)]
     actual = [f"actual_q_{k}" for k in range(6)]
     header = ["timestamp", *names, *actual, "tracker_x", "tracker_y", "tracker_z", "payload"]
@@ -99,7 +98,7 @@ def rtde() -> Case:
     }
 
 
-def with_units_row() -> Case:
+def with_units_row():
     names = [f"theta{k}" for k in range(1, 7)]
     xyz, sigma = ["MeasX", "MeasY", "MeasZ"], ["UncX", "UncY", "UncZ"]
     head = ["Pose", *names, *xyz, *sigma]
@@ -115,7 +114,7 @@ def with_units_row() -> Case:
     }
 
 
-def expanded() -> Case:
+def expanded():
     names = [f"q{k}_rad" for k in range(1, 7)]
     header = ["id", *names, "x_m", "y_m", "z_m", "U95_x", "U95_y", "U95_z", "date"]
     start = datetime(2024, 5, 31, 8)
@@ -132,7 +131,7 @@ def expanded() -> Case:
     }
 
 
-def forces() -> Case:
+def forces():
     names = [f"joint_{k}" for k in range(1, 7)]
     header = [*names, "x", "y", "z", "rx", "ry", "rz", "Fx", "Fy", "Fz", "Mx", "My", "Mz"]
     wrench = np.where(np.arange(N)[:, None] % 2, 0.0, 10.0) * np.ones(6)
@@ -147,7 +146,7 @@ def forces() -> Case:
     }  # fmt: skip
 
 
-def without_header() -> Case:
+def without_header():
     text = lines(None, MM, DEG, separator=",")
     return text, {
         "file": {"header_row": 0},
@@ -156,7 +155,7 @@ def without_header() -> Case:
     }
 
 
-def numpy_savetxt() -> Case:
+def numpy_savetxt():
     names = [f"q{k}" for k in range(1, 7)]
     text = "# " + lines([*names, "x", "y", "z"], C.q, MM, separator=" ", digits=8)
     return text, {
@@ -166,7 +165,7 @@ def numpy_savetxt() -> Case:
     }
 
 
-def thousands() -> Case:
+def thousands():
     names = [f"J{k}" for k in range(1, 7)]
     text = ";".join([*names, "X", "Y", "Z", ""]) + "\n"
     for q, p in zip(DEG, MM, strict=True):
@@ -179,7 +178,7 @@ def thousands() -> Case:
     }
 
 
-def ros() -> Case:
+def ros():
     names = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"]
     names += [f"wrist_{k}_joint" for k in (1, 2, 3)]
     header = ["Goal x", "Goal y", "Goal z", *names]
@@ -211,7 +210,7 @@ CASES: dict[str, Callable[[], Case]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_guess_is_the_mapping(case: str, tmp_path: Path) -> None:
+def test_the_guess_is_the_mapping(case, tmp_path):
     text, wanted = CASES[case]()
     encoding = "latin-1" if case == "german" else "utf-8"
     found = propose(write(tmp_path / "t.csv", text, encoding)).proposal
@@ -224,7 +223,7 @@ def test_the_guess_is_the_mapping(case: str, tmp_path: Path) -> None:
     assert load_mapping(tmp_path / "m.toml", Mapping) == found.mapping(Mapping)
 
 
-def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path: Path) -> None:
+def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path):
     order = np.random.default_rng(0).permutation(N)
     names = [f"A{k}" for k in range(1, 7)]
     points = [f"P{k}" for k in range(N)]
@@ -233,7 +232,6 @@ def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path: Path) -> None
     write(tmp_path / "robot.csv", shuffled + "P999;0;0;0;0;0;0\n")
     found = propose(tmp_path / "tracker.csv", tmp_path / "robot.csv")
     second = found.proposal.mapping(Mapping).second_file
-    assert second is not None
     assert (second.match, second.separator, second.decimal) == (("Point", "Name"), ";", ",")
     np.testing.assert_allclose(found.grid.numbers("A3"), DEG[:, 2], atol=1e-6)
     one = propose(tmp_path / "tracker.csv")
@@ -242,7 +240,7 @@ def test_a_file_for_the_positions_and_one_for_the_joints(tmp_path: Path) -> None
     ]
 
 
-def test_a_missing_point(tmp_path: Path) -> None:
+def test_a_missing_point(tmp_path):
     p = MM.copy()
     p[3] = p[7] = -9999
     names = [f"A{k}" for k in range(1, 7)]
@@ -252,7 +250,7 @@ def test_a_missing_point(tmp_path: Path) -> None:
     assert ("file", "-9999 stands for a missing point") in found.unsure
 
 
-def test_lines_that_are_no_readings(tmp_path: Path) -> None:
+def test_lines_that_are_no_readings(tmp_path):
     names = [f"A{k}" for k in range(1, 7)]
     text = "Tracker report\n\n" + lines([*names, "X", "Y", "Z"], DEG, MM) + "end;of;file\n\n\n"
     found = propose(write(tmp_path / "t.csv", text))
@@ -261,7 +259,7 @@ def test_lines_that_are_no_readings(tmp_path: Path) -> None:
     assert any("are left out" in words for _, words in found.proposal.unsure)
 
 
-def test_only_text(tmp_path: Path) -> None:
+def test_only_text(tmp_path):
     path = write(tmp_path / "t.csv", "name,colour\nbob,red\n")
     with pytest.raises(InputError, match="no columns of numbers"):
         propose(path)

@@ -1,23 +1,36 @@
-"""Lengths and durations as people write them."""
+"""Lengths and durations, ranges, several targets, and readings that are the same."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
+from hilcal.cell import Cell
 from hilcal.errors import InputError
+from hilcal.readings.covariance import TrackerNoise
+from hilcal.readings.ranges import Range
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.same_readings import already, never_fitted
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.records import content_hash
+from hilcal.tables.table import read_table, write_table
 from hilcal.tables.units import parse_duration, parse_length
+from tests.support.campaigns import cell_of
 
 
 @pytest.mark.parametrize(
-    ("text", "metres"),
-    [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)],
+    ("text", "metres"), [("0.1 mm", 1e-4), ("100um", 1e-4), ("100 µm", 1e-4), (" 2e-3 m ", 2e-3)]
 )
-def test_a_length(text: str, metres: float) -> None:
+def test_a_length(text, metres):
     assert math.isclose(parse_length(text, "--limit"), metres)
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("90 min", 5400), ("1.5h", 5400), ("20 s", 20)])
-def test_a_duration(text: str, seconds: float) -> None:
+def test_a_duration(text, seconds):
     assert math.isclose(parse_duration(text, "--max-time"), seconds)
 
 
@@ -33,7 +46,263 @@ def test_a_duration(text: str, seconds: float) -> None:
         ("1e999 mm", "is not over 0"),  # infinite
     ],
 )
-def test_anything_else_is_refused_with_its_reason(text: str, why: str) -> None:
+def test_anything_else_is_refused_with_its_reason(text, why):
     with pytest.raises(InputError, match="--limit") as refused:
         parse_length(text, "--limit")
     assert why in str(refused.value)
+
+
+MEASURED = Range("joint 1 angle", "rad", np.radians(-176.0), np.radians(168.0))
+
+
+@pytest.mark.parametrize(("degrees", "plain", "turning"), [
+    (0.0, -168.0, -168.0),
+    (184.8, 16.8, -0.8),  # -175.2 a turn before
+    (-190.0, 14.0, 2.0),  # 170
+    (172.0, 4.0, 4.0),
+    (181.0, 13.0, 3.0),  # three degrees before -176
+    (360.0, 192.0, -168.0),
+    (-720.0, 544.0, -168.0)])  # fmt: skip
+def test_whole_turns(degrees, plain, turning):
+    value = np.radians([degrees])
+    np.testing.assert_allclose(np.degrees(MEASURED.over(value)), plain, atol=1e-9)
+    over = np.degrees(MEASURED.over(value, turning=True))
+    if turning > 0:
+        np.testing.assert_allclose(over, turning, atol=1e-9)
+    else:
+        assert over[0] <= 0.0
+
+
+def test_a_range_of_more_than_a_turn_has_every_angle():
+    wide = Range("joint 6 angle", "rad", -4.0, 4.0)
+    angles = np.linspace(-20, 20, 500)
+    assert not wide.beyond(angles, turning=True).any()
+    assert wide.beyond(angles).any()
+
+
+NAMES = ("R1", "R2", "R3")
+CELL = """
+[robot]
+model = "ur10e"
+[[tool.targets]]
+name = "R1"
+target_m = [0.06, 0.02, 0.12]
+[[tool.targets]]
+name = "R2"
+[[tool.targets]]
+name = "R3"
+target_m = [0.02, -0.11, 0.15]
+target_rotvec_rad = [0.0, 0.1, 0.0]
+"""
+HEADER = "pose,load,target,q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_m,y_m,z_m\n"
+
+
+def readings_of(target, names=NAMES, seed=0):
+    """Readings of two poses in turn, one for each number of a target."""
+    rng, count = np.random.default_rng(seed), len(target)
+    pose = np.arange(count) % 2
+    zero = np.zeros(count, dtype=np.int64)
+    q = rng.uniform(-1.5, 1.5, (2, 6))
+    return Readings(
+        states=States(q[pose], np.zeros((count, 6)), target=np.array(target)),
+        pose=pose,
+        load=zero,
+        cycle=zero,
+        value=rng.uniform(-0.5, 0.5, (count, 3)),
+        covariance=np.tile(1e-10 * np.eye(3), (count, 1, 1)),
+        load_names=("none",),
+        pose_names=("p1", "p2"),
+        target_names=names,
+    )
+
+
+def table_of(path, *targets):
+    at = "0,-1,0,0,0,0,0.1,0.2,0.3"
+    rows = [f"p{k},none,{name},{at}" for k, name in enumerate(targets)]
+    path.write_text(HEADER + "\n".join(rows) + "\n")
+    return path
+
+
+@given(st.lists(st.integers(0, 2), min_size=1, max_size=8))
+def test_tables_and_files_keep_the_targets(tmp_path_factory, target):
+    folder, arm = tmp_path_factory.mktemp("targets"), cell_of().arm
+    one = readings_of(target)
+    write_table(one, folder / "t.csv")
+    back = read_table(folder / "t.csv", arm, NOISE, targets=NAMES)
+    with CampaignFile.create(folder / "r.hilcal", "{}", ".", "test") as file:
+        file.append_readings(one[:1])
+        file.append_readings(one[1:])
+        stored = file.readings()
+    for found in (back, stored):
+        assert found.target_names == NAMES
+        np.testing.assert_array_equal(found.target, target)
+        assert content_hash(found) == content_hash(one)
+
+
+def test_a_campaign_numbers_targets_by_their_names(tmp_path):
+    first, other = readings_of([0, 1, 2]), readings_of([0, 1, 1], ("R3", "R1"))
+    with CampaignFile.create(tmp_path / "r.hilcal", "{}", ".", "test") as file:
+        file.append_readings(first)
+        other = replace(other, states=replace(other.states, q=first.states.q))
+        file.append_readings(other)
+        assert file.readings().target.tolist() == [0, 1, 2, 2, 0, 0]
+        with pytest.raises(InputError, match=r"target 'R4' is not one of this .*: R1"):
+            file.append_readings(replace(first, target_names=("R1", "R2", "R4")))
+
+
+def test_one_target_is_stored_as_before(tmp_path):
+    several = readings_of([0, 0])
+    one = replace(several, states=replace(several.states, target=None), target_names=())
+    assert content_hash(one) == ("eae7c0c5c00b9316cd4e55433994b936612c7b72e5f6544934f63c6fc6bc16f6")
+    assert content_hash(one) != content_hash(several)
+    versions = []
+    for name, readings in (("one", one), ("several", several)):
+        with CampaignFile.create(tmp_path / name, "{}", ".", "test") as file:
+            file.append_readings(readings)
+            versions += file.connection.execute("PRAGMA user_version").fetchone()
+    assert versions == [2, 3]
+
+
+def test_readings_of_one_arrival():
+    target = np.array([0, 1, 2, 0, 1, 2, 0, 1, 0])
+    load = np.array([0, 0, 0, 1, 1, 1, 1, 1, 0])
+    many = readings_of(target.tolist())
+    same = replace(many, pose=0 * load, load=load, load_names=("none", "5kg"))
+    _, arrival = np.unique(same.arrivals, return_inverse=True)
+    # The target R1 was read twice unloaded and twice loaded: four arrivals.
+    groups = [set(np.flatnonzero(arrival == k)) for k in range(4)]
+    assert sorted(map(sorted, groups)) == [[0, 1, 2], [3, 4, 5], [6, 7], [8]]
+    assert len(np.unique(replace(same, cycle=np.arange(9)).arrivals)) == 9
+
+
+def test_the_cell_names_its_targets(tmp_path):
+    (tmp_path / "cell.toml").write_text(CELL)
+    cell = Cell.load(tmp_path / "cell.toml")
+    assert cell.target_names == NAMES
+    assert cell.known_targets == (True, False, True)
+    assert not cell.target_known
+    np.testing.assert_array_equal(cell.all_targets[:, 0, 3], [0.06, 0.0, 0.02])
+    np.testing.assert_array_equal(cell.target, cell.all_targets[0])
+    arm = cell.arm
+    read = read_table(table_of(tmp_path / "t.csv", "R3", "R1"), arm, NOISE, targets=NAMES)
+    assert read.target.tolist() == [2, 0]
+
+
+NOISE = TrackerNoise(5e-6, 0.0, 7e-6, 0.0)
+
+
+@pytest.mark.parametrize(("targets", "rows", "message"), [
+    ((), ("A", "B"), r"column 'target' names 'A', 'B', but the cell has one target"),
+    (NAMES, ("R1", "r2"), r"row 3, column 'target': target 'r2' is .* valid: R1, R2, R3"),
+    (NAMES, ("R1", ""), r"row 3, column 'target': the cell is empty; name the target"),
+])  # fmt: skip
+def test_table_and_cell_disagree(tmp_path, targets, rows, message):
+    with pytest.raises(InputError, match=message) as raised:
+        read_table(table_of(tmp_path / "t.csv", *rows), cell_of().arm, None, targets=targets)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_table_without_the_column(tmp_path):
+    path = table_of(tmp_path / "t.csv", "R1", "R1")
+    assert read_table(path, cell_of().arm, NOISE).states.target is None
+    path.write_text(path.read_text().replace("target,", "").replace(",R1", ""))
+    with pytest.raises(InputError, match=r"no column 'target', but the cell's targets are R1"):
+        read_table(path, cell_of().arm, NOISE, targets=NAMES)
+
+
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ('name = "R2"', 'name = "R1"', r'two \[\[tool.targets\]\] have the name "R1"'),
+    ("[[tool.targets]]", "[tool]\ntarget_m = [0, 0, 0]\n[[tool.targets]]", "target_m together"),
+    ("[0.06, 0.02, 0.12]", "[60.0, 20.0, 120.0]", r"over 5 m off the flange; is it in m"),
+    ('name = "R2"', 'nam = "R2"', r'has no key "nam"')])  # fmt: skip
+def test_wrong_targets(tmp_path, old, new, message):
+    (tmp_path / "cell.toml").write_text(CELL.replace(old, new, 1))
+    with pytest.raises(InputError, match=message) as raised:
+        Cell.load(tmp_path / "cell.toml")
+    assert "\n" not in str(raised.value)
+
+
+LOADS = 3
+NOISE_M = 5e-6
+
+
+def campaign(m=3, poses=40, seed=0):
+    """Poses with an unloaded and two loaded readings each."""
+    rng = np.random.default_rng(seed)
+    n = poses * LOADS
+    pose = np.repeat(np.arange(poses), LOADS)
+    load = np.tile(np.arange(LOADS), poses)
+    value = rng.normal(size=(n, m))
+    if m == 6:
+        value[:, 3:] = Rotation.random(n, random_state=1).as_rotvec()
+    return Readings(
+        states=States(rng.uniform(-3, 3, (poses, 6))[pose], rng.normal(size=(n, 6))),
+        pose=pose,
+        load=load,
+        cycle=np.zeros(n, dtype=np.int64),
+        value=value,
+        covariance=np.tile(np.eye(m) * NOISE_M**2, (n, 1, 1)),
+        load_names=("none", "5kg", "10kg"),
+        pose_names=tuple(f"p{k}" for k in range(poses)),
+    )
+
+
+@pytest.mark.parametrize("m", [3, 6])
+def test_a_copy_is_known_whatever_it_went_through(m):
+    r = campaign(m)
+    order = np.random.default_rng(1).permutation(len(r))
+    shuffled = r[order]
+    value, states = shuffled.value.copy(), shuffled.states
+    value[:, :3] = np.round(value[:, :3] * 1e3, 4) / 1e3  # mm, four decimals
+    if m == 6:  # degrees, three decimals, and the other way round where that is as short
+        value[:, 3:] = np.radians(np.round(np.degrees(value[:, 3:]), 3))
+        value[:, 3:] -= (
+            2 * np.pi * value[:, 3:] / np.linalg.norm(value[:, 3:], axis=1, keepdims=True)
+        )
+    copy = replace(
+        shuffled,
+        value=value,
+        states=replace(
+            states, q=np.radians(np.round(np.degrees(states.q), 3)), wrench=states.wrench * 1.02
+        ),
+        covariance=shuffled.covariance * 4,
+        load_names=("none", "five", "ten"),
+        pose_names=tuple(f"P {k}" for k in range(len(r.pose_names))),
+    )
+    assert already(copy, r).all()
+    assert already(r, copy).all()
+
+
+def test_positions_alone_are_compared_with_positions():
+    r = campaign(6)
+    alone = replace(r, value=r.value[:, :3], covariance=r.covariance[:, :3, :3])
+    assert already(alone, r).all()
+
+
+def test_what_was_measured_again_is_another_reading():
+    r = campaign(poses=300)
+    again = replace(r, value=r.value + np.random.default_rng(2).normal(0, NOISE_M, r.value.shape))
+    assert already(again, r).mean() < 0.002  # (0.2 µm)³ in (5 µm √2π)³: none is expected
+    turned = replace(r, states=replace(r.states, q=r.states.q + 1e-3))
+    assert not already(turned, r).any()
+
+
+def test_loaded_and_unloaded_readings_differ_and_arms_with_other_joints():
+    r = campaign()
+    swapped = replace(r, load=np.where(r.load == 0, 1, 0))
+    assert not already(swapped, r)[r.load < 2].any()
+    assert not already(replace(r, states=replace(r.states, q=r.states.q[:, :5])), r).any()
+    assert not already(r, r[:0]).any()
+    assert len(already(r[:0], r)) == 0
+
+
+def test_a_deflection_is_unseen_only_if_neither_reading_of_it_was_fitted():
+    r = campaign(poses=4)
+    fitted = r[[0, 4, 8]]  # p0 unloaded, p1 under 5kg, p2 under 10kg
+    known, unseen = never_fitted(r, fitted, deflections=True)
+    assert np.flatnonzero(known).tolist() == [0, 4, 8]
+    assert np.flatnonzero(unseen).tolist() == [3, 5, 6, 7, 9, 10, 11]
+    known, unseen = never_fitted(r, fitted, deflections=False)
+    assert np.flatnonzero(~unseen).tolist() == [0, 4, 8]
+    known, unseen = never_fitted(r, r[[1, 2]], deflections=True)
+    assert not unseen[:3].any()  # the unloaded reading alone tells nothing

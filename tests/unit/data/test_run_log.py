@@ -24,7 +24,7 @@ STEPS = tuple(Step(pose, load, 0) for pose in ("p1", "p2", "p3") for load in ("n
 MADE = Plan(("p1", "p2", "p3"), np.arange(18.0).reshape(3, 6) / 10, STEPS, {"seed": 3})
 
 
-def _reading(step: Step) -> Readings:
+def _reading(step):
     return Readings(
         states=States(q=MADE.joints(step.pose)[None], wrench=np.zeros((1, 6))),
         pose=np.zeros(1, dtype=np.int64),
@@ -37,11 +37,11 @@ def _reading(step: Step) -> Readings:
     )
 
 
-def _campaign(path: Path) -> CampaignFile:
+def _campaign(path):
     return CampaignFile.create(path, "{}", ".", "test", more={PLAN: MADE.to_json()})
 
 
-def test_what_was_recorded_comes_back_after_reopening(tmp_path: Path) -> None:
+def test_what_was_recorded_comes_back_after_reopening(tmp_path):
     path = tmp_path / "run.hilcal"
     with _campaign(path) as campaign:
         log = RunLog(campaign)
@@ -61,7 +61,7 @@ def test_what_was_recorded_comes_back_after_reopening(tmp_path: Path) -> None:
         assert len(readings) == 3
 
 
-def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path: Path) -> None:
+def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path):
     with _campaign(tmp_path / "run.hilcal") as campaign:
         log = RunLog(campaign)
         log.record(_reading(STEPS[0]), STEPS[0], {})
@@ -70,20 +70,20 @@ def test_a_step_is_never_there_twice_and_its_refusal_leaves_no_reading(tmp_path:
         assert campaign.n_readings == 1
 
 
-def test_a_table_cannot_be_resumed(tmp_path: Path) -> None:
+def test_a_table_cannot_be_resumed(tmp_path):
     made = CampaignFile.create(tmp_path / "run.hilcal", "{}", ".", "a table")
     with made as campaign, pytest.raises(InputError, match="cannot be resumed"):
         RunLog(campaign)
 
 
-def test_a_full_database_stores_all_or_nothing(tmp_path: Path) -> None:
+def test_a_full_database_stores_all_or_nothing(tmp_path):
     path = tmp_path / "run.hilcal"
     with _campaign(path) as campaign:
         log = RunLog(campaign)
         (pages,) = campaign.connection.execute("PRAGMA page_count").fetchone()
         campaign.connection.execute(f"PRAGMA max_page_count = {pages + 2}")
 
-        def fill() -> None:
+        def fill():
             for step in (Step("p1", "none", k) for k in range(100)):
                 log.record(_reading(step), step, {"filler": "x" * 300})
 
@@ -119,7 +119,7 @@ with CampaignFile.open(path) as campaign:
 """
 
 
-def test_a_write_that_the_system_refuses_loses_nothing(tmp_path: Path) -> None:
+def test_a_write_that_the_system_refuses_loses_nothing(tmp_path):
     """A file-size limit of the process: writes fail in the system, as on a full disk."""
     path = tmp_path / "run.hilcal"
     _campaign(path).close()
@@ -149,9 +149,7 @@ names = st.text(min_size=1, max_size=6).filter(lambda name: escaped(name) == nam
     st.lists(st.tuples(st.integers(0, 3), names, st.integers(0, 3)), min_size=1, max_size=8),
     st.floats(-7, 7),
 )
-def test_a_plan_is_read_back_as_written(
-    poses: list[str], rows: list[tuple[int, str, int]], angle: float
-) -> None:
+def test_a_plan_is_read_back_as_written(poses, rows, angle):
     steps = tuple(dict.fromkeys(Step(poses[p % len(poses)], ld, c) for p, ld, c in rows))
     q = angle * np.arange(1.0, 1 + 6 * len(poses)).reshape(-1, 6) / 7.0
     again = read_plan(Plan(tuple(poses), q, steps, {"note": 1}).to_json(), "plan")
@@ -161,34 +159,27 @@ def test_a_plan_is_read_back_as_written(
     assert again.about == {"note": 1}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("{", "not JSON"),
-        ("[]", "not a plan"),
-        ('{"format": "hilcal-plan", "version": 9}', "version 9"),
-        ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
-    ],
-)
-def test_what_is_not_a_plan_is_refused_in_one_line(text: str, message: str) -> None:
+@pytest.mark.parametrize(("text", "message"), [
+    ("{", "not JSON"),
+    ("[]", "not a plan"),
+    ('{"format": "hilcal-plan", "version": 9}', "version 9"),
+    ('{"format": "hilcal-plan", "version": 1, "poses": []}', '"poses" must be a list'),
+])  # fmt: skip
+def test_what_is_not_a_plan_is_refused_in_one_line(text, message):
     with pytest.raises(InputError, match=message) as raised:
         read_plan(text, "p.json")
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
-        ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
-        ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
-        ('"cycle": 0', '"cycle": -1', "must be a whole number"),
-        ('"load": "5kg"', '"load": "none"', "are the same"),
-        ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
-        ("0.1,", '"a",', "finite numbers"),
-    ],
-)
-def test_a_wrong_edit_of_a_plan_is_named(tmp_path: Path, old: str, new: str, message: str) -> None:
+@pytest.mark.parametrize(("old", "new", "message"), [
+    ('"name": "p2"', '"name": "p1"', "two poses have the name 'p1'"),
+    ('"pose": "p3"', '"pose": "p9"', "there is no pose 'p9'"),
+    ('"load": "5kg"', '"load": 5', "load 5 must be a name"),
+    ('"cycle": 0', '"cycle": -1', "must be a whole number"),
+    ('"load": "5kg"', '"load": "none"', "are the same"),
+    ('"cycle": 0', '"cycel": 0', 'must have "pose" and "load"'),
+    ("0.1,", '"a",', "finite numbers")])  # fmt: skip
+def test_a_wrong_edit_of_a_plan_is_named(tmp_path, old, new, message):
     path = tmp_path / "plan.json"
     path.write_text(MADE.to_json().replace(old, new, 1))
     with pytest.raises(InputError, match=message) as raised:
@@ -197,14 +188,14 @@ def test_a_wrong_edit_of_a_plan_is_named(tmp_path: Path, old: str, new: str, mes
     assert "plan.json" in str(raised.value)
 
 
-def test_a_missing_plan_names_the_command(tmp_path: Path) -> None:
+def test_a_missing_plan_names_the_command(tmp_path):
     with pytest.raises(InputError, match="hilcal plan"):
         load_plan(tmp_path / "no.json")
 
 
 def test_an_interrupt_between_a_transaction_s_begin_and_its_block_leaves_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, monkeypatch
+):
     """The block is never entered: nobody ends the transaction but the next one, or the close."""
     complaints: list[object] = []
     monkeypatch.setattr("sys.unraisablehook", complaints.append)

@@ -7,20 +7,17 @@ import pytest
 
 from hilcal.readings import whitening as scaling_module
 from hilcal.readings.covariance import symmetric_root
-from hilcal.readings.readings import Readings
+from hilcal.readings.reading_groups import has_unloaded
 from hilcal.readings.serial_noise import SerialNoise
-from hilcal.readings.whitening import MODES, Mode, has_unloaded, whitening
-from hilcal.types import Floats
+from hilcal.readings.whitening import MODES, whitening
 from tests.unit.data.test_whitening import make_readings, random_readings, spd
 
 NOISE = SerialNoise("order", 0.8, 0.05, 7.0, float(np.exp(-1 / 7)), 0.02, 30.0)
 
 
-def covariance_of(readings: Readings) -> Floats:
+def covariance_of(readings):
     """(N·m, N·m) covariance of all readings, element by element from the law."""
     n, m, r = len(readings), readings.m, readings
-    assert r.serial is not None
-    assert r.along is not None
     arrivals = r.arrivals
     full = np.zeros((n, m, n, m))
     own = r.covariance if r.stated is None else r.stated
@@ -39,7 +36,7 @@ def covariance_of(readings: Readings) -> Floats:
     return full.reshape(n * m, n * m)
 
 
-def difference(readings: Readings, mode: Mode, loaded: list[int]) -> Floats:
+def difference(readings, mode, loaded):
     """(D·m, N·m) measurements from readings, each from its own unloaded ones."""
     n = len(readings)
     d = np.zeros((len(loaded), n))
@@ -55,7 +52,7 @@ def difference(readings: Readings, mode: Mode, loaded: list[int]) -> Floats:
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("m", [3, 6])
 @pytest.mark.parametrize("kind", ["alone", "targets", "scatter"])
-def test_whitened_noise_is_white(mode: Mode, m: int, kind: str) -> None:
+def test_whitened_noise_is_white(mode, m, kind):
     rng = np.random.default_rng([m, len(kind)])
     readings = random_readings(rng, m, decades=1.0)
     while not has_unloaded(readings).all() or readings.unloaded.all():
@@ -91,7 +88,7 @@ def test_whitened_noise_is_white(mode: Mode, m: int, kind: str) -> None:
     np.testing.assert_array_equal(w.covariance, whitening_of_each(w.covariance, d, serial))
 
 
-def whitening_of_each(like: Floats, d: Floats, readings: Readings) -> Floats:
+def whitening_of_each(like, d, readings):
     """Covariance of each measurement by itself as without correlation: what is stated holds."""
     m = readings.m
     alone = np.zeros((len(readings) * m,) * 2)
@@ -103,7 +100,7 @@ def whitening_of_each(like: Floats, d: Floats, readings: Readings) -> Floats:
     return like
 
 
-def test_units_do_not_matter() -> None:
+def test_units_do_not_matter():
     rng = np.random.default_rng(4)
     readings = random_readings(rng, 6).with_serial(NOISE)
     units = 10 ** rng.uniform(-6, 6, 6)
@@ -115,7 +112,7 @@ def test_units_do_not_matter() -> None:
     )
 
 
-def test_a_long_campaign_is_cut_into_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_campaign_is_cut_into_runs(monkeypatch):
     monkeypatch.setattr(scaling_module, "RUN", 10)
     rng = np.random.default_rng(5)
     count = 47
@@ -130,6 +127,6 @@ def test_a_long_campaign_is_cut_into_runs(monkeypatch: pytest.MonkeyPatch) -> No
         assert np.all(np.diff(b.loaded[0]) == 1)
 
 
-def test_what_is_kept_is_read_again() -> None:
+def test_what_is_kept_is_read_again():
     for noise in (NOISE, replace(NOISE, proved=False, instead=("creep",), wider=(0.5, 2.0))):
         assert SerialNoise.from_json(noise.to_json()) == noise

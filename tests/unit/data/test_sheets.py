@@ -5,7 +5,6 @@ import pickle
 import sys
 import zipfile
 from datetime import datetime, timedelta
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,13 +16,11 @@ from scipy.io import savemat
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
-from hilcal.readings.readings import Readings
-from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.tables.files import open_grid
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapped import import_mapped
 from hilcal.tables.mapping import FileFormat, Mapping
+from hilcal.tables.propose import propose
 from hilcal.tables.table import import_table
 from hilcal.toml import check_section
 from tests.support.foreign_tables import campaign
@@ -35,11 +32,11 @@ START = datetime(2024, 5, 31, 23, 59)
 
 
 @pytest.fixture(scope="module")
-def arm() -> Arm:
+def arm():
     return load_arm("ur10e")
 
 
-def section(**more: Any) -> Mapping:
+def section(**more):
     basic = {
         "position": {"columns": ["X", "Y", "Z"], "unit": "mm"},
         "joints": {"columns": NAMES, "unit": "deg"},
@@ -47,14 +44,13 @@ def section(**more: Any) -> Mapping:
     return check_section(basic | more, Mapping, "m.toml")
 
 
-def read(path: Path, mapping: Mapping, arm: Arm) -> Readings:
+def read(path, mapping, arm):
     return import_mapped(path, mapping, arm, NOISE).readings
 
 
-def book(path: Path) -> None:
+def book(path):
     out = openpyxl.Workbook()
     notes = out.active
-    assert notes is not None
     notes.title = "Notes"
     notes["A1"] = "nothing here"
     sheet = out.create_sheet("Data")
@@ -73,7 +69,7 @@ def book(path: Path) -> None:
     out.save(path)
 
 
-def test_a_spreadsheet(tmp_path: Path, arm: Arm) -> None:
+def test_a_spreadsheet(tmp_path, arm):
     path = tmp_path / "t.xlsx"
     book(path)
     found = propose(path).proposal.mapping(Mapping)
@@ -88,7 +84,7 @@ def test_a_spreadsheet(tmp_path: Path, arm: Arm) -> None:
         open_grid(path, FileFormat(sheet="Date"))
 
 
-def test_a_formula_without_a_stored_value_is_no_number(tmp_path: Path, arm: Arm) -> None:
+def test_a_formula_without_a_stored_value_is_no_number(tmp_path, arm):
     path = tmp_path / "t.xlsx"
     book(path)
     edited = openpyxl.load_workbook(path)
@@ -99,7 +95,7 @@ def test_a_formula_without_a_stored_value_is_no_number(tmp_path: Path, arm: Arm)
     assert result.notes[0] == "1 of 12 rows left out (5): no value in A1"
 
 
-def test_a_mat_file(tmp_path: Path, arm: Arm) -> None:
+def test_a_mat_file(tmp_path, arm):
     path = tmp_path / "t.mat"
     t = np.zeros((4, 4, 12))
     t[:3, :3], t[:3, 3], t[3, 3] = np.moveaxis(C.attitude.as_matrix(), 0, 2), C.position.T, 1
@@ -126,7 +122,7 @@ def test_a_mat_file(tmp_path: Path, arm: Arm) -> None:
         open_grid(path, FileFormat(variable="Q"))
 
 
-def test_parquet(tmp_path: Path, arm: Arm) -> None:
+def test_parquet(tmp_path, arm):
     path = tmp_path / "t.parquet"
     columns: dict[str, Any] = {n: np.rad2deg(C.q[:, k]) for k, n in enumerate(NAMES)}
     columns |= {n: 1e3 * C.position[:, k] for k, n in enumerate("XYZ")}
@@ -139,9 +135,7 @@ def test_parquet(tmp_path: Path, arm: Arm) -> None:
 
 
 @pytest.mark.parametrize("name", ["openpyxl", "pyarrow.parquet"])
-def test_a_missing_package_is_named(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_named(name, tmp_path, monkeypatch):
     path = tmp_path / "t"
     if name == "openpyxl":
         book(path)
@@ -152,7 +146,7 @@ def test_a_missing_package_is_named(
         open_grid(path, FileFormat())
 
 
-def _zip(**members: bytes) -> bytes:
+def _zip(**members):
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         for name, content in members.items():
@@ -160,22 +154,18 @@ def _zip(**members: bytes) -> bytes:
     return out.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"\x89HDF\r\n\x1a\n and so on", r"HDF5 file \(MATLAB's -v7.3\); save it with -v7"),
-        (pickle.dumps([1, 2]), "pickle, which is never loaded"),
-        (b"\xd0\xcf\x11\xe0 and so on", r"old Excel file"),
-        (_zip(a=b"1"), "a zip archive that is no XLSX"),
-        (b"PK\x03\x04 cut", "damaged"),
-        (b"PAR1 cut", "damaged"),
-        (b"MATLAB 5.0 MAT-file cut", "t.bin"),
-        (b"\x1f\x8b\x08", "gzip"),
-        (b"a\x00b", "binary data"),
-        (b"", "empty"),
-    ],
-)
-def test_what_is_no_table(content: bytes, message: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("content", "message"), [
+    (b"\x89HDF\r\n\x1a\n and so on", r"HDF5 file \(MATLAB's -v7.3\); save it with -v7"),
+    (pickle.dumps([1, 2]), "pickle, which is never loaded"),
+    (b"\xd0\xcf\x11\xe0 and so on", r"old Excel file"),
+    (_zip(a=b"1"), "a zip archive that is no XLSX"),
+    (b"PK\x03\x04 cut", "damaged"),
+    (b"PAR1 cut", "damaged"),
+    (b"MATLAB 5.0 MAT-file cut", "t.bin"),
+    (b"\x1f\x8b\x08", "gzip"),
+    (b"a\x00b", "binary data"),
+    (b"", "empty")])  # fmt: skip
+def test_what_is_no_table(content, message, tmp_path):
     path = tmp_path / "t.bin"
     path.write_bytes(content)
     for attempt in (lambda: open_grid(path, FileFormat()), lambda: propose(path)):
@@ -184,7 +174,7 @@ def test_what_is_no_table(content: bytes, message: str, tmp_path: Path) -> None:
         assert "\n" not in str(error.value)
 
 
-def test_an_exchange_table_may_be_a_sheet(tmp_path: Path, arm: Arm) -> None:
+def test_an_exchange_table_may_be_a_sheet(tmp_path, arm):
     text, sheet = tmp_path / "t.csv", tmp_path / "t.xlsx"
     header = ["pose", "load", *(f"q{k}_rad" for k in range(1, 7)), "x_m", "y_m", "z_m"]
     rows = [[f"P{k}", "none", *C.q[k], *C.position[k]] for k in range(3)]

@@ -1,37 +1,37 @@
-"""Stated uncertainties that cannot be right are refused, raised, or doubted in words."""
+"""Noise that tables state, and the arm's scatter in them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
+import hilcal as hc
 from hilcal.errors import InputError
-from hilcal.readings.covariance import TrackerNoise, tracker_covariance
-from hilcal.readings.readings import Readings
-from hilcal.tables.table import ImportResult, import_table, write_table
+from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.readings.covariance import COVERS, WHOLE, TrackerNoise, tracker_covariance
+from hilcal.store.campaign_file import CampaignFile
+from hilcal.tables.table import import_table, write_table
 from hilcal.tables.uncertainty import rounding_variance, step
+from tests.support.cli_cases import CELL, ok, rehearsal
 from tests.support.readings_cases import make_arm, simple
 
 ARM = make_arm()
 NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
 
 
-def through_a_table(
-    tmp_path: Path, x: Readings, noise: TrackerNoise | None = NOISE
-) -> ImportResult:
+def through_a_table(tmp_path, x, noise=NOISE):
     write_table(x, tmp_path / "t.csv")
     return import_table(tmp_path / "t.csv", ARM, noise)
 
 
-def with_variances(x: Readings, row: int, *variances: float) -> Readings:
+def with_variances(x, row, *variances):
     cov = x.covariance.copy()
     cov[row] = np.diag(variances)
     return replace(x, covariance=cov)
 
 
 @pytest.mark.parametrize("tiny", [0.0, 1e-30, 1e-15])
-def test_one_variance_of_zero_is_the_instruments(tmp_path: Path, tiny: float) -> None:
+def test_one_variance_of_zero_is_the_instruments(tmp_path, tiny):
     x = with_variances(simple(20), 4, 1e-10, tiny, 1e-10)
     result = through_a_table(tmp_path, x)
     cov = result.readings.covariance
@@ -45,20 +45,16 @@ def test_one_variance_of_zero_is_the_instruments(tmp_path: Path, tiny: float) ->
         through_a_table(tmp_path, x, None)
 
 
-def test_angles_have_a_floor_of_their_own(tmp_path: Path) -> None:
+def test_angles_have_a_floor_of_their_own(tmp_path):
     x = with_variances(simple(20, m=6), 4, 1e-10, 1e-10, 1e-10, 1e-8, 0.0, 1e-8)
     assert through_a_table(tmp_path, x).readings.covariance[4, 4, 4] == NOISE.orientation_std**2
 
 
-@pytest.mark.parametrize(
-    ("sigma", "looks"),
-    [
-        (1e-15, "expected the standard deviations"),
-        (1e-10, "variances given as standard deviations"),
-        (2e-8, "1000 times too small"),
-    ],
-)
-def test_precision_that_nothing_has_is_refused(tmp_path: Path, sigma: float, looks: str) -> None:
+@pytest.mark.parametrize(("sigma", "looks"), [
+    (1e-15, "expected the standard deviations"),
+    (1e-10, "variances given as standard deviations"),
+    (2e-8, "1000 times too small")])  # fmt: skip
+def test_precision_that_nothing_has_is_refused(tmp_path, sigma, looks):
     x = simple(20)
     cov = np.tile(sigma**2 * np.eye(3), (20, 1, 1))
     with pytest.raises(InputError, match="no instrument reaches") as error:
@@ -68,9 +64,7 @@ def test_precision_that_nothing_has_is_refused(tmp_path: Path, sigma: float, loo
 
 
 @pytest.mark.parametrize(("m", "sigma", "unit"), [(3, 5e-3, "m"), (3, 40.0, "m"), (6, 0.1, "rad")])
-def test_noise_that_calibrates_nothing_is_refused(
-    tmp_path: Path, m: int, sigma: float, unit: str
-) -> None:
+def test_noise_that_calibrates_nothing_is_refused(tmp_path, m, sigma, unit):
     x = simple(20, m=m)
     cov = x.covariance.copy()
     cov[:, -1, -1] = sigma**2
@@ -78,7 +72,7 @@ def test_noise_that_calibrates_nothing_is_refused(
         through_a_table(tmp_path, replace(x, covariance=cov))
 
 
-def test_rounding_is_found_and_added(tmp_path: Path) -> None:
+def test_rounding_is_found_and_added(tmp_path):
     x = simple(20)
     fine = through_a_table(tmp_path, x)
     np.testing.assert_array_equal(fine.readings.covariance, x.covariance)
@@ -92,7 +86,7 @@ def test_rounding_is_found_and_added(tmp_path: Path) -> None:
     assert len(through_a_table(tmp_path, coarse).notes) == 1  # it does not count beside 1 mm
 
 
-def test_the_step_of_values() -> None:
+def test_the_step_of_values():
     rng = np.random.default_rng(0)
     values = rng.uniform(-2000, 2000, 50)
     assert step(values) == 0
@@ -103,10 +97,75 @@ def test_the_step_of_values() -> None:
                                (1e-5) ** 2 / 12)  # fmt: skip
 
 
-def test_rounding_changes_the_spread_by_its_variance() -> None:
+def test_rounding_changes_the_spread_by_its_variance():
     """Δ²/12 against the scatter that rounding really makes."""
     rng = np.random.default_rng(1)
     exact = rng.uniform(-1, 1, (20000, 3))
     error = np.round(exact, 2) - exact
     np.testing.assert_allclose(error.var(axis=0), rounding_variance(np.round(exact, 2), 1.0),
                                rtol=0.05)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def table(tmp_path_factory):
+    """Readings with a covariance that the table does not explain."""
+    path = tmp_path_factory.mktemp("import") / "t.csv"
+    write_table(rehearsal("nothing").readings, path)
+    return path
+
+
+def covariances(run):
+    """As stored, and in full."""
+    with hc.Campaign.open(run) as opened:
+        return opened.file.readings().covariance, opened.readings.covariance
+
+
+def test_repeatability_is_added_to_an_imported_table(table, tmp_path, capsys):
+    run = tmp_path / "run.hilcal"
+    told = ok(capsys, "import", table, "--config", CELL, "-o", run, "--json").document
+    assert told["covariance"] == "instrument and repeatability"
+    stored, full = covariances(run)
+    cell = hc.Cell.load(CELL)
+    with CampaignFile.open(run) as file:
+        expected = with_joint_scatter(cell, file.readings(), np.full(6, 1e-5)).covariance
+    np.testing.assert_allclose(full, expected, rtol=1e-12)
+    assert np.all(np.trace(full, axis1=1, axis2=2) > np.trace(stored, axis1=1, axis2=2))
+    np.testing.assert_allclose(hc.read_table(table, cell).covariance, full, rtol=1e-12)
+    assert "[repeatability]" in ok(capsys, "identify", run, "--details").out
+
+
+def test_what_was_exported_is_not_added_again(table, tmp_path, capsys):
+    first, again, out = tmp_path / "a.hilcal", tmp_path / "b.hilcal", tmp_path / "out.csv"
+    ok(capsys, "import", table, "--config", CELL, "-o", first)
+    ok(capsys, "export", first, "--table", out)
+    told = ok(capsys, "import", out, "--config", CELL, "-o", again, "--json").document
+    assert told["covariance"] == "instrument and arm as stated"
+    np.testing.assert_allclose(covariances(again)[1], covariances(first)[1], rtol=1e-9)
+
+
+def test_the_cell_may_say_that_tables_include_it(table, tmp_path, capsys):
+    cell, run = tmp_path / "cell.toml", tmp_path / "run.hilcal"
+    text = CELL.read_text(encoding="utf-8")
+    cell.write_text(text.replace("[repeatability]", "[repeatability]\nin_tables = true"))
+    ok(capsys, "import", table, "--config", cell, "-o", run)
+    np.testing.assert_array_equal(*covariances(run))
+
+
+def test_a_campaign_that_an_older_version_imported_is_read_as_it_was(table, tmp_path):
+    config, run = hc.Cell.load(CELL).configured(), tmp_path / "old.hilcal"
+    with CampaignFile.create(run, config.to_json(), str(CELL.parent), "t.csv (table)") as file:
+        file.append_readings(rehearsal("nothing").readings)
+        assert file.about(COVERS) is None
+    np.testing.assert_array_equal(*covariances(run))
+
+
+def test_a_table_says_the_same_in_all_rows(tmp_path):
+    path = tmp_path / "t.csv"
+    write_table(rehearsal("nothing").readings, path, WHOLE)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    path.write_text("\n".join([*lines[:2], lines[2].replace(WHOLE, "arm"), *lines[3:]]))
+    with pytest.raises(InputError, match=r"row 3, column 'covers': 'arm' is unknown; valid"):
+        hc.read_table(path, hc.Cell.load(CELL))
+    path.write_text("\n".join([*lines[:2], lines[2].replace(WHOLE, "instrument"), *lines[3:]]))
+    with pytest.raises(InputError, match="all rows must say the same"):
+        hc.read_table(path, hc.Cell.load(CELL))

@@ -12,7 +12,6 @@ from hypothesis import HealthCheck, given, settings
 
 from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
-from hilcal.readings.readings import Readings
 from hilcal.tables.table import read_table, write_table
 from tests.support.readings_cases import assert_same, make_arm, readings, simple
 
@@ -26,7 +25,7 @@ per_example_file = settings(
 )
 
 
-def good() -> Table:
+def good():
     """Three poses, each without and with a load, covariances given."""
     rng = np.random.default_rng(1)
     rows = []
@@ -45,8 +44,8 @@ def good() -> Table:
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Write:
-    def to_file(rows: Table) -> Path:
+def write(tmp_path):
+    def to_file(rows):
         path = tmp_path / "table.csv"
         with path.open("w", newline="") as stream:
             out = csv.writer(stream)
@@ -57,22 +56,22 @@ def write(tmp_path: Path) -> Write:
     return to_file
 
 
-def without(rows: Table, *names: str) -> Table:
+def without(rows, *names):
     return [{k: v for k, v in row.items() if k not in names} for row in rows]
 
 
-def renamed(rows: Table, old: str, new: str) -> Table:
+def renamed(rows, old, new):
     return [{new if k == old else k: v for k, v in row.items()} for row in rows]
 
 
-def with_cell(row: int, **cells: str) -> Table:
+def with_cell(row, **cells):
     """The good table with cells changed in a row, counted as a spreadsheet counts."""
     rows = good()
     rows[row - 2] |= cells
     return rows
 
 
-def with_column(name: str, value: str) -> Table:
+def with_column(name, value):
     return [row | {name: value} for row in good()]
 
 
@@ -81,12 +80,12 @@ COVARIANCE = tuple(name for name in good()[0] if name.startswith("cov_"))
 
 @per_example_file
 @given(x=readings())
-def test_round_trip_is_exact(tmp_path: Path, x: Readings) -> None:
+def test_round_trip_is_exact(tmp_path, x):
     write_table(x, tmp_path / "t.csv")
     assert_same(read_table(tmp_path / "t.csv", ARM, None), x)
 
 
-def test_seven_joints(tmp_path: Path) -> None:
+def test_seven_joints(tmp_path):
     x = simple(4)
     x = replace(x, states=replace(x.states, q=np.hstack([x.states.q, np.ones((4, 1))]), time=None))
     write_table(x, tmp_path / "t.csv")
@@ -95,7 +94,7 @@ def test_seven_joints(tmp_path: Path) -> None:
         read_table(tmp_path / "t.csv", ARM, None)
 
 
-def test_good_table(write: Write) -> None:
+def test_good_table(write):
     x = read_table(write(good()), ARM, None)
     assert x.pose.tolist() == [0, 0, 1, 1, 2, 2]
     assert x.load_names == ("none", "plate")
@@ -103,7 +102,7 @@ def test_good_table(write: Write) -> None:
     assert x.covariance[0].tolist() == [[1e-10, 1e-11, 0], [1e-11, 4e-10, 0], [0, 0, 1e-10]]
 
 
-def test_covariance_comes_from_the_instrument_when_the_table_has_none(write: Write) -> None:
+def test_covariance_comes_from_the_instrument_when_the_table_has_none(write):
     path = write(without(good(), *COVARIANCE))
     station = np.array([3.0, 0.0, 0.0])
     x = read_table(path, ARM, NOISE, station)
@@ -120,7 +119,7 @@ def test_covariance_comes_from_the_instrument_when_the_table_has_none(write: Wri
         read_table(path, ARM, NOISE, station)
 
 
-def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write: Write) -> None:
+def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write):
     rows = [dict(reversed(row.items())) for row in good()]
     path = write(rows + rows[:2])
     path.write_text("\ufeff" + path.read_text().replace("\n", "\n\n") + "\n\n")
@@ -130,24 +129,18 @@ def test_repeats_blank_lines_and_order_of_columns_do_not_matter(write: Write) ->
 
 
 BAD: dict[str, tuple[Table, str]] = {
-    "misspelled": (
-        renamed(good(), "q3_rad", "q3_rda"),
-        r"unknown column 'q3_rda'; did you mean 'q3_rad'",
-    ),
+    "misspelled": (renamed(good(), "q3_rad", "q3_rda"),
+        r"unknown column 'q3_rda'; did you mean 'q3_rad'"),
     "capital": (renamed(good(), "y_m", "Y_m"), r"unknown column 'Y_m'; did you mean 'y_m'"),
     "unknown": (with_column("temperature", "20"), r"unknown column 'temperature'.*start with 'x_'"),
     "missing": (without(good(), "q4_rad"), r"column 'q4_rad' is missing.*needs pose, load, q1_rad"),
-    "in millimetres by name": (
-        renamed(good(), "x_m", "x_mm"),
-        r"column 'x_m' is missing; 'x_mm' is taken as a column of your own",
-    ),
+    "in millimetres by name": (renamed(good(), "x_m", "x_mm"),
+        r"column 'x_m' is missing; 'x_mm' is taken as a column of your own"),
     "unnamed": (with_column("", ""), r"column 21 has no name"),
     "lower triangle": (with_column("cov_y_x", "1e-11"), r"upper triangle only: 'cov_x_y'"),
     "incomplete covariance": (without(good(), "cov_y_z"), r"'cov_y_z' is missing.*upper triangle"),
-    "covariance of what was not read": (
-        with_column("cov_rx_rx", "1e-10"),
-        r"'cov_rx_rx' needs the rotation vector",
-    ),
+    "covariance of what was not read": (with_column("cov_rx_rx", "1e-10"),
+        r"'cov_rx_rx' needs the rotation vector"),
     "half a rotation": (with_column("rx_rad", "0.1"), r"'ry_rad' is missing; give all of"),
     "half the approaches": (with_column("approach1", "1"), r"'approach2' is missing"),
     "empty cell": (with_cell(3, x_m=""), r"row 3, column 'x_m': the cell is empty"),
@@ -157,71 +150,47 @@ BAD: dict[str, tuple[Table, str]] = {
     "too large": (with_cell(2, z_m="1e999"), r"row 2, column 'z_m': '1e999' is not a number"),
     "underscore": (with_cell(2, z_m="1_0"), r"row 2, column 'z_m': '1_0' is not a number"),
     "decimal comma": (with_cell(2, z_m="0,1"), r"row 2, column 'z_m': '0,1' is not a number"),
-    "one position in millimetres": (
-        with_cell(4, x_m="1400"),
-        r"row 4, column 'x_m': 1400 m cannot be right \(looks like millimetres\)",
-    ),
+    "one position in millimetres": (with_cell(4, x_m="1400"),
+        r"row 4, column 'x_m': 1400 m cannot be right \(looks like millimetres\)"),
     "far from the others": (with_cell(4, x_m="40"), r"row 4: position is .* m from the others"),
-    "degrees": (
-        with_cell(2, q5_rad="90"),
-        r"row 2, column 'q5_rad': 90 rad .* -6.28319 to 6.28319 rad \(looks like degrees\)",
-    ),
+    "degrees": (with_cell(2, q5_rad="90"),
+        r"row 2, column 'q5_rad': 90 rad .* -6.28319 to 6.28319 rad \(looks like degrees\)"),
     "beyond a limit": (with_cell(2, q5_rad="6.5"), r"row 2, column 'q5_rad': 6.5 rad is beyond"),
-    "zero covariance": (
-        with_cell(6, **dict.fromkeys(COVARIANCE, "0")),
-        r"row 6: the covariance is zero",
-    ),
+    "zero covariance": (with_cell(6, **dict.fromkeys(COVARIANCE, "0")),
+        r"row 6: the covariance is zero"),
     "negative variance": (with_cell(6, cov_y_y="-1e-10"), r"row 6: variance 2 .* is -1e-10"),
     "indefinite": (with_cell(6, cov_x_y="5e-10"), r"row 6: the covariance is not positive semi"),
-    "correlated with what has no variance": (
-        with_cell(6, cov_y_y="0"),
-        r"row 6: the covariance is not positive semi",
-    ),
-    "covariance in mm²": (
-        with_cell(6, cov_x_x="4e-4", cov_x_y="0"),
-        r"row 6: a standard deviation of 0.02 m .* m²",
-    ),
-    "time in nanoseconds": (
-        with_column("time_s", "1.7e18"),
-        r"row 2, column 'time_s': 1.7e\+18 s cannot be right; expected -1e\+12 to 1e\+12 s",
-    ),
+    "correlated with what has no variance": (with_cell(6, cov_y_y="0"),
+        r"row 6: the covariance is not positive semi"),
+    "covariance in mm²": (with_cell(6, cov_x_x="4e-4", cov_x_y="0"),
+        r"row 6: a standard deviation of 0.02 m .* m²"),
+    "time in nanoseconds": (with_column("time_s", "1.7e18"),
+        r"row 2, column 'time_s': 1.7e\+18 s cannot be right; expected -1e\+12 to 1e\+12 s"),
     "no load": (with_cell(3, load=" "), r"row 3, column 'load': the cell is empty"),
     "no pose": (with_cell(3, pose=""), r"row 3, column 'pose': the cell is empty"),
     "two lines": (with_cell(3, pose="a\nb"), r"row 3, column 'pose': 'a\\u000ab' holds the"),
-    "column of two lines": (
-        with_column("a\nb", ""),
-        r"row 1, column 21: 'a\\u000ab' holds the char",
-    ),
+    "column of two lines": (with_column("a\nb", ""),
+        r"row 1, column 21: 'a\\u000ab' holds the char"),
     "None": (with_cell(2, load="None"), r"row 2, column 'load': 'None' must be spelled 'none'"),
-    "wrench without a load": (
-        with_cell(4, fz_N="-50"),
-        r"row 4, column 'fz_N': -50: the load is 'none'",
-    ),
+    "wrench without a load": (with_cell(4, fz_N="-50"),
+        r"row 4, column 'fz_N': -50: the load is 'none'"),
     "wrench in millinewton": (with_cell(3, fz_N="-50000"), r"row 3, column 'fz_N'.*expected N"),
-    "approach": (
-        [row | {f"approach{i}": "0.5" for i in range(1, 7)} for row in good()],
-        r"row 2, column 'approach1': 0.5 must be -1 or \+1",
-    ),
-    "actual joints in degrees": (
-        [row | {f"qa{i}_rad": "57.3" for i in range(1, 7)} for row in good()],
-        r"row 2, column 'qa1_rad': 57.3 rad is not within",
-    ),
+    "approach": ([row | {f"approach{i}": "0.5" for i in range(1, 7)} for row in good()],
+        r"row 2, column 'approach1': 0.5 must be -1 or \+1"),
+    "actual joints in degrees": ([row | {f"qa{i}_rad": "57.3" for i in range(1,
+        7)} for row in good()], r"row 2, column 'qa1_rad': 57.3 rad is not within"),
     "kelvin": (with_column("air_degC", "293"), r"row 2, column 'air_degC': 293 °C cannot be"),
     "negative load time": (with_column("load_time_s", "-1"), r"column 'load_time_s': -1 s"),
     "half a cycle": (with_cell(2, cycle="0.5"), r"row 2, column 'cycle': 0.5 must be a whole"),
-    "covariance of a position for a pose": (
-        [row | {"rx_rad": "1", "ry_rad": "0", "rz_rad": "0"} for row in good()],
-        r"'cov_x_rx' is missing",
-    ),
-    "one pose, two joints": (
-        with_cell(5, q2_rad="0.5"),
-        r"row 5: pose 'P1' commands joint 2 to 0.5 rad, row 4 to",
-    ),
-}
+    "covariance of a position for a pose": ([row | {"rx_rad": "1", "ry_rad": "0",
+        "rz_rad": "0"} for row in good()], r"'cov_x_rx' is missing"),
+    "one pose, two joints": (with_cell(5, q2_rad="0.5"),
+        r"row 5: pose 'P1' commands joint 2 to 0.5 rad, row 4 to"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_bad_tables_are_refused_by_name(write: Write, case: str) -> None:
+def test_bad_tables_are_refused_by_name(write, case):
     rows, message = BAD[case]
     with pytest.raises(InputError, match=message) as error:
         read_table(write(rows), ARM, NOISE)
@@ -229,21 +198,21 @@ def test_bad_tables_are_refused_by_name(write: Write, case: str) -> None:
     assert "table.csv: " in str(error.value)
 
 
-def test_rotations_in_degrees(write: Write) -> None:
+def test_rotations_in_degrees(write):
     rows = without(good(), *COVARIANCE)
     path = write([row | {"rx_rad": "170", "ry_rad": "0", "rz_rad": "0"} for row in rows])
     with pytest.raises(InputError, match=r"row 2: rotation vector .*looks like degrees"):
         read_table(path, ARM, replace(NOISE, orientation_std=1e-4))
 
 
-def test_duplicated_column(tmp_path: Path) -> None:
+def test_duplicated_column(tmp_path):
     path = tmp_path / "t.csv"
     path.write_text("pose,load,x_m,x_m\na,none,1,1\n")
     with pytest.raises(InputError, match="column 'x_m' appears 2 times"):
         read_table(path, ARM, None)
 
 
-def test_all_positions_in_millimetres(write: Write) -> None:
+def test_all_positions_in_millimetres(write):
     rows = [
         row | {f"{a}_m": str(1000 * float(row[f"{a}_m"]) + 900) for a in "xyz"} for row in good()
     ]
@@ -251,14 +220,14 @@ def test_all_positions_in_millimetres(write: Write) -> None:
         read_table(write(rows), ARM, None)
 
 
-def test_positions_that_do_not_move_with_the_joints(tmp_path: Path) -> None:
+def test_positions_that_do_not_move_with_the_joints(tmp_path):
     x = simple(20)
     write_table(replace(x, value=1.0 + 1e-4 * x.value), tmp_path / "t.csv")
     with pytest.raises(InputError, match="all positions lie within"):
         read_table(tmp_path / "t.csv", ARM, None)
 
 
-def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path: Path) -> None:
+def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path):
     write_table(simple(9000), tmp_path / "t.csv")
     lines = (tmp_path / "t.csv").read_text().splitlines()
     lines[8000] = lines[8000].replace(",", ",oops,", 1)
@@ -268,29 +237,25 @@ def test_row_numbers_count_blank_lines_and_all_blocks(tmp_path: Path) -> None:
         read_table(tmp_path / "t.csv", ARM, None)
 
 
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "the file is empty"),
-        (b"\xef\xbb\xbf \n\n", "the file is empty"),
-        (b"\x00\x01\x02", "binary data"),
-        (b"PK\x03\x04 and so on", "damaged, or not an XLSX file"),
-        ("name,age\n".encode("utf-16"), "not an exchange table"),
-        (b"pose,load\xff\xfe,q1_rad\n", "not UTF-8"),
-        (b"Timestamp;Goal x;Goal y\n2;3;4\n", "separated by ','"),
-        (b"pose;load;q1_rad\na;none;0,1\n", "separated by ','"),
-        (b"name,age\nbob,7\n", "not an exchange table"),
-        (b'pose,load\n"a,none\n', "row 2: not delimited text"),
-    ],
-)
-def test_files_of_another_format(tmp_path: Path, content: bytes, message: str) -> None:
+@pytest.mark.parametrize(("content", "message"), [
+    (b"", "the file is empty"),
+    (b"\xef\xbb\xbf \n\n", "the file is empty"),
+    (b"\x00\x01\x02", "binary data"),
+    (b"PK\x03\x04 and so on", "damaged, or not an XLSX file"),
+    ("name,age\n".encode("utf-16"), "not an exchange table"),
+    (b"pose,load\xff\xfe,q1_rad\n", "not UTF-8"),
+    (b"Timestamp;Goal x;Goal y\n2;3;4\n", "separated by ','"),
+    (b"pose;load;q1_rad\na;none;0,1\n", "separated by ','"),
+    (b"name,age\nbob,7\n", "not an exchange table"),
+    (b'pose,load\n"a,none\n', "row 2: not delimited text")])  # fmt: skip
+def test_files_of_another_format(tmp_path, content, message):
     path = tmp_path / "t.csv"
     path.write_bytes(content)
     with pytest.raises(InputError, match=message):
         read_table(path, ARM, None)
 
 
-def test_other_things_than_a_table(tmp_path: Path, write: Write) -> None:
+def test_other_things_than_a_table(tmp_path, write):
     with pytest.raises(InputError, match="no such file"):
         read_table(tmp_path / "absent.csv", ARM, None)
     with pytest.raises(InputError, match="cannot be read"):
@@ -311,7 +276,7 @@ def test_other_things_than_a_table(tmp_path: Path, write: Write) -> None:
         read_table(path, ARM, None)
 
 
-def test_damaged_bytes_give_one_line_or_sound_readings(write: Write) -> None:
+def test_damaged_bytes_give_one_line_or_sound_readings(write):
     path = write(good())
     whole = path.read_bytes()
     rng = np.random.default_rng(8)
@@ -332,21 +297,21 @@ def test_damaged_bytes_give_one_line_or_sound_readings(write: Write) -> None:
     assert not any("\n" in message for message in messages)
 
 
-def test_a_reading_at_the_station_has_no_line_of_sight(write: Write) -> None:
+def test_a_reading_at_the_station_has_no_line_of_sight(write):
     rows = with_cell(5, x_m="0", y_m="0", z_m="0")
     with pytest.raises(InputError, match=r"row 5: position lies at the tracker's station"):
         read_table(write(without(rows, *COVARIANCE)), ARM, NOISE)
 
 
 @pytest.mark.parametrize("name", ["", " a", "a\n", "a\x00", "None"])
-def test_names_that_a_table_cannot_hold_are_not_written(tmp_path: Path, name: str) -> None:
+def test_names_that_a_table_cannot_hold_are_not_written(tmp_path, name):
     x = replace(simple(2), load_names=(name,))
     with pytest.raises(InputError, match="load"):
         write_table(x, tmp_path / "t.csv")
     assert not list(tmp_path.iterdir())
 
 
-def test_two_poses_of_one_name_are_not_merged(tmp_path: Path) -> None:
+def test_two_poses_of_one_name_are_not_merged(tmp_path):
     x = replace(simple(2), pose_names=("a", "a"))
     with pytest.raises(InputError, match="two of the readings' poses have this name"):
         write_table(x, tmp_path / "t.csv")

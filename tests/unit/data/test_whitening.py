@@ -1,42 +1,115 @@
-"""Scaling of measurements: the laws of `hilcal.readings.whitening`."""
+"""Every term of a covariance, and whitening by it."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from hilcal.readings.readings import Readings, States
-from hilcal.readings.whitening import (
-    MANY,
-    MODES,
-    Mode,
-    Scaling,
-    inverse_root,
-    measured,
-    whitening,
+from hilcal.errors import InputError
+from hilcal.readings.covariance import (
+    TrackerNoise,
+    covariance_of_mean,
+    expected_share_of_mean,
+    joint_scatter,
+    tracker_covariance,
 )
+from hilcal.readings.readings import Readings, States
+from hilcal.readings.whitening import MANY, MODES, inverse_root, measured, whitening
 from hilcal.robot import se3
-from hilcal.types import Floats, Ints
+
+NOISE = TrackerNoise(10e-6, 0.3e-6, 15e-6, 6e-6, 1e-4)
+
+points = arrays(np.float64, (4, 3), elements=st.floats(-10, 10)).filter(
+    lambda p: np.linalg.norm(p, axis=1).min() > 0.1
+)
+vectors = arrays(np.float64, 3, elements=st.floats(-3, 3))
+
+
+@given(points, vectors)
+def test_only_the_position_from_the_station_matters(p, station):
+    moved = tracker_covariance(p + station, NOISE, station)
+    np.testing.assert_allclose(moved, tracker_covariance(p, NOISE), rtol=1e-9, atol=1e-20)
+
+
+def test_it_is_the_first_order_covariance_of_azimuth_elevation_and_range():
+    p = np.array([[2.0, -1.0, 0.5]])
+    d = np.linalg.norm(p)
+    azimuth, elevation = np.arctan2(p[0, 1], p[0, 0]), np.arcsin(p[0, 2] / d)
+
+    def point(az, el, r):
+        c = np.cos(el)
+        return r * np.array([c * np.cos(az), c * np.sin(az), np.sin(el)])
+
+    h, at = 1e-6, np.array([azimuth, elevation, d])
+    jac = np.stack([(point(*(at + e)) - point(*(at - e))) / (2 * h) for e in h * np.eye(3)], axis=1)
+    t, r = 15e-6 + 6e-6 * d, 10e-6 + 0.3e-6 * d
+    sigma = np.array([t / (d * np.cos(elevation)), t / d, r])
+    np.testing.assert_allclose(
+        tracker_covariance(p, NOISE)[0], jac @ np.diag(sigma**2) @ jac.T, rtol=1e-7, atol=1e-18
+    )
+
+
+def test_pose_covariance_adds_the_rotation_block():
+    p = np.array([[1.0, 2.0, 3.0], [0.0, -1.0, 0.0]])
+    cov = tracker_covariance(p, NOISE, m=6)
+    np.testing.assert_array_equal(cov[:, :3, :3], tracker_covariance(p, NOISE))
+    np.testing.assert_array_equal(cov[:, 3:, 3:], np.tile(1e-8 * np.eye(3), (2, 1, 1)))
+    assert not cov[:, :3, 3:].any()
+
+
+def test_what_no_instrument_has_is_refused():
+    with pytest.raises(InputError, match="range_std = -1"):
+        TrackerNoise(-1.0, 0.0, 1e-5, 0.0)
+    with pytest.raises(InputError, match="transverse_std"):
+        TrackerNoise(1e-5, 0.0, 0.0, 0.0)
+    with pytest.raises(InputError, match="orientation_std = nan"):
+        TrackerNoise(1e-5, 0.0, 1e-5, 0.0, float("nan"))
+    with pytest.raises(InputError, match="reading 2 lies at the tracker's station"):
+        tracker_covariance(np.array([[1.0, 0, 0], [1.0, 1, 1]]), NOISE, (1.0, 1.0, 1.0))
+    with pytest.raises(InputError, match="orientation_std is 0"):
+        tracker_covariance(np.ones((1, 3)), TrackerNoise(1e-5, 0.0, 1e-5, 0.0), m=6)
+
+
+def test_joint_scatter_is_its_formula_and_turns_with_the_base():
+    rng = np.random.default_rng(5)
+    jac, std = rng.normal(size=(4, 6, 7)), rng.uniform(1e-5, 5e-5, 7)
+    turn = se3.rotation(rng.normal(size=(4, 3)))
+    both = np.zeros((4, 6, 6))
+    both[:, :3, :3] = both[:, 3:, 3:] = turn
+    expected = both @ jac @ np.diag(std**2) @ np.swapaxes(jac, 1, 2) @ np.swapaxes(both, 1, 2)
+    whole = joint_scatter(jac, std, turn, 6)
+    np.testing.assert_allclose(whole, expected, rtol=1e-12, atol=1e-24)
+    np.testing.assert_array_equal(joint_scatter(jac, std, turn, 3), whole[:, :3, :3])
+
+
+def test_the_mean_keeps_the_expected_share_of_what_is_stated():
+    """A scatter of just the random part makes s Σ + (1 - s) Σ / K; then nothing is learnt."""
+    stated, samples, share = np.diag([1.0, 4.0, 9.0]) * 1e-10, 6, 0.3
+    basis = np.sqrt((samples - 1) * (1 - share)) * np.linalg.cholesky(stated).T
+    scatter = np.vstack([basis, np.zeros((samples - 3, 3))])
+    expected = expected_share_of_mean(samples, share) * stated
+    found = covariance_of_mean(stated, scatter, share)
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-24)
+
 
 seeds = st.integers(0, 2**32 - 1)
 sizes = st.sampled_from([3, 6])
 
 
-def spd(rng: np.random.Generator, count: int, k: int, decades: float = 3.0) -> Floats:
+def spd(rng, count, k, decades=3.0):
     """Covariances (count, k, k) of full rank; standard deviations over some decades."""
     b = rng.standard_normal((count, k, k))
     std = 10 ** rng.uniform(-decades, decades, (count, k))
     return std[:, :, None] * (b @ np.swapaxes(b, 1, 2) + 0.1 * np.eye(k)) * std[:, None, :]
 
 
-def random_units(rng: np.random.Generator, k: int) -> Floats:
+def random_units(rng, k):
     """Factors (k,) such as from m to mm."""
     return np.asarray(10 ** rng.uniform(-6, 6, k))
 
 
-def make_readings(
-    pose: Ints, cycle: Ints, load: Ints, value: Floats, covariance: Floats
-) -> Readings:
+def make_readings(pose, cycle, load, value, covariance):
     """Readings with load 0 the unloaded state."""
     count = len(pose)
     return Readings(
@@ -51,7 +124,7 @@ def make_readings(
     )
 
 
-def random_readings(rng: np.random.Generator, m: int, decades: float = 3.0) -> Readings:
+def random_readings(rng, m, decades=3.0):
     """Poses in random order, 1-2 cycles, 1-3 unloaded and 1-4 loaded readings in each."""
     rows = []
     for pose in range(int(rng.integers(1, 6))):
@@ -70,7 +143,7 @@ def random_readings(rng: np.random.Generator, m: int, decades: float = 3.0) -> R
 
 
 @given(seeds, sizes)
-def test_gc_whitens(seed: int, k: int) -> None:
+def test_gc_whitens(seed, k):
     v = spd(np.random.default_rng(seed), 4, k)
     f = inverse_root(v, "gc")
     np.testing.assert_allclose(
@@ -79,7 +152,7 @@ def test_gc_whitens(seed: int, k: int) -> None:
 
 
 @given(seeds, sizes)
-def test_gu_divides_by_the_standard_deviations(seed: int, k: int) -> None:
+def test_gu_divides_by_the_standard_deviations(seed, k):
     v = spd(np.random.default_rng(seed), 4, k)
     eps = np.random.default_rng(seed).standard_normal((4, k))
     white = (inverse_root(v, "gu") @ eps[:, :, None])[:, :, 0]
@@ -87,12 +160,12 @@ def test_gu_divides_by_the_standard_deviations(seed: int, k: int) -> None:
     np.testing.assert_allclose(white, eps / std, rtol=1e-14)
 
 
-def test_none_leaves_everything_as_it_is() -> None:
+def test_none_leaves_everything_as_it_is():
     v = spd(np.random.default_rng(0), 2, 6)
     np.testing.assert_array_equal(inverse_root(v, "none"), np.tile(np.eye(6), (2, 1, 1)))
 
 
-def estimate(factor: Floats, a: Floats, y: Floats) -> tuple[Floats, float]:
+def estimate(factor, a, y):
     """Least squares of the scaled regression, and its χ²; one measurement per factor."""
     count, k = factor.shape[:2]
     ga = (factor @ a.reshape(count, k, -1)).reshape(count * k, -1)
@@ -103,7 +176,7 @@ def estimate(factor: Floats, a: Floats, y: Floats) -> tuple[Floats, float]:
 
 @pytest.mark.parametrize("scaling", ["gu", "gc"])
 @given(seeds, sizes)
-def test_change_of_units_changes_nothing(scaling: Scaling, seed: int, k: int) -> None:
+def test_change_of_units_changes_nothing(scaling, seed, k):
     rng = np.random.default_rng(seed)
     v, u = spd(rng, 6, k, decades=1.0), random_units(rng, k)
     a, y = rng.standard_normal((6, k, 3)), rng.standard_normal((6, k))
@@ -114,7 +187,7 @@ def test_change_of_units_changes_nothing(scaling: Scaling, seed: int, k: int) ->
 
 
 @given(seeds, sizes)
-def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed: int, k: int) -> None:
+def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed, k):
     """Cholesky's factor or eigenvectors: V⁻¹ = S⁻ᵀ S⁻¹ is the same, singular blocks included."""
     rng = np.random.default_rng(seed)
     v = spd(rng, 50, k)
@@ -135,7 +208,7 @@ def test_many_blocks_give_the_squares_that_each_gives_by_itself(seed: int, k: in
 
 
 @given(seeds, sizes, st.data())
-def test_direction_without_noise_is_left_out(seed: int, k: int, data: st.DataObject) -> None:
+def test_direction_without_noise_is_left_out(seed, k, data):
     rank = data.draw(st.integers(1, k - 1))
     rng = np.random.default_rng(seed)
     b = rng.standard_normal((k, rank)) * random_units(rng, k)[:, None]
@@ -149,9 +222,7 @@ def test_direction_without_noise_is_left_out(seed: int, k: int, data: st.DataObj
 
 @pytest.mark.parametrize("scaling", ["gu", "gc"])
 @given(seeds, st.data())
-def test_element_without_noise_is_left_out(
-    scaling: Scaling, seed: int, data: st.DataObject
-) -> None:
+def test_element_without_noise_is_left_out(scaling, seed, data):
     dead = data.draw(st.lists(st.integers(0, 5), min_size=1, max_size=6, unique=True))
     v = spd(np.random.default_rng(seed), 1, 6)[0]
     v[dead], v[:, dead] = 0.0, 0.0
@@ -162,7 +233,7 @@ def test_element_without_noise_is_left_out(
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_rank_counts_what_carries_information(mode: Mode) -> None:
+def test_rank_counts_what_carries_information(mode):
     """Three elements that lie in a plane that the instrument sees: two rows per measurement."""
     rng = np.random.default_rng(3)
     b = rng.standard_normal((3, 2)) * 1e-5
@@ -179,7 +250,7 @@ def test_rank_counts_what_carries_information(mode: Mode) -> None:
 # --- readings and deflections --------------------------------------------------------------
 
 
-def whitened_covariance(readings: Readings, mode: Mode, scaling: Scaling = "gc") -> Floats:
+def whitened_covariance(readings, mode, scaling="gc"):
     """Covariance (D·m, D·m) of the whitened rows, by propagation from independent readings."""
     w = whitening(readings, mode, scaling)
     count, m = readings.value.shape
@@ -191,9 +262,7 @@ def whitened_covariance(readings: Readings, mode: Mode, scaling: Scaling = "gc")
 
 @pytest.mark.parametrize("mode", MODES)
 @given(seeds, sizes)
-def test_all_whitened_rows_are_independent_with_unit_variance(
-    mode: Mode, seed: int, m: int
-) -> None:
+def test_all_whitened_rows_are_independent_with_unit_variance(mode, seed, m):
     """Exactly, by propagation from the readings: shared, repeated and uneven unloaded readings."""
     readings = random_readings(np.random.default_rng(seed), m, decades=1.0)
     w = whitening(readings, mode)
@@ -203,7 +272,7 @@ def test_all_whitened_rows_are_independent_with_unit_variance(
 
 
 @given(seeds, sizes)
-def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed: int, m: int) -> None:
+def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed, m):
     r = random_readings(np.random.default_rng(seed), m)
     w = whitening(r, "deflection")
     raw = w.raw(r.value)
@@ -217,7 +286,7 @@ def test_deflection_is_loaded_minus_mean_unloaded_of_pose_and_cycle(seed: int, m
 
 
 @given(seeds, sizes)
-def test_absolute_readings_stand_for_themselves(seed: int, m: int) -> None:
+def test_absolute_readings_stand_for_themselves(seed, m):
     r = random_readings(np.random.default_rng(seed), m)
     w = whitening(r, "absolute")
     np.testing.assert_array_equal(w.reading, np.arange(len(r)))
@@ -226,7 +295,7 @@ def test_absolute_readings_stand_for_themselves(seed: int, m: int) -> None:
     np.testing.assert_array_equal(w.covariance, r.covariance)
 
 
-def test_pose_measured_only_unloaded_gives_no_deflection() -> None:
+def test_pose_measured_only_unloaded_gives_no_deflection():
     pose, load = np.array([0, 0, 1]), np.array([0, 1, 0])
     covariance = spd(np.random.default_rng(0), 3, 3)
     r = make_readings(pose, np.zeros(3, np.int64), load, np.zeros((3, 3)), covariance)
@@ -237,7 +306,7 @@ def test_pose_measured_only_unloaded_gives_no_deflection() -> None:
 
 
 @given(seeds)
-def test_measured_rotation_is_that_from_unloaded_to_loaded(seed: int) -> None:
+def test_measured_rotation_is_that_from_unloaded_to_loaded(seed):
     rng = np.random.default_rng(seed)
     unloaded = rng.uniform(-1.5, 1.5, 3)
     turn = rng.uniform(-0.5, 0.5, 3)
@@ -249,7 +318,7 @@ def test_measured_rotation_is_that_from_unloaded_to_loaded(seed: int) -> None:
     np.testing.assert_allclose(measured(r, whitening(r, "deflection"))[0, 3:], turn, atol=1e-9)
 
 
-def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
+def rotation_variance(unloaded, count=4000):
     """Variances (3,) of the whitened rotations of poses with some unloaded readings each."""
     rng = np.random.default_rng(5)
     std = 1e-4
@@ -269,5 +338,5 @@ def rotation_variance(unloaded: int, count: int = 4000) -> Floats:
     return np.asarray(w.whiten(measured(r, w)).reshape(-1, 6)[:, 3:].var(axis=0))
 
 
-def test_rotations_have_the_stated_noise() -> None:
+def test_rotations_have_the_stated_noise():
     assert np.abs(rotation_variance(1) - 1).max() < 4 * np.sqrt(2 / 4000)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.config.joints import Conventions, Coupling
+from hilcal.config.sections import Conventions, Coupling
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit

@@ -17,7 +17,7 @@ import pytest
 
 from hilcal.engine.cluster import Cluster
 from hilcal.engine.engine import open_engine
-from hilcal.engine.tasks import ClusterError
+from hilcal.engine.processes import ClusterError
 from hilcal.errors import InputError
 from tests.support.cluster import (
     HERE,
@@ -35,13 +35,13 @@ ITEMS = range(40)
 SEED = 11
 
 
-def here() -> tuple[float, ...]:
+def here():
     with open_engine(1) as engine:
         return engine.map(singular_value, ITEMS, SEED)
 
 
 @pytest.mark.slow
-def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
+def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed():
     with scheduler() as address:
         start = ("dask", "worker", address, *WORKER)
         with running(*start) as doomed, running(*start), open_engine(scheduler=address) as engine:
@@ -49,7 +49,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
             engine.workers.client.wait_for_workers(2, timeout=60)
             done: list[int] = []
 
-            def advance(step: int) -> None:
+            def advance(step):
                 done.append(step)
                 if len(done) == 8:
                     doomed.send_signal(signal.SIGKILL)
@@ -59,7 +59,7 @@ def test_a_cluster_gives_the_same_bits_though_a_worker_is_killed() -> None:
             assert len(done) == len(ITEMS)
 
 
-def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody() -> None:
+def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody():
     before = sockets()  # of what the tests before this one have left
     with open_engine(2) as engine:
         assert engine.map(singular_value, ITEMS, SEED) == here()
@@ -77,13 +77,13 @@ def test_workers_of_this_machine_give_the_same_bits_and_can_be_reached_by_nobody
     assert not workers()
 
 
-def workers() -> list[psutil.Process]:
+def workers():
     """Every process below this one but that which Python keeps for its semaphores."""
     every = psutil.Process().children(recursive=True)
     return [p for p in every if "resource_tracker" not in " ".join(p.cmdline())]
 
 
-def sockets() -> list[str]:
+def sockets():
     """What the processes of the engine listen at, or have on a network; this process included."""
     every = [psutil.Process(), *workers()]
     return [
@@ -95,7 +95,7 @@ def sockets() -> list[str]:
 
 
 @pytest.mark.long
-def test_what_a_killed_worker_held_is_computed_by_another(tmp_path: Path) -> None:
+def test_what_a_killed_worker_held_is_computed_by_another(tmp_path):
     with open_engine(2) as engine:
         found = engine.map(partial(die_once, folder=tmp_path), range(6))
         assert found == tuple(range(6))
@@ -106,17 +106,13 @@ def test_what_a_killed_worker_held_is_computed_by_another(tmp_path: Path) -> Non
         assert engine.map(refuse, range(2)) == (0, 1)  # nothing of it is left
 
 
-@pytest.mark.parametrize(
-    "kind",
-    [
-        signal.SIGINT,
-        *(
-            pytest.param(kind, marks=pytest.mark.slow)
-            for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
-        ),
-    ],
-)
-def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [
+    signal.SIGINT,
+    *(
+        pytest.param(kind, marks=pytest.mark.slow)
+        for kind in (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)
+    )])  # fmt: skip
+def test_a_signal_leaves_no_process_and_no_folder(kind, tmp_path):
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.support.engine_cases"],
         env=HERE | {"TMPDIR": str(tmp_path)},
@@ -125,7 +121,6 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
         text=True,
         start_new_session=True,
     )
-    assert process.stderr is not None
     assert process.stderr.readline() == "computing\n"  # by the first of its workers
     workers = psutil.Process(process.pid).children(recursive=True)
     assert len(workers) >= 2
@@ -149,7 +144,7 @@ def test_a_signal_leaves_no_process_and_no_folder(kind: signal.Signals, tmp_path
         assert "Traceback" not in told
 
 
-def deaf(pid: int, number: signal.Signals) -> bool:
+def deaf(pid, number):
     """Whether a process blocks or ignores a signal; proc(5), SigBlk and SigIgn."""
     lines = Path(f"/proc/{pid}/status").read_text(encoding="ascii").splitlines()
     masks = [int(line.split()[1], 16) for line in lines if line.startswith(("SigBlk", "SigIgn"))]
@@ -158,7 +153,7 @@ def deaf(pid: int, number: signal.Signals) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("openssl") is None, reason="needs openssl")
-def test_a_cluster_with_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_with_certificates(tmp_path, monkeypatch):
     certificates(tmp_path, ("ours", "theirs"))
     for name, value in in_environment(tls(tmp_path, "ours")).items():
         monkeypatch.setenv(name, value)  # of the cluster's processes
@@ -173,7 +168,7 @@ def test_a_cluster_with_certificates(tmp_path: Path, monkeypatch: pytest.MonkeyP
             pass
 
 
-def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path: Path) -> None:
+def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path):
     for settings, why in (({}, "none are named"), (tls(tmp_path, "none"), "No such file")):
         with (
             dask.config.set(settings),
@@ -183,19 +178,16 @@ def test_certificates_that_are_not_there_are_said_in_one_line(tmp_path: Path) ->
             pass
 
 
-def test_what_is_no_cluster_is_said_in_one_line() -> None:
+def test_what_is_no_cluster_is_said_in_one_line():
     with pytest.raises(InputError, match="not an address"), open_engine(scheduler="nowhere"):
         pass
     with pytest.raises(InputError, match="from 1"), open_engine(0):
         pass
-    with (
-        pytest.raises(InputError, match="own workers"),
-        open_engine(2, "tcp://127.0.0.1:1"),
-    ):
+    with pytest.raises(InputError, match="own workers"), open_engine(2, "tcp://127.0.0.1:1"):
         pass
 
 
-def test_a_scheduler_without_workers_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_without_workers_is_refused(monkeypatch):
     monkeypatch.setattr("hilcal.engine.cluster.WORKERS_S", 0.2)
     with (
         scheduler() as address,

@@ -10,7 +10,7 @@ import pytest
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.cell import Cell
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import installed
 from hilcal.errors import CannotAnswerError, InputError

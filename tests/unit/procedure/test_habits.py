@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.config import CellConfig, load_config
 from hilcal.config.cell import Target, Tool
-from hilcal.config.planning import Obstacle
+from hilcal.config.sections import Obstacle
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from tests.support.procedure_cases import drawn, small

@@ -8,7 +8,7 @@ import pytest
 import hilcal as hc
 from hilcal.calibration.improvement import Improvement
 from hilcal.config.cell import Repeatability
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.errors import InputError
 from hilcal.identification.carried import carried_prior
 from hilcal.library import load_posterior

@@ -1,8 +1,6 @@
 """Readings of a stream: the fit of all of them in memory, to rounding."""
 
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -14,34 +12,33 @@ from hilcal.calibration.calibration import Calibration
 from hilcal.engine.engine import open_engine
 from hilcal.errors import InputError
 from hilcal.identification import gauss_newton_steps
-from hilcal.identification.fit import Fit, fit
+from hilcal.identification.fit import fit
 from hilcal.readings.readings import Readings
 from hilcal.regression import normal_equations
 from hilcal.regression.normal_equations import find_basis
 from hilcal.regression.triangle import Triangle, combined
-from hilcal.stream.fit import StreamFit, fit_stream
-from hilcal.tables.parquet_stream import ReadingStream, open_stream
-from hilcal.types import Floats
-from tests.support.cli_cases import Capsys, ok, refused
+from hilcal.stream.fit import fit_stream
+from hilcal.tables.parquet_stream import open_stream
+from tests.support.cli_cases import ok, refused
 from tests.support.stream_cases import CELL, EFFECTS, NOISE, cell, write
 
 COUNT, GROUP, GROSS = 2_400, 1_000, 4
 EFFECT = {name: {} for name in EFFECTS}
 
 
-def opened(path: Path) -> ReadingStream:
+def opened(path):
     return open_stream(path, cell().arm, None, None)
 
 
 @pytest.fixture(scope="module")
-def stream(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def stream(tmp_path_factory):
     path = tmp_path_factory.mktemp("stream") / "moving.parquet"
     write(path, COUNT, group=GROUP)
     return path
 
 
 @pytest.fixture(scope="module", autouse=True)
-def to_rounding() -> Iterator[None]:
+def to_rounding():
     """Let fits go on until rounding stops them: else a part of σ may be left."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(gauss_newton_steps, "CONVERGED", 1e-9)
@@ -49,13 +46,13 @@ def to_rounding() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def found(stream: Path) -> StreamFit:
+def found(stream):
     with open_engine(1) as engine:
         return fit_stream(opened(stream), cell(), engine, EFFECT)
 
 
 @pytest.fixture(scope="module")
-def in_memory(stream: Path, found: StreamFit) -> Fit:
+def in_memory(stream, found):
     whole = opened(stream)
     readings = Readings.joined([c for group in range(len(whole.rows)) for c in whole.chunks(group)])
     alone = np.arange(len(readings))
@@ -64,7 +61,7 @@ def in_memory(stream: Path, found: StreamFit) -> Fit:
     return fit(found.model, readings, "absolute", start=found.sample.theta)
 
 
-def test_parameters_are_those_of_the_fit_in_memory(found: StreamFit, in_memory: Fit) -> None:
+def test_parameters_are_those_of_the_fit_in_memory(found, in_memory):
     seen = found.identifiable
     assert not found.outliers
     assert np.array_equal(seen, in_memory.uncertainty.identifiable)
@@ -83,7 +80,7 @@ def test_parameters_are_those_of_the_fit_in_memory(found: StreamFit, in_memory: 
     )
 
 
-def test_errors_are_those_of_the_noise(found: StreamFit, in_memory: Fit) -> None:
+def test_errors_are_those_of_the_noise(found, in_memory):
     assert found.error.rms_m == pytest.approx(in_memory.error.rms_m)
     assert found.error.max_m == pytest.approx(in_memory.error.max_m)
     assert found.noise_floor == pytest.approx(NOISE * np.sqrt(3))
@@ -91,14 +88,14 @@ def test_errors_are_those_of_the_noise(found: StreamFit, in_memory: Fit) -> None
     assert abs(found.variance_factor - 1) < 4 * np.sqrt(2 / found.dof)
 
 
-def test_two_workers_give_the_same_bits(stream: Path, found: StreamFit) -> None:
+def test_two_workers_give_the_same_bits(stream, found):
     with open_engine(2) as engine:
         again = fit_stream(opened(stream), cell(), engine, EFFECT)
     assert np.array_equal(again.theta, found.theta)
     assert np.array_equal(again.covariance, found.covariance)
 
 
-def ill_conditioned() -> tuple[Floats, Floats]:
+def ill_conditioned():
     """A (R, 8) of condition 1e9 whose solution is known, and the right-hand side."""
     rng = np.random.default_rng(5)
     u = sl.qr(rng.normal(size=(20_000, 8)), mode="economic")[0]
@@ -107,7 +104,7 @@ def ill_conditioned() -> tuple[Floats, Floats]:
     return a, a @ np.ones(8)
 
 
-def test_nearly_dependent_columns_lose_no_digits() -> None:
+def test_nearly_dependent_columns_lose_no_digits():
     a, b = ill_conditioned()
     rows = np.column_stack([a, b])
     parts = []
@@ -118,7 +115,7 @@ def test_nearly_dependent_columns_lose_no_digits() -> None:
         parts.append(triangle.r)
     r = combined(parts, 9)
 
-    def off(solution: Floats) -> float:
+    def off(solution):
         return float(np.linalg.norm(solution - 1))
 
     by_triangle = off(sl.solve_triangular(r[:8, :8], r[:8, 8]))
@@ -129,7 +126,7 @@ def test_nearly_dependent_columns_lose_no_digits() -> None:
     assert off(by_products) > 1e4 * by_triangle
 
 
-def test_a_tall_problem_has_the_rank_of_its_qr(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tall_problem_has_the_rank_of_its_qr(monkeypatch):
     rng = np.random.default_rng(2)
     a = rng.normal(size=(12_000, 5)) @ np.diag([1, 1e3, 1e-3, 1, 1])
     a[:, 4] = a[:, 0] - a[:, 3]
@@ -143,7 +140,7 @@ def test_a_tall_problem_has_the_rank_of_its_qr(monkeypatch: pytest.MonkeyPatch) 
 
 
 @pytest.mark.long
-def test_identify_takes_a_stream_and_writes_a_calibration(capsys: Capsys, tmp_path: Path) -> None:
+def test_identify_takes_a_stream_and_writes_a_calibration(capsys, tmp_path):
     path, out = tmp_path / "gross.parquet", tmp_path / "cal.json"
     truth = write(path, COUNT, group=GROUP, gross=GROSS)
     told = ok(
@@ -166,29 +163,24 @@ def test_identify_takes_a_stream_and_writes_a_calibration(capsys: Capsys, tmp_pa
     assert f"Fitted to {COUNT} absolute readings" in told.err
 
 
-def nan_at(table: pa.Table) -> pa.Table:
+def nan_at(table):
     y = table.column("y_m").to_numpy(zero_copy_only=False).copy()
     y[41:42] = np.nan
     return table.set_column(table.column_names.index("y_m"), "y_m", pa.array(y))
 
 
-@pytest.mark.parametrize(
-    ("damage", "words"),
-    [
-        (nan_at, "row 42, column 'y_m': not a finite number"),
-        (lambda t: t.drop_columns(["q4_rad"]), "column 'q4_rad' is missing"),
-        (lambda t: t.rename_columns([*t.column_names[:-1], "speed"]), "unknown column 'speed'"),
-    ],
-)
-def test_what_cannot_be_read_is_said_in_one_line(
-    capsys: Capsys, tmp_path: Path, damage: Callable[[pa.Table], pa.Table], words: str
-) -> None:
+@pytest.mark.parametrize(("damage", "words"), [
+    (nan_at, "row 42, column 'y_m': not a finite number"),
+    (lambda t: t.drop_columns(["q4_rad"]), "column 'q4_rad' is missing"),
+    (lambda t: t.rename_columns([*t.column_names[:-1], "speed"]), "unknown column 'speed'"),
+])  # fmt: skip
+def test_what_cannot_be_read_is_said_in_one_line(capsys, tmp_path, damage, words):
     path = tmp_path / "s.parquet"
     write(path, 300, damage=damage)
     assert words in refused(capsys, 2, "identify", path, "--cell", CELL, "--workers", "1")
 
 
-def test_interrupted_and_damaged_files_are_refused(tmp_path: Path) -> None:
+def test_interrupted_and_damaged_files_are_refused(tmp_path):
     path = tmp_path / "s.parquet"
     write(path, 3000)
     whole = path.read_bytes()
@@ -202,7 +194,7 @@ def test_interrupted_and_damaged_files_are_refused(tmp_path: Path) -> None:
         list(opened(path).chunks(0))
 
 
-def test_options_of_a_stream_are_not_of_a_campaign(capsys: Capsys, stream: Path) -> None:
+def test_options_of_a_stream_are_not_of_a_campaign(capsys, stream):
     assert "--cell" in refused(capsys, 2, "identify", stream)
     told = refused(capsys, 2, "identify", stream, "--cell", CELL, "--scaling", "none")
     assert "scaling is gc" in told

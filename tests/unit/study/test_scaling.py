@@ -9,32 +9,30 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
-from hilcal.engine.engine import Engine, open_engine
+from hilcal.engine.engine import open_engine
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import Deviation, evaluate
 from hilcal.robot.se3 import rotation_vector
-from hilcal.study.scaling import CORRELATIONS, UNITS, ScalingStudy, experiments, scaling_study
-from hilcal.study.scaling_design import TARGET, WRENCHES, StudyDesign, bound, make_design
-from hilcal.study.scaling_table import CURVES, table
-from hilcal.types import Floats
+from hilcal.study.scaling import CORRELATIONS, CURVES, UNITS, experiments, scaling_study, table
+from hilcal.study.scaling_design import TARGET, WRENCHES, bound, make_design
 
 SEED = 7
 
 
 @pytest.fixture(scope="module")
-def study() -> ScalingStudy:
+def study():
     """The study as the command runs it."""
     return scaling_study(np.random.default_rng(SEED))
 
 
 @pytest.fixture(scope="module")
-def design() -> StudyDesign:
+def design():
     """What the study draws first."""
     return make_design(np.random.default_rng(SEED), load_arm("ur10e"), 30)
 
 
-def dense(design: StudyDesign, rho: float, shared: bool) -> tuple[Floats, Floats]:
+def dense(design, rho, shared):
     """Observation matrix (D, n) and covariance (D, D) of all deflections, written out."""
     poses, loads = design.observation.shape[:2]
     between = np.eye(loads) + np.ones((loads, loads)) if shared else 2 * np.eye(loads)
@@ -45,7 +43,7 @@ def dense(design: StudyDesign, rho: float, shared: bool) -> tuple[Floats, Floats
     return design.observation.reshape(poses * size, -1), v
 
 
-def linear_estimator(a: Floats, weight: Floats) -> tuple[Floats, Floats]:
+def linear_estimator(a, weight):
     """K with ĉ = K ΔX for a weight (D, D), and (Aᵀ W A)⁻¹."""
     normal = np.linalg.inv(a.T @ weight @ a)
     return np.asarray(normal @ a.T @ weight), np.asarray(normal)
@@ -54,20 +52,20 @@ def linear_estimator(a: Floats, weight: Floats) -> tuple[Floats, Floats]:
 # --- what issue and report claim -------------------------------------------------------------
 
 
-def test_gc_attains_the_cramer_rao_bound(study: ScalingStudy) -> None:
+def test_gc_attains_the_cramer_rao_bound(study):
     ratios = {c.error_over_bound for c in study.cells if c.scaling == "gc"}
     assert study.runs == 2000
     assert max(abs(r - 1) for r in ratios) < 0.03
 
 
-def test_gc_intervals_cover(study: ScalingStudy) -> None:
+def test_gc_intervals_cover(study):
     for c in study.cells:
         if c.scaling == "gc":
             assert 0.94 <= c.coverage <= 0.96
 
 
 @pytest.mark.parametrize("seed", [100, 101, 102])
-def test_neither_is_luck(seed: int) -> None:
+def test_neither_is_luck(seed):
     """Other poses, other noise."""
     other = scaling_study(np.random.default_rng(seed), correlations=(0.95,))
     for c in other.cells:
@@ -80,9 +78,7 @@ def test_neither_is_luck(seed: int) -> None:
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("rho", [0.0, 0.6, 0.99])
-def test_monte_carlo_agrees_with_the_exact_law(
-    study: ScalingStudy, design: StudyDesign, rho: float, shared: bool
-) -> None:
+def test_monte_carlo_agrees_with_the_exact_law(study, design, rho, shared):
     """Cov(ĉ) = K V Kᵀ for every scaling and unit; coverage of stated normal intervals."""
     a, v = dense(design, rho, shared)
     limit = np.asarray(np.linalg.inv(a.T @ np.linalg.solve(v, a)))
@@ -91,11 +87,9 @@ def test_monte_carlo_agrees_with_the_exact_law(
     for c in cells:
         _, length, angle = next(u for u in UNITS if u[0] == c.unit)
         unit = np.tile([length] * 3 + [angle] * 3, len(v) // 6)
-        weight = {
-            "none": np.diag(unit**2),
-            "gu": np.diag(1 / np.diag(v)),
-            "gc": np.linalg.inv(v),
-        }[c.scaling]
+        weight = {"none": np.diag(unit**2), "gu": np.diag(1 / np.diag(v)), "gc": np.linalg.inv(v)}[
+            c.scaling
+        ]
         k, stated = linear_estimator(a, weight)
         actual = np.diag(k @ v @ k.T)
         exact = np.sqrt(np.mean(actual / np.diag(limit)))
@@ -106,7 +100,7 @@ def test_monte_carlo_agrees_with_the_exact_law(
             assert abs(c.coverage - covered) < 4.5 * c.coverage_mc
 
 
-def test_none_depends_on_units_and_the_others_do_not(study: ScalingStudy) -> None:
+def test_none_depends_on_units_and_the_others_do_not(study):
     first = UNITS[0][0]
     for c in study.cells:
         if c.unit == first:
@@ -117,7 +111,7 @@ def test_none_depends_on_units_and_the_others_do_not(study: ScalingStudy) -> Non
             assert c.unit_shift < 1e-10
 
 
-def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study: ScalingStudy) -> None:
+def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study):
     for shared in (False, True):
         curve = study.of("gu", UNITS[0][0], shared)
         errors = [c.error_over_bound for c in curve]
@@ -128,7 +122,7 @@ def test_gu_loses_and_its_intervals_fail_where_correlation_is_high(study: Scalin
         assert curve[-1].variance_factor == pytest.approx(1, abs=0.02)
 
 
-def test_shared_unloaded_reading_is_used_by_gc_alone(study: ScalingStudy) -> None:
+def test_shared_unloaded_reading_is_used_by_gc_alone(study):
     """At ρ = 0 the pose group's block is all that sets gc apart from gu."""
     gu, gc = (study.of(s, UNITS[0][0], True)[0] for s in ("gu", "gc"))
     assert gu.error_over_bound > 1.1
@@ -138,7 +132,7 @@ def test_shared_unloaded_reading_is_used_by_gc_alone(study: ScalingStudy) -> Non
 # --- the experiment -------------------------------------------------------------------------
 
 
-def test_poses_are_feasible_and_the_arm_repeats_as_said(design: StudyDesign) -> None:
+def test_poses_are_feasible_and_the_arm_repeats_as_said(design):
     arm = design.arm
     assert np.all((design.q >= arm.q_min) & (design.q <= arm.q_max))
     chain = evaluate(arm, design.q)
@@ -151,7 +145,7 @@ def test_poses_are_feasible_and_the_arm_repeats_as_said(design: StudyDesign) -> 
         assert np.linalg.eigvalsh(v / (design.std[:, :, None] * design.std[:, None])).min() > 0.005
 
 
-def test_observation_matrix_is_the_motion_under_load(design: StudyDesign) -> None:
+def test_observation_matrix_is_the_motion_under_load(design):
     """Joints turned by c τ, with τ from virtual work, move the target by A c."""
     c = np.array([2, 3, 4, 10, 12, 15]) * 1e-9
     zero = evaluate(design.arm, design.q)
@@ -167,41 +161,37 @@ def test_observation_matrix_is_the_motion_under_load(design: StudyDesign) -> Non
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_bound_is_the_inverse_of_the_dense_information(design: StudyDesign, shared: bool) -> None:
+def test_bound_is_the_inverse_of_the_dense_information(design, shared):
     a, v = dense(design, 0.9, shared)
     expected = np.linalg.inv(a.T @ np.linalg.solve(v, a))
     found = bound(design, design.covariance(0.9), shared)
     np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-10 * expected.max())
 
 
-def test_arm_too_weak_is_said() -> None:
+def test_arm_too_weak_is_said():
     arm = replace(load_arm("ur3e"), torque_max=np.full(6, 1.0))
     with pytest.raises(CannotAnswerError, match=r"ur3e: only 0 feasible poses of 30"):
         scaling_study(np.random.default_rng(0), arm=arm)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"runs": 1}, "runs = 1"),
-        ({"poses": 1}, "poses = 1"),
-        ({"correlations": ()}, "none given"),
-        ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
-        ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
-        ({"correlations": (float("nan"),)}, "correlation nan: must be"),
-    ],
-)
-def test_wrong_options_are_named(options: dict[str, object], message: str) -> None:
+@pytest.mark.parametrize(("options", "message"), [
+    ({"runs": 1}, "runs = 1"),
+    ({"poses": 1}, "poses = 1"),
+    ({"correlations": ()}, "none given"),
+    ({"correlations": (0.5, 1.0)}, r"correlation 1: must be in \[0, 1\)"),
+    ({"correlations": (-0.1,)}, r"correlation -0.1: must be"),
+    ({"correlations": (float("nan"),)}, "correlation nan: must be")])  # fmt: skip
+def test_wrong_options_are_named(options, message):
     with pytest.raises(InputError, match=message) as caught:
         scaling_study(np.random.default_rng(0), **options)  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.long
-def test_the_same_bits_on_several_workers() -> None:
+def test_the_same_bits_on_several_workers():
     correlations, done = (0.5, 0.9), []
 
-    def on(engine: Engine) -> ScalingStudy:
+    def on(engine):
         rng = np.random.default_rng(3)
         found = scaling_study(rng, 50, correlations, engine=engine, advance=done.append)
         assert rng.random() == after
@@ -223,7 +213,7 @@ def test_the_same_bits_on_several_workers() -> None:
 # --- what people and scripts get ------------------------------------------------------------
 
 
-def test_json_holds_every_cell(study: ScalingStudy) -> None:
+def test_json_holds_every_cell(study):
     document = json.loads(json.dumps(study.to_json(), allow_nan=False))
     assert len(document["cells"]) == len(study.cells) == 3 * 3 * 2 * len(CORRELATIONS)
     for key in ("scaling", "correlation", "unit", "error_over_bound", "error_over_bound_mc"):
@@ -234,7 +224,7 @@ def test_json_holds_every_cell(study: ScalingStudy) -> None:
 
 
 @pytest.mark.parametrize("width", [80, 120])
-def test_table_shows_every_correlation_and_scaling(study: ScalingStudy, width: int) -> None:
+def test_table_shows_every_correlation_and_scaling(study, width):
     out = io.StringIO()
     Console(file=out, width=width).print(table(study))
     words = out.getvalue()

@@ -8,7 +8,7 @@ import pytest
 
 from hilcal.calibration.calibration import Calibration
 from hilcal.campaign.campaign import Campaign
-from hilcal.cli.fits import fitted_with
+from hilcal.cli.fitting import fitted_with
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.errors import CannotAnswerError, InputError

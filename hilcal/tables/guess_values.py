@@ -1,27 +1,30 @@
 """Positions, orientations, forces and uncertainties by names and axes; what else values tell."""
 
+import re
 from datetime import datetime
+from itertools import product
 from typing import Any
 
 import numpy as np
 
+from hilcal.tables import proposal as words
 from hilcal.tables.grid import Grid
-from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.proposal import (
+from hilcal.tables.mapped import nines
+from hilcal.tables.proposal import (
     FAR,
     SHOWN,
     SIDE_BY_SIDE,
     TURN,
+    ColumnName,
     Guesser,
     angle_unit,
     length_unit,
+    parse,
 )
-from hilcal.tables.mapped import nines
+from hilcal.tables.units import FORCES, LENGTHS, MOMENTS
 from hilcal.types import Floats
 
-NORM = 3e-3
-"""How far the length of a quaternion may be from 1: three digits."""
+NORM = 3e-3  # How far the length of a quaternion may be from 1: three digits
 FORMATS = (
     "%d.%m.%Y %H:%M:%S",
     "%d.%m.%Y %H:%M:%S.%f",
@@ -35,8 +38,7 @@ FORMATS = (
     "%H:%M:%S.%f",
 )
 """Forms of dates that are tried, in this order."""
-RIVAL = 0.5
-"""Difference of the score within which another choice of columns is as good; a choice."""
+RIVAL = 0.5  # Difference of the score within which another choice of columns is as good; a choice
 BY_VALUES = "found by their values: check the columns"
 RIVALS = "as good by their values:"
 _EXCEL = (30000.0, 60000.0)
@@ -75,26 +77,20 @@ def time_unit(
         if np.nanmin(values) > 1e11:
             return {"unit": "ms"}, "ms since 1970, by their size"
         return {"unit": "s"}, "no unit stated; read as s"
-    texts = [str(c).strip() for c in cells]
-    if _all_parse(texts, None):
+    import pandas as pd
+
+    def fits(form: str) -> bool:
+        texts = pd.Series([str(c).strip() for c in cells])
+        texts = texts.str.replace(",", ".") if form == "ISO8601" else texts
+        return bool(pd.to_datetime(texts, format=form, errors="coerce", utc=True).notna().all())
+
+    if fits("ISO8601"):
         return {"unit": "iso"}, None
-    fitting = [form for form in FORMATS if _all_parse(texts, form)]
+    fitting = list(filter(fits, FORMATS))
     if not fitting:
         return None
     doubt = f"month first, or {fitting[1]}?" if len(fitting) > 1 else None
     return {"unit": "format", "format": fitting[0]}, doubt
-
-
-def _all_parse(texts: list[str], form: str | None) -> bool:
-    try:
-        for text in texts:
-            if form is None:
-                datetime.fromisoformat(text.replace(",", "."))
-            else:
-                datetime.strptime(text, form)
-    except ValueError:
-        return False
-    return True
 
 
 def guess_by_values(g: Guesser) -> None:
@@ -104,65 +100,55 @@ def guess_by_values(g: Guesser) -> None:
     angles stay within one turn. Where several choices are as good, that is said.
     """
     told = words.NOMINAL | words.STD | words.TIME | words.TEMPERATURE | words.LOAD | words.MASS
-    free = [
-        name
-        for name, c in g.free.items()
-        if g.number(name) and c.axis is None and not c.has(told) and not c.has(words.POSE)
-        if not _counts(g.block([name])[:, 0])
-    ]
-    free = [name for name in free if np.ptp(g.block([name])[np.isfinite(g.block([name]))]) > 0]
+    free = []
+    for name, c in g.free.items():
+        if g.number(name) and c.axis is None and not c.has(told | words.POSE):
+            values = g.block([name])[:, 0]
+            counts = len(values) > 2 and np.all(np.diff(values) == 1)  # the rows
+            if not counts and np.ptp(values[np.isfinite(values)]) > 0:
+                free.append(name)
     _orientation_by_values(g, free)
     free = [name for name in free if name in g.free]
-    index = {name: k for k, name in enumerate(g.grid.names)}
-    count = g.joints or 6
 
     def runs(width: int) -> list[list[str]]:
+        index = {name: k for k, name in enumerate(g.grid.names)}
         parts = [free[k : k + width] for k in range(len(free) - width + 1)]
         return [p for p in parts if index[p[-1]] - index[p[0]] == width - 1]
+
+    def size(names: list[str]) -> float:
+        return float(np.nanmax(np.abs(g.block(names))))
 
     has_joints = "joints" in g.proposal.sections
     has_position = bool({"position", "distance", "gauge"} & set(g.proposal.sections))
     ranked: list[tuple[float, list[str], list[str]]] = []
-    for joints in [[]] if has_joints else runs(count):
-        for position in [[]] if has_position else runs(3):
-            if set(joints) & set(position):
-                continue
-            score = 0.0
-            if joints:
-                size = float(np.nanmax(np.abs(g.block(joints))))
-                if size > 400:
-                    continue
-                score += 2.0 if size <= TURN else 1.0
-            if position:
-                block = g.block(position)
-                size = float(np.nanmax(np.abs(block)))
-                score += 2.0 if size > 400 else (1.0 if size < FAR else 0.5)
-            rest = [n for n in free if n not in joints and n not in position]
-            score += 0.1 * (len(rest) % 3 == 0)
-            ranked.append((score, position, joints))
+    every = product([[]] if has_joints else runs(g.joints or 6), [[]] if has_position else runs(3))
+    for joints, position in every:
+        if set(joints) & set(position) or (joints and size(joints) > 400):
+            continue
+        score = 0.1 * ((len(free) - len(joints) - len(position)) % 3 == 0)
+        if joints:
+            score += 2.0 if size(joints) <= TURN else 1.0
+        if position:
+            far = size(position)
+            score += 2.0 if far > 400 else (1.0 if far < FAR else 0.5)
+        ranked.append((score, position, joints))
     if not ranked:
         return
     ranked.sort(key=lambda r: -r[0])
     best, position, joints = ranked[0]
-    rivals = [r for r in ranked[1:] if r[0] >= best - RIVAL]
-    g.proposal.alternatives = [(p, j) for score, p, j in ranked if score >= best - RIVAL]
-    if position:
-        unit = length_unit(g, "position", position)
-        g.take("position", position, unit, unit=unit)
-        g.unsure("position", BY_VALUES)
-    if joints:
-        unit = angle_unit(g, "joints", joints)
-        g.take("joints", joints, unit, unit=unit)
-        g.unsure("joints", BY_VALUES)
-    if rivals:
-        other = rivals[0]
-        pair = [", ".join(part) for part in other[1:] if part]
+    near = [(p, j) for score, p, j in ranked if score >= best - RIVAL]
+    g.proposal.alternatives = near
+    for what, names, unit_of in (
+        ("position", position, length_unit),
+        ("joints", joints, angle_unit),
+    ):
+        if names:
+            unit = unit_of(g, what, names)
+            g.take(what, names, unit, unit=unit)
+            g.unsure(what, BY_VALUES)
+    if len(near) > 1:
+        pair = [", ".join(part) for part in near[1] if part]
         g.unsure("joints", f"{RIVALS} {' and '.join(pair)}")
-
-
-def _counts(values: Floats) -> bool:
-    """Whether numbers count the rows."""
-    return len(values) > 2 and bool(np.all(np.diff(values) == 1))
 
 
 def _orientation_by_values(g: Guesser, free: list[str]) -> None:
@@ -204,8 +190,7 @@ Group = dict[str, dict[tuple[object, ...], dict[str, str]]]
 _KINDS = words.STD | words.ROTATION | words.QUATERNION | words.FORCE | words.MOMENT
 
 
-LARGE = 1e-6
-"""m²; a larger variance, of more than 1 mm, is in mm²."""
+LARGE = 1e-6  # m²; a larger variance, of more than 1 mm, is in mm²
 
 
 def guess_axes(g: Guesser) -> None:
@@ -301,13 +286,9 @@ def _orientation(g: Guesser, whole: Group, stem: tuple[object, ...]) -> None:
     if stem in angles:
         _by_axes(g, [angles[stem][axis] for axis in "xyz"])
         return
-    for letters, convention in (
-        ("wpr", "fanuc"),
-        ("abc", "kuka"),
-        ("oat", "kawasaki"),
-    ):
-        by_letter = {c.name.strip().lower(): c.name for c in g.columns if c.name in g.free}
-        plain = {key.split("[")[0].split("(")[0].strip(): name for key, name in by_letter.items()}
+    free = [c.name for c in g.columns if c.name in g.free]
+    plain = {re.split(r"[\[(]", name.strip().lower())[0].strip(): name for name in free}
+    for letters, convention in (("wpr", "fanuc"), ("abc", "kuka"), ("oat", "kawasaki")):
         if all(letter in plain and g.number(plain[letter]) for letter in letters):
             names = [plain[letter] for letter in letters]
             _angles(g, names, convention)
@@ -378,17 +359,16 @@ def _matrix(g: Guesser) -> bool:
 
 
 def _forces(g: Guesser, whole: Group) -> None:
-    force = next(iter(whole.get("force", {}).values()), None)
+    force, moment = (next(iter(whole.get(k, {}).values()), None) for k in ("force", "moment"))
     if force is None:
         return
     names = [force[axis] for axis in "xyz"]
     unit = g.unit(names)
-    section: dict[str, object] = {"unit": unit if unit in ("N", "kN", "kgf", "lbf") else "N"}
-    moment = next(iter(whole.get("moment", {}).values()), None)
+    section: dict[str, object] = {"unit": unit if unit in FORCES else "N"}
     if moment is not None:
         turning = [moment[axis] for axis in "xyz"]
         stated = g.unit(turning)
-        section["moment_unit"] = stated if stated in ("Nm", "Nmm", "kNm") else "Nm"
+        section["moment_unit"] = stated if stated in MOMENTS else "Nm"
         names += turning
     g.unsure("wrench", 'base axes, and of = "load" (exerted on the tool), or "reaction"?')
     g.take("wrench", names, ", ".join(map(str, section.values())), **section)
@@ -396,20 +376,15 @@ def _forces(g: Guesser, whole: Group) -> None:
 
 def _std(g: Guesser, whole: Group, stem: tuple[object, ...], position_unit: str) -> None:
     axes = _like(whole.get("std", {}), stem)
+    other = words.DISTANCE | words.GAUGE
     one = [c for c in g.columns if c.name in g.free and c.has(words.STD) and not c.axis]
-    single = [
-        c.name
-        for c in one
-        if g.number(c.name) and not c.numbers and not c.has(words.DISTANCE | words.GAUGE)
-    ]
+    single = [c.name for c in one if g.number(c.name) and not c.numbers and not c.has(other)]
     if axes is None and not single:
         return
     names = [axes[axis] for axis in "xyz"] if axes is not None else single[:1]
     first = parse(names[0])
     stated = g.unit(names)
-    section: dict[str, object] = {
-        "unit": stated if stated in ("m", "mm", "um", "in") else position_unit
-    }
+    section: dict[str, object] = {"unit": stated if stated in LENGTHS else position_unit}
     turned = _like(whole.get("std_angle", {}), stem)
     orientation = g.proposal.sections.get("orientation")
     if axes is not None and turned is not None and orientation is not None:

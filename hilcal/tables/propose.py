@@ -11,29 +11,25 @@ import numpy as np
 from hilcal import limits
 from hilcal.errors import InputError
 from hilcal.readings.readings import SAME_POSE
+from hilcal.tables import proposal as words
 from hilcal.tables.columns import required_columns
 from hilcal.tables.grid import Grid, joined
-from hilcal.tables.guessing import column_names as words
-from hilcal.tables.guessing.column_names import ColumnName, parse
-from hilcal.tables.guessing.guess_values import (
-    guess_axes,
-    guess_by_values,
-    is_quaternion,
-    time_unit,
-)
-from hilcal.tables.guessing.proposal import (
+from hilcal.tables.guess_values import guess_axes, guess_by_values, is_quaternion, time_unit
+from hilcal.tables.mapping import UNLOADED
+from hilcal.tables.proposal import (
     FEWEST_JOINTS,
     GUESSED,
     MOST_JOINTS,
     REPORTED,
     SHOWN,
+    ColumnName,
     Guesser,
     Proposal,
     angle_unit,
     length_unit,
+    parse,
 )
-from hilcal.tables.guessing.sniff import sniff
-from hilcal.tables.mapping import UNLOADED
+from hilcal.tables.sniff import sniff
 from hilcal.tables.units import ANGLES, LENGTHS, MOMENTS
 
 
@@ -115,11 +111,7 @@ def _is_key(keys: list[str]) -> bool:
 
 
 def guess(grid: Grid, joints: int | None = None) -> Proposal:
-    """Propose a mapping for a table.
-
-    Args:
-        joints: number of the arm's joints, where it is known.
-    """
+    """Propose a mapping for a table."""
     g = Guesser(grid, joints)
     _joints(g)
     guess_axes(g)
@@ -137,10 +129,7 @@ def guess(grid: Grid, joints: int | None = None) -> Proposal:
         g.unsure("orientation", GUESSED)
     for what, sentence in (
         ("position", "no position: three columns x, y, z were not found"),
-        (
-            "joints",
-            "no joint angles: where they are in a file of their own, give it with --second",
-        ),
+        ("joints", "no joint angles: where they are in a file of their own, give it with --second"),
     ):
         if what not in g.proposal.sections and not (what == "position" and read):
             g.proposal.lacking.append(sentence)

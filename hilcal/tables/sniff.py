@@ -15,8 +15,10 @@ from hilcal.tables.files import (
     BYTE_ORDER_MARKS,
     content_of,
     decoded,
+    filled,
     grid_of_rows,
     kind_of,
+    length_of,
     open_grid,
     records,
     sheet_names,
@@ -25,8 +27,7 @@ from hilcal.tables.files import (
 from hilcal.tables.grid import Cell, Grid, number
 from hilcal.tables.mapping import FileFormat
 
-HEAD = 400
-"""Lines that the dialect is guessed from."""
+HEAD = 400  # Lines that the dialect is guessed from
 COMMENTS = ("//", "#", "%", "!")
 _UNIT = re.compile(
     r"[\[(<]?\s*(|-|1|m|mm|[uµμ]m|in(ch)?|\"|deg|degrees?|°|rad|mrad|n|kn|nm|n[*·]m|kg|g|s|sec|ms|"
@@ -39,16 +40,11 @@ Rows = Sequence[tuple[int, Sequence[Cell]]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sniffed:
-    """A file, opened as it seems to be written.
+    """A file, opened as it seems to be written."""
 
-    Attributes:
-        how: keys of [file] that differ from a plain CSV file.
-        doubts: sentences on what is unsure.
-    """
-
-    how: dict[str, Any]
+    how: dict[str, Any]  # keys of [file] that differ from a plain CSV file
     grid: Grid
-    doubts: tuple[str, ...]
+    doubts: tuple[str, ...]  # sentences on what is unsure
 
 
 def sniff(path: str | Path) -> Sniffed:
@@ -66,8 +62,11 @@ def sniff(path: str | Path) -> Sniffed:
         return Sniffed({}, open_grid(path, FileFormat()), ())
     how: dict[str, Any] = {}
     text = decoded(name, content, None)
-    if not content.startswith(tuple(BYTE_ORDER_MARKS)) and not _is_utf8(content):
-        how["encoding"] = "latin-1"
+    if not content.startswith(tuple(BYTE_ORDER_MARKS)):
+        try:
+            content.decode("utf-8")
+        except UnicodeDecodeError:
+            how["encoding"] = "latin-1"
     lines = [line for line in text.splitlines() if line.strip()][:HEAD]
     for mark in COMMENTS:
         count = sum(line.lstrip().startswith(mark) for line in lines)
@@ -88,53 +87,34 @@ def sniff(path: str | Path) -> Sniffed:
     return Sniffed(how, open_grid(path, FileFormat(**how)), doubts)
 
 
-def _is_utf8(content: bytes) -> bool:
-    try:
-        content.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
-
-
 def _dialect(path: str, lines: list[str], comment: str | None) -> dict[str, Any]:
     """Separator, decimal mark and thousands mark that make most cells numbers."""
-    best: tuple[float, dict[str, Any]] = (0.0, {})
+    best, score = dict[str, Any](), 0.0
     body = "\n".join(lines)
     choices = product((None, "'", ".", ",", " "), ("tab", ";", "|", ",", "blanks"), (".", ","))
     for thousands, separator, decimal in choices:
-        if decimal == separator or thousands in (decimal, separator):
-            continue
-        if separator == "blanks" and thousands == " ":
+        blank = separator == "blanks" and thousands == " "
+        if decimal == separator or thousands in (decimal, separator) or blank:
             continue
         given = {"separator": separator}
         given |= {"decimal": decimal} if decimal != "." else {}
         given |= {"thousands": thousands} if thousands else {}
         form = FileFormat(**{**given, "comment": comment, "header_row": 0})
         try:
-            found = [cells for _, cells in records(path, body, form)]
+            rows = [cells for _, cells in records(path, body, form)]
         except InputError:
             continue
-        score = _numbers_per_row(found, form)
-        if score > best[0] + 1e-9:
-            best = score, given
-    if not best[1]:
+        length, _ = Counter(map(len, rows)).most_common(1)[0] if rows else (0, 0)
+        usual = [cells for cells in rows if len(cells) == length >= 3]
+        mean = sum(_is_number(c, form) for cells in usual for c in cells) / max(len(rows), 1)
+        if mean > score + 1e-9:
+            best, score = given, mean
+    if not best:
         raise InputError(
             f"{path}: no columns of numbers; expected a table, one row per reading, or XLSX, MAT "
             f"or Parquet"
         )
-    return best[1]
-
-
-def _numbers_per_row(rows: Sequence[Sequence[Cell]], how: FileFormat) -> float:
-    """Mean count of numbers in the rows of the usual length; 0 where there is one column."""
-    if not rows:
-        return 0.0
-    length, _ = Counter(map(len, rows)).most_common(1)[0]
-    if length < 3:
-        return 0.0
-    usual = [cells for cells in rows if len(cells) == length]
-    count = sum(sum(_is_number(c, how) for c in cells) for cells in usual)
-    return count / len(rows)
+    return best
 
 
 def _is_number(cell: Cell, how: FileFormat) -> bool:
@@ -146,70 +126,54 @@ def _layout(rows: Rows, how: FileFormat) -> tuple[dict[str, Any], tuple[str, ...
     length, _ = Counter(len(cells) for _, cells in rows).most_common(1)[0]
     share = []
     for _, cells in rows:
-        filled = [c for c in cells if c is not None and c != ""]
-        share.append(sum(_is_number(c, how) for c in filled) / max(len(filled), 1))
+        some = list(filter(filled, cells))
+        share.append(sum(_is_number(c, how) for c in some) / max(len(some), 1))
     usual = float(np.median([s for s, (_, c) in zip(share, rows, strict=True) if len(c) == length]))
-    first = next(
-        (k for k, (_, c) in enumerate(rows) if share[k] >= 0.5 * usual and len(c) >= length - 1), 0
-    )
-    titled = [k for k in range(first) if len(rows[k][1]) >= length - 1 and _filled(rows[k][1]) > 1]
-    above = [k for k in titled if _trim(rows[k][1]) <= length]
+    whole = [len(cells) >= length - 1 for _, cells in rows]
+    first = next((k for k in range(len(rows)) if share[k] >= 0.5 * usual and whole[k]), 0)
+    titled = [k for k in range(first) if whole[k] and sum(map(filled, rows[k][1])) > 1]
+    above = [k for k in titled if length_of(rows[k][1]) <= length]
     out: dict[str, Any] = {"header_row": 0}
     doubts: list[str] = []
     if titled and not above:
         row, cells = rows[titled[-1]]
-        doubts.append(
-            f"row {row} names {_trim(cells)} columns, the readings have {length}: the columns are "
-            f"numbered"
-        )
+        named = f"row {row} names {length_of(cells)} columns, the readings have {length}"
+        doubts.append(f"{named}: the columns are numbered")
     header: Sequence[Cell] = ()
     if above:
         at = above[-1]
         if len(above) > 1 and all(_UNIT.fullmatch(str(c or "")) for c in rows[at][1]):
             out["units_row"] = rows[at][0]
             at = above[-2]
-        out["header_row"], header = rows[at][0], rows[at][1]
+        out["header_row"], header = rows[at]
     width = len(header) or length
-    trimmed = _trim(header) if header else width
+    trimmed = length_of(header) if header else width
     odd = []
     for k, (row, cells) in enumerate(rows):
         before = k < first and row > out["header_row"] and row != out.get("units_row")
         short = bool(header) and len(cells) < trimmed
-        if before or (k >= first and (short or _trim(cells) > width or cells == header)):
+        if before or (k >= first and (short or length_of(cells) > width or cells == header)):
             odd.append(row)
     if odd and len(odd) <= 0.1 * len(rows) + 10:
         out["skip_rows"] = odd
         late = [row for row in odd if row > rows[first][0]]
         if late:
-            doubts.append(
-                f"rows {', '.join(map(str, late[:5]))}{', ...' if len(late) > 5 else ''} are left "
-                f"out: they are not of the table's length"
-            )
+            listed = ", ".join(map(str, late[:5])) + ", ..." * (len(late) > 5)
+            doubts.append(f"rows {listed} are left out: they are not of the table's length")
     return out, tuple(doubts)
-
-
-def _filled(cells: Sequence[Cell]) -> int:
-    return sum(c is not None and c != "" for c in cells)
-
-
-def _trim(cells: Sequence[Cell]) -> int:
-    """Cells up to the last one that is not empty."""
-    return max((k for k, c in enumerate(cells, start=1) if c is not None and c != ""), default=0)
 
 
 def _commented_header(text: str, how: dict[str, Any], rows: Rows) -> dict[str, Any]:
     """Header in the last comment line above the readings, as numpy.savetxt writes it."""
-    lines = text.splitlines()
-    for row in range(min(rows[0][0] - 1, len(lines)), 0, -1):
-        if not lines[row - 1].lstrip().startswith(how["comment"]):
-            continue
-        plain = FileFormat(**{**how, "comment": None, "header_row": 0})
-        line = lines[row - 1].lstrip()[len(how["comment"]) :]
-        cells = [c for _, c in records("", line, plain)]
-        if cells and len(cells[0]) == len(rows[0][1]):
-            return {"header_row": row}
-        break
-    return {}
+    lines = [line.lstrip() for line in text.splitlines()[: rows[0][0] - 1]]
+    marked = [row for row, line in enumerate(lines, start=1) if line.startswith(how["comment"])]
+    if not marked:
+        return {}
+    plain = FileFormat(**{**how, "comment": None, "header_row": 0})
+    line = lines[marked[-1] - 1][len(how["comment"]) :]
+    cells = [c for _, c in records("", line, plain)]
+    same = bool(cells) and len(cells[0]) == len(rows[0][1])
+    return {"header_row": marked[-1]} if same else {}
 
 
 def _spreadsheet(path: str, content: bytes) -> Sniffed:

@@ -1,0 +1,412 @@
+"""`init`: a CELL.toml to begin with; `doctor`: what an operator needs to know of this computer."""
+
+import re
+import sys
+from copy import deepcopy
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import hilcal
+from hilcal.cell import cell_from_config
+from hilcal.cli.options import check_folder, check_new, command
+from hilcal.cli.terminal import Terminal, agreed, somebody_there, terminal
+from hilcal.config import CellConfig, load_config
+from hilcal.config.reference import cell_text
+from hilcal.config.sections import GEOMETRY, LOADED
+from hilcal.design.nominal_model import check_effects
+from hilcal.doctor.computer import Finding, computer, program
+from hilcal.doctor.ports import adapters, reachable, serial_ports
+from hilcal.drivers.ur_link.services import services
+from hilcal.effects.catalogue import installed
+from hilcal.errors import DeviceError, HilcalError, InputError, StoppedError
+from hilcal.measuring import devices
+from hilcal.measuring.connect import driver
+from hilcal.names import quoted
+from hilcal.present.document import heading
+from hilcal.present.preparing import doctor_report, doctor_summary
+from hilcal.present.progress import working
+from hilcal.robot.catalogue import OTHER_ARMS, load_arm, robot_names
+from hilcal.tables.units import METRIC
+from hilcal.toml import check_section
+from hilcal.whole_file import replace_file
+
+SIMULATED = "simulated"  # Port of a device that exists in a rehearsal only
+CLOCK = 20.0  # How much faster than real time a rehearsal goes, as in the demo's cell
+UNITS: dict[str, dict[str, float]] = {
+    "m": {**METRIC, "cm": 1e-2},
+    "m/m": {"m/m": 1.0, "mm/m": 1e-3, "um/m": 1e-6, "µm/m": 1e-6, "μm/m": 1e-6},
+    "kg": {"kg": 1.0, "g": 1e-3},
+    "N": {"N": 1.0, "kN": 1e3},
+}
+"""Units that a quantity may be given in; it is in the first of them, SI, where none is given."""
+_QUANTITY = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d]+(?:/m)?)?")
+_LOAD = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<values>[^=]*?\d[^=]*?(?P<unit>kg|g|N|kN))\s*")
+LOADS = 'e.g. "5 kg", or a pull in base axes: "pull x = 80, 0, 0 N"'
+
+
+@dataclass(slots=True)
+class Draft:
+    """A cell in the making; every answer is checked as it comes."""
+
+    base_dir: Path  # to which paths in it refer
+    data: dict[str, Any] = field(default_factory=dict)  # the sections so far, as TOML has them
+
+    def set(self, section: str, **values: object) -> None:
+        """Set keys of a section; nothing is set where a value is not valid."""
+        data = deepcopy(self.data)
+        data.setdefault(section, {}).update(values)
+        self._take(data)
+
+    def _take(self, data: dict[str, Any]) -> None:
+        check_section(data, CellConfig, "the answer")
+        self.data = data
+
+    def answer(self, asked: str, words: str) -> None:
+        """Put the answer to a question, by the parameter of its option, into the cell."""
+        match asked:
+            case "robot":
+                load_arm(words, self.base_dir)
+                self.set("robot", model=words)
+            case "host":
+                if not re.fullmatch(r"[\w.:-]+", words):
+                    raise InputError(f'{words!r} is no address; valid: e.g. "192.168.56.101"')
+                names = drivers(devices.ARMS)
+                self.set("robot", driver="ur" if "ur" in names else names[0], host=words)
+            case "repeatability":
+                self.set("robot", repeatability_m=number(words, "m"))
+            case "tracker":
+                driver(devices.TRACKERS, words, "[tracker] driver")
+                self.set("tracker", driver=words)
+            case "force_sensor":
+                driver(devices.FORCE_SENSORS, words, "[force_sensor] driver")
+                self.set("force_sensor", driver=words, port=SIMULATED)
+            case "tracker_port" | "force_port":  # a serial port, which is a path, or an address
+                section = {"tracker_port": "tracker", "force_port": "force_sensor"}[asked]
+                self.data[section].pop("port", None)
+                self.set(section, **{"port" if "/" in words else "host": words})
+            case "tracker_accuracy":
+                fixed, _, growing = words.partition("+")
+                std, per_m = number(fixed, "m"), number(growing, "m/m") if growing else 0.0
+                keys = ("range_std", "transverse_std")
+                values = {f"{k}_m": std for k in keys} | {f"{k}_per_m": per_m for k in keys}
+                self.set("tracker", **values)
+            case "target" | "load_point" | "tool_com":
+                key = {"target": "target_m", "load_point": "load_point_m", "tool_com": "com_m"}
+                self.set("tool", **{key[asked]: vector(words, "m")})
+            case "tool_mass":
+                self.set("tool", mass_kg=number(words, "kg"))
+            case "load":
+                self._add_load(words)
+            case "readings":
+                if words == "deflection" and not self.data.get("loads"):
+                    raise InputError('"deflection" needs a load; valid without one: absolute')
+                self.set("planning", readings=words)
+            case "floor":
+                reach = load_arm(self.data["robot"]["model"], self.base_dir).reach
+                side = round(2.0 * reach, 1)
+                self.set("limits", workspace_min_m=[-side, -side, number(words, "m")])
+            case "tracker_place":
+                self.set("sight", tracker_m=vector(words, "m"))
+
+    def _add_load(self, words: str) -> None:
+        match = _LOAD.fullmatch(words)
+        if match is None:
+            raise InputError(f"{words!r} is no load; valid: {LOADS}")
+        one: dict[str, object] = {"name": (match["name"] or words.replace(" ", "")).strip()}
+        if match["unit"] in UNITS["kg"]:
+            one["mass_kg"] = number(match["values"], "kg")
+        else:
+            one["force_N"] = vector(match["values"], "N")
+        self._take({**self.data, "loads": [*self.data.get("loads", ()), one]})
+
+
+def number(words: str, unit: str) -> float:
+    """Read a number, in `unit` or in the one that is behind it.
+
+    Raises:
+        InputError: it is none.
+    """
+    found = _quantities(words, unit)
+    if len(found) != 1:
+        raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}")
+    return found[0]
+
+
+def vector(words: str, unit: str) -> list[float]:
+    """Read three numbers, in `unit`, or each or all with the one behind it or them."""
+    found = _quantities(words, unit)
+    if len(found) != 3:
+        many = f"{len(found)} number{'s' * (len(found) != 1)}"
+        raise InputError(f"{words.strip()!r} is {many}; valid: three in {unit}")
+    return found
+
+
+def _quantities(words: str, unit: str) -> list[float]:
+    """Read numbers with their units; empty where anything else is among them."""
+    known, found = UNITS[unit], _QUANTITY.findall(words)
+    if _QUANTITY.sub("", words).strip("[](),; \t").replace(",", "").replace(";", "").strip():
+        return []
+    given = [u for _, u in found if u]
+    for u in given:
+        if u not in known:
+            raise InputError(f"{words.strip()!r} has the unit {u}; valid: {', '.join(known)}")
+    if len(given) == 1 and found[-1][1]:
+        given *= len(found)
+    if given and len(given) != len(found):
+        raise InputError(f"{words.strip()!r} has units behind some numbers only; valid: all or one")
+    factors = [known[u] for u in given] or [1.0] * len(found)
+    return [round(float(x) * f, 12) for (x, _), f in zip(found, factors, strict=True)]
+
+
+def drivers(group: str) -> list[str]:
+    """Names of the drivers that are installed for one kind of device."""
+    return sorted({point.name for point in entry_points(group=group)})
+
+
+def ports() -> list[str]:
+    """Serial ports of this computer, by names that stay the same where there are such."""
+    from serial.tools import list_ports  # takes a while
+
+    there = [p.device for p in list_ports.comports()]
+    folder = Path("/dev/serial/by-id")
+    steady = sorted(folder.iterdir()) if folder.is_dir() else []
+    named = {str(p.resolve()): str(p) for p in steady}
+    return [named.get(device, device) for device in there]
+
+
+@dataclass(frozen=True, slots=True)
+class CellQuestion:
+    """One thing that is asked for."""
+
+    asked: str  # parameter of the option that gives it without a question
+    words: str
+    without: str = ""  # what an empty answer means; empty where there has to be one
+
+    @property
+    def option(self) -> str:
+        """The option that gives it without a question."""
+        return "--" + self.asked.replace("_", "-")
+
+    @property
+    def needs(self) -> str:
+        """The section that must be there for it to be asked."""
+        needed = {"tracker_port": "tracker", "force_port": "force_sensor", "tool_com": "tool"}
+        return needed.get(self.asked, "")
+
+
+def questions() -> list[CellQuestion]:
+    """Return all that is asked for, in order."""
+    trackers, sensors = drivers(devices.TRACKERS), drivers(devices.FORCE_SENSORS)
+    written = f"""
+robot | Which arm? One of {", ".join(robot_names())}, or {OTHER_ARMS} |
+host | Address of its controller | not connected yet
+repeatability | What pose repeatability does its maker state (ISO 9283)? E.g. 0.05 mm |
+    that of the arm's file, if any
+tracker | Which tracker? {" or ".join(trackers)} | not connected yet
+tracker_port | Its serial port, or its address in the network | not connected yet
+tracker_accuracy | How accurate is the tracker? Standard deviation of a point, half of its maximum
+    permissible error, e.g. 8 um + 3 um/m | as a Leica AT500
+force_sensor | Which force sensor between flange and tool? {" or ".join(sensors)} | none
+force_port | Its serial port, or its address in the network | the simulated one, for a rehearsal
+target | Where does the target sit? x, y, z in m, flange axes | not known: it is estimated
+load_point | Where do loads act? x, y, z in m, flange axes | the flange's centre
+tool_mass | Mass of the tool in kg | 0
+tool_com | Its centre of mass, x, y, z in m, flange axes | the flange's centre
+load | Which loads are at hand? One at a time, {LOADS} | no more
+readings | What is to be calibrated? absolute: where the tool is, geometry and loads; deflection:
+    what loads do, and no geometry | absolute
+floor | What height must arm and load stay above? In m, base axes | no limit
+tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
+    not known: sight is not checked
+"""
+    lines = written.replace("\n    ", " ").strip().splitlines()
+    return [CellQuestion(*(part.strip() for part in line.split(" |"))) for line in lines]
+
+
+@command(
+    f"""
+    cell | CELL.toml | The file to write.
+    robot | --robot | The arm, e.g. ur10e, or a .urdf.
+    host | --host | Address of its controller.
+    repeatability | --repeatability LENGTH | As the maker states it (ISO 9283), e.g. "0.05 mm".
+    tracker | --tracker | The tracker's driver.
+    tracker_port | --tracker-port | Its serial port, or its address in the network.
+    tracker_accuracy | --tracker-accuracy LENGTH | Standard deviation of a point, e.g. "8 um + 3
+        um/m".
+    force_sensor | --force-sensor | The force sensor's driver.
+    force_port | --force-port | Its serial port, or its address in the network.
+    target | --target X,Y,Z | The target in flange axes, m.
+    load_point | --load-point X,Y,Z | Where loads act, flange axes, m.
+    tool_mass | --tool-mass KG | Of the tool.
+    tool_com | --tool-com X,Y,Z | The tool's centre of mass, m.
+    load | --load LOAD | A load, {LOADS}; repeatable.
+    readings | --readings KIND | absolute (unless given) or deflection: what is fitted.
+    floor | --floor Z | Height that the arm stays above, m.
+    tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
+    """
+)
+def init(
+    cell: Path = Path("CELL.toml"),
+    robot: str | None = None,
+    host: str | None = None,
+    repeatability: str | None = None,
+    tracker: str | None = None,
+    tracker_port: str | None = None,
+    tracker_accuracy: str | None = None,
+    force_sensor: str | None = None,
+    force_port: str | None = None,
+    target: str | None = None,
+    load_point: str | None = None,
+    tool_mass: str | None = None,
+    tool_com: str | None = None,
+    load: list[str] | None = None,
+    readings: str | None = None,
+    floor: str | None = None,
+    tracker_place: str | None = None,
+    force: bool = False,
+    as_json: bool = False,
+) -> None:
+    """Write a commented CELL.toml: asks at a terminal, else takes the options."""
+    t = terminal(as_json)
+    options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}
+    there = somebody_there(t) and not as_json
+    check_folder(cell, str(cell))
+    check_new(cell, force or (there and cell.exists() and agreed(t, f"{cell} exists. Replace it?")))
+    draft = Draft(cell.absolute().parent)
+    if there:
+        t.notice(f"Enter alone leaves a thing open; Ctrl-C ends, and {cell} is not written.\n")
+    for question in questions():
+        given = options[question.option]
+        if given is not None:
+            for words in given if isinstance(given, list) else [given]:
+                _from_option(draft, question, words)
+        elif there:
+            _ask(t, draft, question)
+        elif question.asked == "robot":
+            raise InputError(
+                f"--robot is missing, and nobody can be asked; valid: {', '.join(robot_names())}, "
+                f"or {OTHER_ARMS}"
+            )
+    _complete(draft)
+    written = cell_text(draft.data, f"The cell of a {draft.data['robot']['model']}")
+    replace_file(cell, written)
+    t.show(heading(f"Written: {cell}"))
+    t.show(
+        "Look it over: what was not answered stands there as an example. Then, without any "
+        f"device:\n  hilcal plan {quoted(cell)} -o plan.json\n"
+        f"  hilcal run {quoted(cell)} --plan plan.json --rehearse -o rehearsal.hilcal\n"
+        f"and with the devices{_lacking(draft)}:\n  hilcal check {quoted(cell)} --plan plan.json"
+    )
+    t.document({"cell": str(cell), "config": draft.data})
+
+
+def _lacking(draft: Draft) -> str:
+    """Say which keys the cell still needs before it can be measured."""
+    connection = "host" if "host" in draft.data.get("tracker", {}) else "port"
+    keys = (("robot", "driver"), ("robot", "host"), ("tracker", "driver"), ("tracker", connection))
+    wanted = [f"[{s}] {key}" for s, key in keys if key not in draft.data.get(s, {})]
+    return f", once it has {' and '.join(wanted)}" if wanted else ""
+
+
+def _from_option(draft: Draft, question: CellQuestion, words: str) -> None:
+    if question.needs and question.needs not in draft.data:
+        raise InputError(
+            f"{question.option} without --{question.needs.replace('_', '-')}; give both"
+        )
+    try:
+        draft.answer(question.asked, words.strip())
+    except InputError as error:
+        raise InputError(f'{question.option} "{words}": {_shortly(error)}') from None
+
+
+def _ask(t: Terminal, draft: Draft, question: CellQuestion) -> None:
+    """Ask until the answer is valid, or empty where that means something."""
+    if question.needs and question.needs not in draft.data:
+        return
+    if question.asked.endswith("_port"):
+        t.notice(f"Serial ports here: {', '.join(ports()) or 'none'}.")
+    words = question.words + (f" (Enter: {question.without}):" if question.without else ":")
+    while True:
+        t.progress.print(words, markup=False, highlight=False, style="bold")
+        t.progress.print("> ", end="", markup=False, highlight=False)
+        answer = sys.stdin.readline()
+        if not answer:
+            raise StoppedError("nothing is written: the input ended")
+        answer = answer.strip()
+        if not answer and question.without:
+            return
+        try:
+            draft.answer(question.asked, answer)
+        except InputError as error:
+            t.notice(f"  Not so: {_shortly(error)}")
+            continue
+        if question.asked != "load":
+            return
+        words = "Another one (Enter: no more):"
+
+
+def _shortly(error: InputError) -> str:
+    return str(error).removeprefix("the answer: ")
+
+
+def _complete(draft: Draft) -> None:
+    """Add what a plan and a rehearsal need, and check the whole."""
+    if draft.data.setdefault("planning", {}).setdefault("readings", "absolute") == "absolute":
+        loaded = () if not draft.data.get("loads") else LOADED
+        draft.set("planning", model=[*GEOMETRY, *loaded])
+    draft.set("simulation", clock=CLOCK)
+    config = check_section(draft.data, CellConfig, "the cell")
+    check_effects(cell_from_config(config, draft.base_dir), config, installed())
+
+
+@command(
+    """
+    cell | CELL.toml | Also look at this cell's ports and addresses.
+    folder | --folder DIR | Where campaigns are stored.
+    """
+)
+def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
+    """Look at packages, ports, permissions, network, clock and disk of this computer."""
+    t = terminal(as_json)
+    findings: list[Finding] = []
+    with working(t.progress) as say:
+        say("looking at what is installed")
+        findings += program(hilcal.__version__)
+        say("looking at clock and disk")
+        findings += computer(folder.absolute())
+        config, of_cell = _cell(cell)
+        findings += of_cell
+        say("looking at serial ports")
+        findings += serial_ports(_ports(config), adapters())
+        if config is not None and config.robot.driver == "ur" and config.robot.host:
+            say(f"connecting to {config.robot.host}")
+            findings += reachable(config.robot.host, services(config))
+    t.show(doctor_report(findings))
+    failed: HilcalError | None = None
+    if any(f.state == "problem" for f in findings):
+        failed = DeviceError(doctor_summary(findings))
+    t.document({"ok": failed is None, "findings": [asdict(f) for f in findings]}, failed)
+
+
+def _cell(path: Path | None) -> tuple[CellConfig | None, list[Finding]]:
+    if path is None:
+        return None, []
+    try:
+        config = load_config(path)
+        cell_from_config(config, path.absolute().parent)  # its robot's file, too
+    except InputError as error:
+        mend = "mend the file; hilcal config explains every key"
+        return None, [Finding("cell", str(path), "problem", str(error), mend)]
+    return config, [Finding("cell", str(path), "ok", "can be read")]
+
+
+def _ports(config: CellConfig | None) -> dict[str, str]:
+    """Return the serial ports of a cell by device."""
+    if config is None:
+        return {}
+    ports = {"tracker": config.tracker.port}
+    if config.force_sensor is not None:
+        ports["force sensor"] = config.force_sensor.port
+    return {what: port for what, port in ports.items() if port and port != SIMULATED}

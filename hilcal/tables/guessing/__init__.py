@@ -1,1 +1,0 @@
-"""A mapping proposed for a table whose form is unknown."""

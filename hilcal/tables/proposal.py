@@ -1,0 +1,322 @@
+"""What the names of columns say, and a proposed mapping in the making."""
+
+import re
+import unicodedata
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from hilcal.errors import InputError
+from hilcal.names import escaped
+from hilcal.tables.grid import Grid
+from hilcal.tables.mapping import M
+from hilcal.toml import check_section
+from hilcal.types import Floats
+
+UNITS = {
+    "m": "m", "meter": "m", "metre": "m", "mm": "mm", "millimeter": "mm", "um": "um",
+    "micron": "um", "in": "in", "inch": "in", "inches": "in",
+    "rad": "rad", "mrad": "mrad", "deg": "deg", "degree": "deg", "degrees": "deg", "grad": "deg",
+    "°": "deg", "arcsec": "arcsec",
+    "n": "N", "newton": "N", "kn": "kN", "kgf": "kgf", "lbf": "lbf",
+    "nm": "Nm", "n*m": "Nm", "n·m": "Nm", "nmm": "Nmm", "knm": "kNm",
+    "kg": "kg", "g": "g", "lb": "lb", "lbs": "lb",
+    "s": "s", "sec": "s", "seconds": "s", "ms": "ms", "min": "min", "h": "h",
+    "c": "degC", "°c": "degC", "degc": "degC", "celsius": "degC", "k": "K", "f": "degF",
+    "°f": "degF", "degf": "degF",
+}  # fmt: skip
+"""Units as they are written, in small letters, and as a mapping calls them."""
+
+STD = {
+    "std", "stdev", "stddev", "sd", "sigma", "s", "u", "unc", "uncert", "uncertainty", "u95", "u2",
+    "expanded", "unsicherheit", "standardabweichung", "stabw", "incertitude", "ecart", "incert",
+    "incertidumbre", "var", "variance", "varianz", "deviation",
+}  # fmt: skip
+EXPANDED = {"u95", "u2", "expanded"}
+VARIANCE = {"var", "variance", "varianz"}
+ROTATION = {"r", "rot", "rotation", "ang", "angle", "euler", "winkel", "rotvec", "rv"}
+FORCE = {"f", "force", "kraft", "fuerza"}
+MOMENT = {"m", "mom", "moment", "torque", "t", "drehmoment", "couple"}
+QUATERNION = {"q", "quat", "quaternion"}
+NOMINAL = {
+    "goal", "nom", "nominal", "soll", "target", "ziel", "cmd", "command", "commanded", "ref",
+    "reference", "ideal", "set", "setpoint", "programmed", "flange", "flansch", "tcp", "robot",
+}  # fmt: skip
+MEASURED = {
+    "meas", "measured", "measurement", "measure", "ist", "actual", "act", "track", "tracker",
+    "laser", "lt", "smr", "gemessen", "mess", "messung", "mesure", "mesuree", "medido", "medida",
+    "obs", "observed", "enc", "encoder", "feedback", "reported", "recorded",
+}  # fmt: skip
+JOINT = {
+    "q", "j", "jt", "jnt", "joint", "joints", "axis", "axes", "achse", "achsen", "gelenk", "axe",
+    "articulation", "eje", "articulacion", "a", "ax", "rax", "theta", "th", "giunto", "qa",
+    "achswinkel", "gelenkwinkel", "jointangle", "jointposition", "axisangle",
+}  # fmt: skip
+"""Words of joint angles; with a number each."""
+NO_ANGLE = {
+    "temp", "temperature", "temperatur", "current", "strom", "torque", "moment", "drehmoment",
+    "speed", "velocity", "vel", "qd", "qdd", "acc", "acceleration", "voltage", "error", "offset",
+    "approach", "richtung", "direction", "degc",
+}  # fmt: skip
+TORQUE = {"tau", "torque", "drehmoment", "moment", "gelenkmoment", "achsmoment", "couple"}
+"""Words of measured joint torques; with a number each."""
+DISTANCE = {"distance", "dist", "abstand", "entfernung", "length", "lange", "range", "ballbar"}
+GAUGE = {"gauge", "messuhr", "taster", "dial", "indicator", "height", "hohe", "hauteur"}
+FROM = {"from", "von", "point", "punkt", "ball", "kugel", "anchor", "bar", "plane", "ebene"}
+"""Words of what a distance or a height is of, beside those of the quantity itself."""
+STATION = {"station", "standpunkt", "stationierung", "aufstellung"}
+TEMPERATURE = {"temp", "temperature", "temperatur", "temperatura"}
+APPROACH = {"approach", "richtung", "direction", "anfahrt"}
+POSE = {
+    "pose", "poses", "point", "punkt", "pt", "messpunkt", "posenr", "id", "name", "nr", "no",
+    "number", "index", "position", "punto", "target", "p", "pkt", "label", "repere",
+}  # fmt: skip
+LOAD = {"load", "last", "payload", "charge", "carga", "loadcase", "lastfall", "zuladung"}
+MASS = {"mass", "masse", "weight", "gewicht", "masa", "peso"}
+CYCLE = {"cycle", "zyklus", "repeat", "repetition", "wiederholung", "lauf", "ciclo"}
+TIME = {"time", "zeit", "timestamp", "date", "datum", "datetime", "zeitstempel", "temps", "hora",
+        "t"}  # fmt: skip
+REFLECTOR = {"target", "reflector", "reflektor", "prism", "prisma", "smr", "nest"}
+AIR = {"air", "luft", "ambient", "umgebung", "room", "raum", "aire"}
+ARM_JOINTS = (
+    ("shoulder", "pan"),
+    ("shoulder", "lift"),
+    ("elbow",),
+    ("wrist", "1"),
+    ("wrist", "2"),
+    ("wrist", "3"),
+)
+"""Joint names of Universal Robots arms under ROS, in order."""
+
+DIFFERENCE = {"dev", "delta", "diff", "difference", "error", "err", "residual", "abweichung"}
+"""Words of what is no reading but compared with one."""
+CHINESE = {
+    "关节": " joint ", "轴": " joint ", "坐标": " ", "位置": " ", "测量": " measured ",
+    "温度": " temperature ", "负载": " load ", "编号": " point ", "点号": " point ",
+    "时间": " time ", "实际": " actual ", "理论": " nominal ",
+}  # fmt: skip
+"""Words without letters, as those with."""
+
+_PREFIXES = STD | ROTATION | FORCE | MOMENT | QUATERNION | MEASURED | NOMINAL | {"p", "pos", "d"}
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnName:
+    """A column's name, taken apart."""
+
+    name: str  # as the file has it
+    words: tuple[str, ...]  # in small letters, without axis and number
+    axis: str | None  # "x", "y", "z" or "w", where the name ends in one
+    numbers: tuple[int, ...]  # the numbers in it
+    unit: str | None  # as a mapping calls it, where the name or the row of units says it
+
+    def has(self, words: set[str]) -> bool:
+        """Whether one of its words is among these."""
+        return not words.isdisjoint(self.words)
+
+
+def parse(name: str, unit_cell: str = "") -> ColumnName:
+    """Take a column's name apart."""
+    rest, unit = _unit(name)
+    told = UNITS.get(unit_cell.strip(" []()<>").replace("µ", "u").replace("μ", "u").lower())
+    for sign, word in CHINESE.items():
+        rest = rest.replace(sign, word)
+    rest = re.sub(r"(?<=[a-zµ])(?=[A-Z])", " ", rest)
+    plain = unicodedata.normalize("NFKD", rest.replace("ß", "ss")).encode("ascii", "ignore")
+    words: list[str] = []
+    numbers: list[int] = []
+    axis = None
+    for word in re.findall(r"[a-z]+\d*|\d+", plain.decode().lower()):
+        if word in STD:
+            words.append(word)
+            continue
+        letters = word.rstrip("0123456789")
+        digits = word[len(letters) :]
+        if digits:
+            numbers.append(int(digits))
+        if not letters:
+            continue
+        if letters.endswith(("temperatur", "temperature")) and letters not in TEMPERATURE:
+            words += [letters[: letters.index("temp")], "temperature"]
+        elif letters in ("x", "y", "z"):
+            axis = letters
+        elif letters[-1] in "wxyz" and letters[:-1] in _PREFIXES:
+            axis = letters[-1]
+            words.append(letters[:-1])
+        elif letters[0] in "xyz" and letters[1:] in MEASURED | NOMINAL | STD:
+            axis = letters[0]
+            words.append(letters[1:])
+        else:
+            words.append(letters)
+    return ColumnName(name, tuple(words), axis, tuple(numbers), told or unit)
+
+
+def _unit(name: str) -> tuple[str, str | None]:
+    """Name without its unit, and the unit."""
+    plain = name.replace("µ", "u").replace("μ", "u").strip()
+    for found in re.finditer(r"[\[({<]\s*([^\])}>]+?)\s*[\])}>]", plain):
+        if unit := UNITS.get(found[1].lower()):
+            return plain[: found.start()] + plain[found.end() :], unit
+    ending = re.search(r"[ _/.,-]+([A-Za-z°·*]+)$", plain)
+    if ending and (unit := UNITS.get(ending[1].lower())):
+        single = len(ending[1]) == 1
+        if not single or ending[1] in ("m", "N", "K", "°", "s"):
+            return plain[: ending.start()], unit
+    return plain, None
+
+
+TURN = 2 * np.pi + 0.1  # rad; a larger angle is in degrees
+FAR = 50.0  # A position beyond this number is in millimetres: no arm is measured from 50 m
+GUESSED = "the convention is a guess; --config CELL.toml lets the arm decide"
+SIDE_BY_SIDE = "several targets: name them as in the cell's [[tool.targets]]"
+REPORTED = 5e-3
+"""rad; encoders at rest in one pose differ by less, commanded poses by more; a choice."""
+FEWEST_JOINTS, MOST_JOINTS = 4, 8
+SHOWN = 3
+
+
+@dataclass(frozen=True, slots=True)
+class UnderstoodColumn:
+    """One thing that the table holds."""
+
+    what: str  # section of the mapping
+    columns: tuple[str, ...]
+    meaning: str  # unit and convention
+    example: tuple[str, ...]  # the cells of the first reading
+
+
+@dataclass(slots=True, eq=False)
+class Proposal:
+    """A mapping in the making.
+
+    Attributes:
+        unsure: sentences on what should be checked, by section.
+        unused: columns without a meaning, with the reason.
+        lacking: sentences on what an import needs and was not found.
+        alternatives: columns of the position and of the joints that are as good by their values,
+            the chosen ones first; empty lists where names tell.
+    """
+
+    sections: dict[str, dict[str, Any]] = field(default_factory=dict)  # of the mapping, by name
+    understood: list[UnderstoodColumn] = field(default_factory=list)  # what the table holds
+    unsure: list[tuple[str, str]] = field(default_factory=list)
+    unused: list[tuple[str, str]] = field(default_factory=list)
+    lacking: list[str] = field(default_factory=list)
+    open_convention: bool = False  # whether the orientation's convention is a guess
+    alternatives: list[tuple[list[str], list[str]]] = field(default_factory=list)
+
+    def mapping(self, kind: type[M]) -> M:
+        """Return the mapping, `Mapping` for readings, `PointMapping` for points."""
+        return check_section(self.sections, kind, "the proposed mapping")
+
+    def to_toml(self, source: str) -> str:
+        """Return the mapping file, with what is unsure as comments."""
+        lines = [
+            f"# How to read {source}; proposed by `hilcal import --preview`. Check what is",
+            "# marked, change what is wrong, and give this file with --format.",
+        ]
+        lines += [f"# missing: {what}" for what in self.lacking]
+        absent = [(about, words) for about, words in self.unsure if about not in self.sections]
+        lines += [f"# {about}: {words}" for about, words in absent]
+        for name, section in self.sections.items():
+            lines.append("")
+            lines += [f"# check: {words}" for about, words in self.unsure if about == name]
+            lines.append(f"[{name}]")
+            lines += [f"{key} = {_value(value)}" for key, value in section.items()]
+        if self.unused:
+            lines += ["", "# not used:"]
+            lines += [f"#   {name} ({why})" for name, why in self.unused]
+        return "\n".join(map(escaped, lines)) + "\n"
+
+
+def _value(value: Any) -> str:
+    """Return a value as TOML."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + escaped(value).replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_value, value))}]"
+    return repr(value)
+
+
+class Guesser:
+    """Columns that are not yet used, and the mapping that grows."""
+
+    def __init__(self, grid: Grid, joints: int | None) -> None:
+        """Take the table apart."""
+        self.grid = grid
+        self.joints = joints
+        self.columns = [parse(name, grid.units.get(name, "")) for name in grid.names]
+        self.proposal = Proposal()
+        self.free = dict(zip(grid.names, self.columns, strict=True))
+        self.values: dict[str, Floats | None] = {name: self._numbers(name) for name in grid.names}
+
+    def _numbers(self, name: str) -> Floats | None:
+        try:
+            values = self.grid.numbers(name)
+        except InputError:
+            return None
+        return values if np.isfinite(values).any() else None
+
+    def number(self, name: str) -> bool:
+        """Whether a column holds numbers."""
+        return self.values[name] is not None
+
+    def block(self, names: Iterable[str]) -> Floats:
+        """(N, k) numbers of columns."""
+        nothing = np.full(len(self.grid.rows), np.nan)
+        given = (self.values[name] for name in names)
+        return np.stack([nothing if v is None else v for v in given], axis=1)
+
+    def take(self, what: str, names: Sequence[str], meaning: str, **section: object) -> None:
+        """Give columns a meaning."""
+        key = "column" if "column" in section else "columns"
+        section = {key: names[0] if key == "column" else list(names)} | section
+        self.proposal.sections[what] = section
+        examples = tuple(self.grid.text(name)[0] for name in names)
+        self.proposal.understood.append(UnderstoodColumn(what, tuple(names), meaning, examples))
+        for name in names:
+            self.free.pop(name, None)
+
+    def unsure(self, about: str, sentence: str) -> None:
+        """Note what should be checked."""
+        self.proposal.unsure.append((about, sentence))
+
+    def drop(self, name: str, why: str) -> None:
+        """Leave a column unused."""
+        if self.free.pop(name, None) is not None:
+            self.proposal.unused.append((name, why))
+
+    def unit(self, names: Sequence[str]) -> str | None:
+        """Return the unit that the names of columns, or the row of units, state."""
+        found = {self.columns[self.grid.names.index(name)].unit for name in names}
+        return found.pop() if len(found) == 1 else None
+
+
+def angle_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+    """Return the unit of angles by name, else by size."""
+    stated = g.unit(names)
+    largest = float(np.nanmax(np.abs(g.block(names))))
+    if stated in ("rad", "mrad", "deg", "arcsec"):
+        if stated == "rad" and largest > TURN:
+            g.unsure(what, f"named rad, but up to {largest:.4g}: read as degrees")
+            return "deg"
+        return stated
+    if largest > TURN:
+        return "deg"
+    g.unsure(what, f"no unit stated; rad, since no angle exceeds {largest:.3g}")
+    return "rad"
+
+
+def length_unit(g: Guesser, what: str, names: Sequence[str]) -> str:
+    """Return the unit of positions by name, else by size."""
+    stated = g.unit(names)
+    if stated in ("m", "mm", "um", "in"):
+        return stated
+    largest = float(np.nanmax(np.abs(g.block(names))))
+    unit = "mm" if largest > FAR else "m"
+    g.unsure(what, f"no unit stated; {unit}, since the largest is {largest:.4g}")
+    return unit
