@@ -28,21 +28,13 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """Standard uncertainties of a 3-D position or deflection at a pose that was not fitted, m.
+    """Standard uncertainties of a 3-D position or deflection at a pose that was not fitted, m."""
 
-    Attributes:
-        parameters: of the parameters, estimated without the pose.
-        misfit: of what the model misses beyond the noise.
-        scatter: of the arm's own repeatability; of both arrivals of a deflection.
-        scatter_source: what that is from.
-        instrument: of the instrument's noise, as stated.
-    """
-
-    parameters: float
-    misfit: float
-    scatter: float
-    scatter_source: ScatterSource
-    instrument: float
+    parameters: float  # of the parameters, estimated without the pose
+    misfit: float  # of what the model misses beyond the noise
+    scatter: float  # of the arm's own repeatability; of both arrivals of a deflection
+    scatter_source: ScatterSource  # what that is from
+    instrument: float  # of the instrument's noise, as stated
 
     @property
     def combined(self) -> float:

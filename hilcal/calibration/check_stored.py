@@ -15,11 +15,7 @@ LARGEST = 1e9
 
 
 def check_frames(what: str, frames: Floats) -> None:
-    """Refuse (..., 4, 4) matrices that are no rotation and translation.
-
-    Raises:
-        ValueError: names them.
-    """
+    """Refuse (..., 4, 4) matrices that are no rotation and translation."""
     check_numbers(what, frames, (*frames.shape[:-2], 4, 4))
     turn = frames[..., :3, :3]
     orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
@@ -69,11 +65,7 @@ def check_arm(arm: Arm) -> None:
 
 
 def check_cell(cell: Cell) -> None:
-    """Refuse a cell that cannot be.
-
-    Raises:
-        ValueError: says why.
-    """
+    """Refuse a cell that cannot be."""
     for name in ("target", "registration"):
         check_frames(name, getattr(cell, name))
     check_numbers("load_point", cell.load_point, (3,))
@@ -85,11 +77,7 @@ def check_cell(cell: Cell) -> None:
 
 
 def check_spread(scatter: Scatter, measured: Measured, n: int) -> None:
-    """Refuse a scatter or ranges that cannot be.
-
-    Raises:
-        ValueError: says why.
-    """
+    """Refuse a scatter or ranges that cannot be."""
     check_numbers("joint_std", scatter.joint_std, (n,), least=0.0)
     check_numbers("std_m", scatter.std_m, least=0.0)
     if np.isnan(measured.most_std_m):
@@ -101,11 +89,7 @@ def check_spread(scatter: Scatter, measured: Measured, n: int) -> None:
 
 
 def check_conditions(conditions: Mapping[str, Condition], n: int) -> None:
-    """Refuse conditions that cannot be.
-
-    Raises:
-        ValueError: says why.
-    """
+    """Refuse conditions that cannot be."""
     for name, c in conditions.items():
         if name not in WORDS:
             raise ValueError(f"{name!r} is no condition")

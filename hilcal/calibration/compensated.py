@@ -30,25 +30,17 @@ BAND = 0.95
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolPoses:
-    """Where the tool is at N points, base axes.
+    """Where the tool is at N points, base axes."""
 
-    Attributes:
-        position: (N, 3) m.
-        rotation: (N, 3, 3).
-        nominal_position: (N, 3) where it is asked to be: where the nominal arm has it, of a fit to
-            deflections where the unloaded arm has it.
-        nominal_rotation: (N, 3, 3).
-        covariance: (N, 3, 3) of the true position about `position`, m²; None where it was not
-            asked for.
-        outside: what the points leave of that which was measured.
-    """
-
-    position: Floats
-    rotation: Floats
+    position: Floats  # (N, 3) m
+    rotation: Floats  # (N, 3, 3)
     nominal_position: Floats
-    nominal_rotation: Floats
+    """(N, 3) where it is asked to be: where the nominal arm has it, of a fit to deflections where
+    the unloaded arm has it."""
+    nominal_rotation: Floats  # (N, 3, 3)
     covariance: Floats | None
-    outside: tuple[Outside, ...]
+    """(N, 3, 3) of the true position about `position`, m²; None where it was not asked for."""
+    outside: tuple[Outside, ...]  # what the points leave of that which was measured
 
     @property
     def error_m(self) -> Floats:
@@ -102,20 +94,16 @@ def band(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Joint values that put the tool where it was asked to be; the rest is computed when asked for.
+    """Joint values that put the tool where it was asked to be; the rest is computed when asked for."""
 
-    Attributes:
-        inverse: joint values, and what is left.
-        untold: columns of `States` that the model needs and the points did not have.
-    """
-
-    inverse: Inverse
+    inverse: Inverse  # joint values, and what is left
     _calibration: "Calibration"
     _tool: ToolPose
     _states: States
     _wanted: tuple[Floats, Floats] | None
     _std: bool
     untold: tuple[str, ...] = ()
+    """Columns of `States` that the model needs and the points did not have."""
 
     @property
     def q(self) -> Floats:

@@ -35,17 +35,11 @@ Pose = tuple[Floats, Floats, Chain]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inverse:
-    """The solution for N points.
+    """The solution for N points."""
 
-    Attributes:
-        q: (N, n) joint values.
-        residual_m: (N,) distance from the wanted position that is left.
-        residual_rad: (N,) angle from the wanted orientation that is left.
-    """
-
-    q: Floats
-    residual_m: Floats
-    residual_rad: Floats
+    q: Floats  # (N, n) joint values
+    residual_m: Floats  # (N,) distance from the wanted position that is left
+    residual_rad: Floats  # (N,) angle from the wanted orientation that is left
 
     @property
     def solved(self) -> Bools:
@@ -63,7 +57,6 @@ def invert(
     """Find joint values.
 
     Args:
-        poses: takes joint values (K, n) and the numbers (K,) of their points; returns the poses.
         q: (N, n) joint values to begin with.
         rotation: (N, 3, 3) wanted orientation of the tool, base axes.
         position: (N, 3) wanted position, base axes, m.

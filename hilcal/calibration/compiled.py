@@ -28,31 +28,20 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Compiled:
-    """Arrays for `kernel.invert_all`.
+    """Arrays for `kernel.invert_all`."""
 
-    Attributes:
-        arm: links and centres of mass.
-        load: where the load acts, and all weights.
-        laws: constants and compliances.
-        tables: of what depends on one angle, or one torque.
-        tool: where it is on the flange, and where the base is.
-        nominal: the same laws with nothing in them, of the nominal arm.
-        reach: m.
-        mode: kind of readings that the model was fitted to.
-        by_point: effects that need times, temperatures or sides of approach, with their parameters.
-        one: a state, for these effects.
-    """
-
-    arm: tuple[Floats, ...]
-    load: tuple[Any, ...]
-    laws: tuple[Floats, ...]
-    tables: tuple[Any, ...]
-    tool: ToolPose
+    arm: tuple[Floats, ...]  # links and centres of mass
+    load: tuple[Any, ...]  # where the load acts, and all weights
+    laws: tuple[Floats, ...]  # constants and compliances
+    tables: tuple[Any, ...]  # of what depends on one angle, or one torque
+    tool: ToolPose  # where it is on the flange, and where the base is
     nominal: tuple[tuple[Floats, ...], tuple[Any, ...]]
-    reach: float
-    mode: Mode
+    """The same laws with nothing in them, of the nominal arm."""
+    reach: float  # m
+    mode: Mode  # kind of readings that the model was fitted to
     by_point: tuple[tuple[Effect, Floats], ...]
-    one: Situation
+    """Effects that need times, temperatures or sides of approach, with their parameters."""
+    one: Situation  # a state, for these effects
 
     def compensate(
         self, states: States, goal: tuple[Floats, Floats] | None
@@ -60,7 +49,6 @@ class Compiled:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
         Args:
-            states: N points, with what the effects need.
             goal: (N, 3, 3) wanted orientations and (N, 3) positions, m, base axes; those that the
                 nominal arm (for deflections: the unloaded arm) has at q where None.
         """

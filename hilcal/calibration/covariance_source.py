@@ -31,19 +31,12 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CovarianceSource:
-    """What the covariance follows from.
+    """What the covariance follows from."""
 
-    Attributes:
-        readings: the fitted ones; their values are not used.
-        prior: (P,) S.
-        noise: σ².
-        factor: κ.
-    """
-
-    readings: Readings
-    prior: Floats
-    noise: float
-    factor: float
+    readings: Readings  # the fitted ones; their values are not used
+    prior: Floats  # (P,) S
+    noise: float  # σ²
+    factor: float  # κ
 
     def root(self, model: Model, theta: Floats, mode: Mode) -> Floats:
         """Return R (P, P) with κ C = R Rᵀ.
@@ -60,12 +53,7 @@ class CovarianceSource:
         return np.asarray(self.prior[:, None] * vectors * np.sqrt(spread))
 
     def check(self, model: Model) -> None:
-        """Refuse what does not go with a model.
-
-        Raises:
-            InputError: too large.
-            ValueError: says why.
-        """
+        """Refuse what does not go with a model."""
         r, n = self.readings, model.cell.arm.n
         count = len(r.states)
         limits.check_numbers("what its covariance follows from", count * r.m * max(model.size, 1))

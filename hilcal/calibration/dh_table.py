@@ -46,35 +46,20 @@ TRIALS = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DhRows:
-    """A table of n joints.
+    """A table of n joints."""
 
-    Attributes:
-        convention: of the rows, see `robot.dh.arm_from_dh`.
-        a: (n,) m.
-        d: (n,) m.
-        alpha: (n,) rad.
-        offset: (n,) rad.
-        base: (4, 4) B.
-        flange: (4, 4) E.
-        base_moves: most that the flange moves where B is left out, m.
-        flange_moves: the same of E, m.
-        table_moves: the same of both together.
-        disagreement: most that the flange is elsewhere with B and E, m: rounding.
-        slides: joints that slide, counted from 0: q adds to d.
-    """
-
-    convention: Convention
-    a: Floats
-    d: Floats
-    alpha: Floats
-    offset: Floats
-    base: Floats
-    flange: Floats
-    base_moves: float = 0.0
-    flange_moves: float = 0.0
-    table_moves: float = 0.0
-    disagreement: float = 0.0
-    slides: tuple[int, ...] = ()
+    convention: Convention  # of the rows, see `robot.dh.arm_from_dh`
+    a: Floats  # (n,) m
+    d: Floats  # (n,) m
+    alpha: Floats  # (n,) rad
+    offset: Floats  # (n,) rad
+    base: Floats  # (4, 4) B
+    flange: Floats  # (4, 4) E
+    base_moves: float = 0.0  # most that the flange moves where B is left out, m
+    flange_moves: float = 0.0  # the same of E, m
+    table_moves: float = 0.0  # the same of both together
+    disagreement: float = 0.0  # most that the flange is elsewhere with B and E, m: rounding
+    slides: tuple[int, ...] = ()  # joints that slide, counted from 0: q adds to d
 
 
 def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:

@@ -37,16 +37,11 @@ FULL_TURN = 2 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Corrected:
-    """An arm with what is constant of a calibration.
-
-    Attributes:
-        within: effects that it contains.
-        beyond: effects that it does not contain.
-    """
+    """An arm with what is constant of a calibration."""
 
     arm: Arm
-    within: tuple[str, ...]
-    beyond: tuple[str, ...]
+    within: tuple[str, ...]  # effects that it contains
+    beyond: tuple[str, ...]  # effects that it does not contain
 
 
 def corrected(calibration: Calibration) -> Corrected:

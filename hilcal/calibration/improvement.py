@@ -76,27 +76,18 @@ class Improved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Improvement:
-    """Errors of N points before and after the correction, as measured.
+    """Errors of N points before and after the correction, as measured."""
 
-    Attributes:
-        mode: kind of readings of the model.
-        poses: their names.
-        loads: name of each one's load.
-        before_m: (N,) distance from where the tool was asked to be.
-        after_m: (N,) the same at the corrected joint values.
-        band_m: (N,) distance within which `BAND` of such readings were predicted to be.
-        noise_m: (N,) root mean square distance by the tracker's noise and the arm's repeatability.
-        left_out: points that could not be corrected or reached, with the reason.
-    """
-
-    mode: Mode
-    poses: tuple[str, ...]
-    loads: tuple[str, ...]
-    before_m: Floats
-    after_m: Floats
-    band_m: Floats
+    mode: Mode  # kind of readings of the model
+    poses: tuple[str, ...]  # their names
+    loads: tuple[str, ...]  # name of each one's load
+    before_m: Floats  # (N,) distance from where the tool was asked to be
+    after_m: Floats  # (N,) the same at the corrected joint values
+    band_m: Floats  # (N,) distance within which `BAND` of such readings were predicted to be
     noise_m: Floats
+    """(N,) root mean square distance by the tracker's noise and the arm's repeatability."""
     left_out: tuple[tuple[str, str], ...] = ()
+    """Points that could not be corrected or reached, with the reason."""
 
     @property
     def everything(self) -> Improved:

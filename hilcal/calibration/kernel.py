@@ -322,20 +322,11 @@ def invert_all(
     """Invert N points; without `newton` write the poses at q into `rotations` and `positions`.
 
     Args:
-        arm: links (n + 1, 3, 3) and (n + 1, 3), centres of mass (n, 3).
-        load: where the load acts, and all weights.
-        laws: constants and compliances of the deviations.
-        tables: of what depends on one angle, or one torque.
-        own: displacements (K, n), twists (K, n + 1, 6) and compliances (K, n) of the points, K
-            each its own; the last ones are those of all further points.
         tool: (4, 4) T_flange_tool.
-        most_turn: largest step of a joint, rad.
-        tolerance: residual at which a point is solved, m and rad.
         q: (N, n) joint values to begin with, rad.
         applied: (N, 6) wrenches at the load point, base axes.
         rotations: (N, 3, 3) wanted orientations.
         positions: (N, 3) wanted positions, m.
-        newton: whether to change q.
         out_q: (N, n) joint values found.
         left: (N, 2) residuals, m and rad.
     """

@@ -32,31 +32,21 @@ from hilcal.types import Bools, Floats
 
 @dataclass(frozen=True, slots=True)
 class Outside:
-    """Points outside of what was measured.
+    """Points outside of what was measured."""
 
-    Attributes:
-        of: the range that they leave; for the uncertainty, its limit, m.
-        points: (N,) which points.
-        values: (N,) their values.
-    """
-
-    of: Range
-    points: Bools
-    values: Floats
+    of: Range  # the range that they leave; for the uncertainty, its limit, m
+    points: Bools  # (N,) which points
+    values: Floats  # (N,) their values
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Where the fitted readings lie.
+    """Where the fitted readings lie."""
 
-    Attributes:
-        ranges: of joint angles, force, moment, temperatures.
-        most_std_m: standard deviation of a prediction, by the parameters alone, from which on a
-            point is far from all fitted ones; see `extrapolation`. For the tracked target.
-    """
-
-    ranges: tuple[Range, ...]
+    ranges: tuple[Range, ...]  # of joint angles, force, moment, temperatures
     most_std_m: float
+    """Standard deviation of a prediction, by the parameters alone, from which on a point is far
+    from all fitted ones; see `extrapolation`. For the tracked target."""
 
     @classmethod
     def of(cls, states: States, p: Predictive, noise: Floats, units: Sequence[str]) -> "Measured":
@@ -117,15 +107,10 @@ MOST = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Condition:
-    """A quantity on the whole while measuring.
+    """A quantity on the whole while measuring."""
 
-    Attributes:
-        mean: x̄: a number, or (n,).
-        variance_m2: v, m².
-    """
-
-    mean: Floats
-    variance_m2: float
+    mean: Floats  # x̄: a number, or (n,)
+    variance_m2: float  # v, m²
 
 
 def needed(model: Model, states: States) -> tuple[str, ...]:
@@ -138,12 +123,7 @@ def needed(model: Model, states: States) -> tuple[str, ...]:
 def conditions_of(
     model: Model, states: States, moves: Callable[[States], tuple[Floats, Floats]]
 ) -> dict[str, Condition]:
-    """Return the conditions that effects of a model need, by column.
-
-    Args:
-        states: that it was fitted to.
-        moves: position (N, 3) of the tool and J R (N, 3, K) at N states.
-    """
+    """Return the conditions that effects of a model need, by column."""
     names = needed(model, States(states.q, states.wrench))
     some = states[:: -(-len(states) // MOST)]
     own = moves(some) if names else None

@@ -68,25 +68,19 @@ LARGEST = 4.0 * np.pi
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
-    """N points.
-
-    Attributes:
-        q: (N, n) joint values, rad; rows of NaN where only a pose is given.
-        wanted: (N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all.
-        wrench: (N, 6) force and moment at the load point, base axes; None where none are given.
-        sensed: (N, 6) what the load adds to the force sensor's reading, sensor axes; None where
-            it is not given.
-        recorded: other columns of `States`.
-        taken: which columns were taken for what, where their names are not ours.
-    """
+    """N points."""
 
     names: tuple[str, ...]
-    q: Floats
+    q: Floats  # (N, n) joint values, rad; rows of NaN where only a pose is given
     wanted: Floats | None = None
+    """(N, 4, 4) T_base_tool, NaN where the joint values say where to go; None for all."""
     wrench: Floats | None = None
+    """(N, 6) force and moment at the load point, base axes; None where none are given."""
     sensed: Floats | None = None
-    recorded: Mapping[str, Floats] = field(default_factory=dict)
-    taken: str = ""
+    """(N, 6) what the load adds to the force sensor's reading, sensor axes; None where it is not
+    given."""
+    recorded: Mapping[str, Floats] = field(default_factory=dict)  # other columns of `States`
+    taken: str = ""  # which columns were taken for what, where their names are not ours
 
 
 class _OtherNamesError(InputError):

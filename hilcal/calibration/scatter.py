@@ -39,17 +39,11 @@ ScatterSource = Literal["estimated", "stated", "repeats", "maker", "industry", "
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
-    """Standard deviations of one arrival.
+    """Standard deviations of one arrival."""
 
-    Attributes:
-        joint_std: (n,) of the drives, rad.
-        std_m: of the position along each axis beside that, m.
-        source: what they are from.
-    """
-
-    joint_std: Floats
-    std_m: float
-    source: ScatterSource
+    joint_std: Floats  # (n,) of the drives, rad
+    std_m: float  # of the position along each axis beside that, m
+    source: ScatterSource  # what they are from
 
     @property
     def known(self) -> bool:

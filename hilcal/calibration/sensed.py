@@ -20,15 +20,10 @@ from hilcal.types import Floats
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorMount:
-    """Where the force sensor stands.
+    """Where the force sensor stands."""
 
-    Attributes:
-        origin_m: (3,) its origin, flange axes, m.
-        rotvec_rad: (3,) its axes in flange axes, a rotation vector, rad.
-    """
-
-    origin_m: Floats
-    rotvec_rad: Floats
+    origin_m: Floats  # (3,) its origin, flange axes, m
+    rotvec_rad: Floats  # (3,) its axes in flange axes, a rotation vector, rad
 
     @classmethod
     def of(cls, cell: Cell) -> Self | None:

@@ -21,29 +21,19 @@ from hilcal.types import Floats, Ints
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToolPose:
-    """What is to be put somewhere.
+    """What is to be put somewhere."""
 
-    Attributes:
-        model: whose target is the tool; without effects that place another target.
-        theta: (P,) its parameters.
-        kept: (P,) which of the parameters of the fitted model they are.
-        nominal: (4, 4) T_flange_tool.
-        pose: (4, 4) T_chainflange_tool, the same on the flange of the fitted chain.
-        registered: (4, 4) from the axes of the registration to those of the base.
-        base: (4, 4) from the axes of the chain to those of the base, constant effects alone.
-        frames: effects that say where the base is, with their parameters.
-        moving: effects that move base or target and are no frames, with their parameters.
-    """
-
-    model: Model
-    theta: Floats
-    kept: Ints
-    nominal: Floats
-    pose: Floats
-    registered: Floats
-    base: Floats
+    model: Model  # whose target is the tool; without effects that place another target
+    theta: Floats  # (P,) its parameters
+    kept: Ints  # (P,) which of the parameters of the fitted model they are
+    nominal: Floats  # (4, 4) T_flange_tool
+    pose: Floats  # (4, 4) T_chainflange_tool, the same on the flange of the fitted chain
+    registered: Floats  # (4, 4) from the axes of the registration to those of the base
+    base: Floats  # (4, 4) from the axes of the chain to those of the base, constant effects alone
     frames: tuple[tuple[Effect, slice], ...]
+    """Effects that say where the base is, with their parameters."""
     moving: tuple[tuple[Effect, slice], ...]
+    """Effects that move base or target and are no frames, with their parameters."""
 
 
 def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:

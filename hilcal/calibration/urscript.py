@@ -86,31 +86,19 @@ Value = float | tuple[str, tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Waypoint:
-    """One waypoint of a program, or another motion.
+    """One waypoint of a program, or another motion."""
 
-    Attributes:
-        line: of the program, from 1.
-        begin: where its target begins in the text.
-        end: where it ends.
-        q: (6,) joint values, or those that its branch is near to, rad; None where neither is given.
-        pose: (4, 4) T_base_tool; None where the joint values are the target.
-        tool: (4, 4) T_flange_tool that was set; None where none was.
-        blend_m: radius within which the arm passes it without a stop, m.
-        left: why it is left as it is; empty where it is understood.
-        straight: whether the tool moves to it on a straight line.
-        follows: whether the waypoint before it in the text always comes right before it.
-    """
-
-    line: int
-    begin: int
-    end: int
+    line: int  # of the program, from 1
+    begin: int  # where its target begins in the text
+    end: int  # where it ends
     q: Floats | None = None
-    pose: Floats | None = None
-    tool: Floats | None = None
-    blend_m: float = 0.0
-    left: str = ""
-    straight: bool = False
-    follows: bool = False
+    """(6,) joint values, or those that its branch is near to, rad; None where neither is given."""
+    pose: Floats | None = None  # (4, 4) T_base_tool; None where the joint values are the target
+    tool: Floats | None = None  # (4, 4) T_flange_tool that was set; None where none was
+    blend_m: float = 0.0  # radius within which the arm passes it without a stop, m
+    left: str = ""  # why it is left as it is; empty where it is understood
+    straight: bool = False  # whether the tool moves to it on a straight line
+    follows: bool = False  # whether the waypoint before it in the text always comes right before it
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
@@ -185,22 +173,15 @@ def movej_program(names: Sequence[str], q: Floats) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Program:
-    """Statements, and what their names stand for.
+    """Statements, and what their names stand for."""
 
-    Attributes:
-        statements: in the order of the text.
-        functions: names that it defines.
-        bound: by name, the number of each statement that gives it a value, with that value; None
-            for a parameter, an element or a function.
-        aliased: whether an element is assigned of what may be another variable's list.
-        known: values that were computed.
-    """
-
-    statements: tuple[Statement, ...]
-    functions: frozenset[str]
+    statements: tuple[Statement, ...]  # in the order of the text
+    functions: frozenset[str]  # names that it defines
     bound: dict[str, list[tuple[int, ast.expr | None]]]
-    aliased: bool
-    known: dict[int, Value | None] = field(default_factory=dict)
+    """By name, the number of each statement that gives it a value, with that value; None for a
+    parameter, an element or a function."""
+    aliased: bool  # whether an element is assigned of what may be another variable's list
+    known: dict[int, Value | None] = field(default_factory=dict)  # values that were computed
 
     @classmethod
     def of(cls, found: tuple[Statement, ...]) -> "_Program":

@@ -33,27 +33,16 @@ VALID = "valid: one statement of URScript per line, as chapter 1 of its manual h
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Statement:
-    """One statement.
+    """One statement."""
 
-    Attributes:
-        line: of the program, from 1.
-        number: of the block that it opens, where it opens one.
-        begin: where in the program the text begins that `node` is of.
-        text: that text.
-        node: as parsed; of `if`, `while` and `def` only the head.
-        blocks: numbers of the blocks that it stands in, the outermost first.
-        kinds: the words that these begin with.
-        called: all calls in it, with the names of their functions.
-    """
-
-    line: int
-    number: int
-    begin: int
-    text: str
-    node: ast.stmt
-    blocks: tuple[int, ...]
-    kinds: tuple[str, ...]
-    called: dict[ast.Call, str]
+    line: int  # of the program, from 1
+    number: int  # of the block that it opens, where it opens one
+    begin: int  # where in the program the text begins that `node` is of
+    text: str  # that text
+    node: ast.stmt  # as parsed; of `if`, `while` and `def` only the head
+    blocks: tuple[int, ...]  # numbers of the blocks that it stands in, the outermost first
+    kinds: tuple[str, ...]  # the words that these begin with
+    called: dict[ast.Call, str]  # all calls in it, with the names of their functions
 
     @property
     def call(self) -> ast.Call | None:

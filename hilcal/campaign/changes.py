@@ -24,25 +24,19 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Changed:
-    """A revision and the one that it was made from.
+    """A revision and the one that it was made from."""
 
-    Attributes:
-        before_number: number of the revision before.
-        number: of the new revision.
-        added: the effect that was added, with its options where a finer form took its place.
-        removed: the effect that was taken out.
-        expected: what the fit before promised of an effect that was added, and what was kept of it;
-            None where it has no whitened residual.
-    """
-
-    before_number: int
+    before_number: int  # number of the revision before
     before: Fit
-    number: int
+    number: int  # of the new revision
     fit: Fit
     diagnosis: Diagnosis
     added: str | None
-    removed: str | None
+    """The effect that was added, with its options where a finer form took its place."""
+    removed: str | None  # the effect that was taken out
     expected: Suspect | None
+    """What the fit before promised of an effect that was added, and what was kept of it; None where
+    it has no whitened residual."""
 
 
 def add_effect(

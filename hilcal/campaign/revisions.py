@@ -302,7 +302,6 @@ def restore_predictive(
 
     Args:
         theta: (P,) its parameters.
-        readings: all readings that it was fitted to.
     """
     stored: Mapping[str, Any] = record.parameters_json
     with sound(record):
@@ -377,11 +376,7 @@ def _sources(model: Model) -> dict[str, dict[str, dict[str, str]]]:
 
 
 def check_sources(record: RevisionRecord, run: Path, catalogue: Catalogue) -> None:
-    """Refuse a revision whose effects are not at hand as they were when it was fitted.
-
-    Raises:
-        InputError: an effect is not in the catalogue, or its file has changed since.
-    """
+    """Refuse a revision whose effects are not at hand as they were when it was fitted."""
     stored = record.options.get(SOURCES, {})
     every = record.parameters_json.get(RANDOM, {}).get("effects", record.effects)
     for name in every:

@@ -91,9 +91,6 @@ def corrected_plan(
     at their corrected values, are left out; the plan says which. `reference` (n,) are the joints of
     the validation's reference pose, rad; the plan begins at `begun`, in the time of the campaign,
     s.
-
-    Raises:
-        CannotAnswerError: no point is left.
     """
     say("correcting joint values")
     of = points_of(validation, calibration.mode)

@@ -180,11 +180,7 @@ def identity(run: Path) -> str:
 
 
 def settings_of(campaign: CampaignFile) -> Settings:
-    """Return what a calibration was asked for, as it was last.
-
-    Raises:
-        InputError: the campaign is not one of a calibration.
-    """
+    """Return what a calibration was asked for, as it was last."""
     begun = ProcedureLog(campaign).last(BEGUN)
     if begun is None:
         raise _another(campaign.path)

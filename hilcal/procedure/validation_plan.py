@@ -50,9 +50,6 @@ def validation_plan(
     measured under one load, for deflections unloaded as well; of a fit to positions the unloaded
     arm is one of the loads, unless `under_load` leaves it out. `reference` (n,) are the joints of
     the pose where loads are changed, rad; that of the first reading where None.
-
-    Raises:
-        CannotAnswerError: no pose is left.
     """
     say("drawing poses within what was measured")
     loads = _loads(calibration, fitted, under_load)

@@ -503,11 +503,7 @@ def moved_to(known: Identity | None) -> Path | None:
 
 
 def rescued(connection: sqlite3.Connection, path: Path) -> Path:
-    """Write a copy of an open file that has no name any more, beside where it was.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a copy of an open file that has no name any more, beside where it was."""
     home = path.absolute().parent
     folder = home if home.is_dir() else Path(tempfile.gettempdir())
     place, k = folder / f"{path.stem}.rescued{path.suffix}", 2
@@ -522,15 +518,7 @@ def rescued(connection: sqlite3.Connection, path: Path) -> Path:
 def new_campaign(
     path: Path, about: Mapping[str, str], overwrite: bool
 ) -> Iterator[sqlite3.Connection]:
-    """Give an empty campaign to the block; the file appears when the block has filled it.
-
-    Args:
-        about: texts about the campaign, by name.
-
-    Raises:
-        InputError: as for `may_write`, or it cannot be written.
-        DeviceError: the disk is full or failed.
-    """
+    """Give an empty campaign to the block; the file appears when the block has filled it."""
     may_write(path, overwrite)
     with replacing(path) as new:
         try:

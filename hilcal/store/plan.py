@@ -26,16 +26,11 @@ REFERENCE = "reference"
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One reading to take; (pose, load, cycle) names it in the whole campaign.
-
-    Attributes:
-        load: name of the load, "none" for unloaded.
-        cycle: readings of one pose and one cycle share their unloaded reading.
-    """
+    """One reading to take; (pose, load, cycle) names it in the whole campaign."""
 
     pose: str
-    load: str
-    cycle: int = 0
+    load: str  # name of the load, "none" for unloaded
+    cycle: int = 0  # readings of one pose and one cycle share their unloaded reading
 
     def __str__(self) -> str:
         """Return the step for people."""
@@ -44,19 +39,13 @@ class Step:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan(Brief):
-    """Poses, and steps in the order in which they are taken.
+    """Poses, and steps in the order in which they are taken."""
 
-    Attributes:
-        pose_names: P distinct names.
-        q: (P, n) commanded joint angles, rad.
-        steps: distinct steps.
-        about: further keys of the file: how the plan was made, what it promises.
-    """
-
-    pose_names: tuple[str, ...]
-    q: Floats
-    steps: tuple[Step, ...]
+    pose_names: tuple[str, ...]  # P distinct names
+    q: Floats  # (P, n) commanded joint angles, rad
+    steps: tuple[Step, ...]  # distinct steps
     about: dict[str, Any] = field(default_factory=dict)
+    """Further keys of the file: how the plan was made, what it promises."""
 
     def joints(self, pose: str) -> Floats:
         """Return the (n,) joint angles of a pose by name, rad."""

@@ -40,11 +40,7 @@ def layout_of(readings: Readings) -> Layout:
 
 
 def read_layout(text: str) -> Layout:
-    """Return the fields of a record from their JSON text.
-
-    Raises:
-        ValueError: fields that no reading has.
-    """
+    """Return the fields of a record from their JSON text."""
     try:
         found = tuple((str(name), int(width)) for name, width in parse_json(text))
     except (TypeError, OverflowError) as error:

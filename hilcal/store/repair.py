@@ -17,16 +17,11 @@ from hilcal.whole_file import replace_file
 
 @dataclass(frozen=True, slots=True)
 class Repaired:
-    """What was set aside.
+    """What was set aside."""
 
-    Attributes:
-        why: what is wrong with the first of them.
-        original: the file as it was.
-    """
-
-    why: str
+    why: str  # what is wrong with the first of them
     revisions: tuple[int, ...]
-    original: Path
+    original: Path  # the file as it was
 
 
 def repair(path: Path) -> Repaired | None:

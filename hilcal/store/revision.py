@@ -43,34 +43,22 @@ def seconds_of(date: str, where: str = "date") -> float:
 
 @dataclass(frozen=True, slots=True)
 class RevisionRecord:
-    """One fit, as a campaign file keeps it; all mappings are JSON.
+    """One fit, as a campaign file keeps it; all mappings are JSON."""
 
-    Attributes:
-        effects: canonical names of the model's effects, in order.
-        added: the effect that this revision added to the one before; None for a first model.
-        options: what was chosen: scaling, kind of readings, options of the effects.
-        data_hash: `content_hash` of the readings that were fitted.
-        program_version: version of the program that fitted.
-        parameters_json: the parameters, enough to predict with the model again.
-        result_json: what `identify --json` or `diagnose --json` reported.
-        created: ISO 8601, UTC.
-        number: 1, 2, ... in one campaign; the campaign gives it.
-        removed: the effect that this revision took out of the one before.
-        parent: number of the revision that it was made from; None where that is the one before, or
-            where it was made from none.
-    """
-
-    effects: tuple[str, ...]
+    effects: tuple[str, ...]  # canonical names of the model's effects, in order
     added: str | None
-    options: Mapping[str, Any]
-    data_hash: str
-    program_version: str
-    parameters_json: Mapping[str, Any]
-    result_json: Mapping[str, Any]
-    created: str = field(default_factory=utc_now)
-    number: int = 0
-    removed: str | None = None
+    """The effect that this revision added to the one before; None for a first model."""
+    options: Mapping[str, Any]  # what was chosen: scaling, kind of readings, options of the effects
+    data_hash: str  # `content_hash` of the readings that were fitted
+    program_version: str  # version of the program that fitted
+    parameters_json: Mapping[str, Any]  # the parameters, enough to predict with the model again
+    result_json: Mapping[str, Any]  # what `identify --json` or `diagnose --json` reported
+    created: str = field(default_factory=utc_now)  # ISO 8601, UTC
+    number: int = 0  # 1, 2, ... in one campaign; the campaign gives it
+    removed: str | None = None  # the effect that this revision took out of the one before
     parent: int | None = None
+    """Number of the revision that it was made from; None where that is the one before, or where it
+    was made from none."""
 
     @property
     def cell(self) -> Changes:
@@ -124,12 +112,7 @@ def to_text(record: RevisionRecord) -> str:
 
 
 def from_text(text: str, number: int) -> RevisionRecord:
-    """Record from its JSON text.
-
-    Raises:
-        ValueError: not such a text.
-        InputError: a name in it is none.
-    """
+    """Record from its JSON text."""
     try:
         content = parse_json(text)
         content["effects"] = tuple(content["effects"])

@@ -19,14 +19,7 @@ _KINDS = (".urdf", ".toml")
 
 
 def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
-    """Return what to keep of the robot of a configuration; no model for one of the catalogue.
-
-    Args:
-        base_dir: the directory to which its relative paths refer.
-
-    Raises:
-        InputError: the file is too large.
-    """
+    """Return what to keep of the robot of a configuration; no model for one of the catalogue."""
     out: dict[str, str] = {}
     for key, name in KEYS.items():
         path = Path(base_dir) / _told(config_json, name)

@@ -54,11 +54,7 @@ def insert_meta(connection: sqlite3.Connection, key: str, value: str) -> None:
 
 
 def fetch_meta(connection: sqlite3.Connection, path: Path) -> dict[str, str]:
-    """All texts about the campaign.
-
-    Raises:
-        InputError: one is damaged.
-    """
+    """All texts about the campaign."""
     with limits.memory(str(path)):
         rows = connection.execute("SELECT key, value, crc FROM meta").fetchall()
     meta = {str(key): str(value) for key, value, _ in rows}
@@ -73,11 +69,7 @@ def fetch_names(connection: sqlite3.Connection, table: str) -> tuple[str, ...]:
 
 
 def insert_names(connection: sqlite3.Connection, table: str, names: Sequence[str]) -> Ints:
-    """Numbers of names; new ones are appended in order.
-
-    Raises:
-        InputError: a name stands for two of them, or is none.
-    """
+    """Numbers of names; new ones are appended in order."""
     if len(set(names)) != len(names):
         raise InputError(f"readings: two {table} have the same name")
     known = {name: k for k, name in enumerate(fetch_names(connection, table))}
@@ -113,11 +105,7 @@ def fetch_readings(
     target_names: Sequence[str] = (),
     observers: Sequence[ObserverName] = (),
 ) -> Readings:
-    """All readings, in order.
-
-    Raises:
-        InputError: one is missing or damaged, or a name of a pose, load or target is none.
-    """
+    """All readings, in order."""
     (count,) = connection.execute("SELECT count(*) FROM readings").fetchone()
     if not count:
         raise InputError(f"{path}: the campaign file is damaged (its readings are gone)")
@@ -174,11 +162,7 @@ def _fetched(
 
 
 def stored_json(path: Path, text: str, check: Callable[[object], None] | None = None) -> Any:
-    """Return what a stored JSON text holds, which `check` may refuse by a ValueError.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Return what a stored JSON text holds, which `check` may refuse by a ValueError."""
     try:
         with limits.memory(str(path)):
             content = parse_json(text)
@@ -190,11 +174,7 @@ def stored_json(path: Path, text: str, check: Callable[[object], None] | None = 
 
 
 def check_poses(connection: sqlite3.Connection, path: Path, readings: Readings) -> None:
-    """Refuse a pose that is commanded to other joints than in earlier readings.
-
-    Raises:
-        InputError: names the pose.
-    """
+    """Refuse a pose that is commanded to other joints than in earlier readings."""
     if len(readings) == 0:
         return
     q = readings.states.q

@@ -94,11 +94,7 @@ class RunLog:
     """
 
     def __init__(self, campaign: CampaignFile) -> None:
-        """Write to an open campaign.
-
-        Raises:
-            InputError: the campaign was not measured by a run (it has no plan).
-        """
+        """Write to an open campaign."""
         text = campaign.about(PLAN)
         if text is None:
             raise InputError(

@@ -97,12 +97,7 @@ def is_campaign(path: Path) -> bool:
 
 @contextmanager
 def sqlite_errors(path: Path) -> Iterator[None]:
-    """Turn SQLite's errors into one line.
-
-    Raises:
-        InputError: names what is wrong with the file.
-        DeviceError: the disk is full or failed.
-    """
+    """Turn SQLite's errors into one line."""
     try:
         yield
     except UnicodeEncodeError as e:
@@ -228,11 +223,7 @@ def require(connection: sqlite3.Connection, version: int) -> None:
 
 
 def check_file(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse what is not a sound campaign of a known version, and of exactly its schema.
-
-    Raises:
-        InputError: names it.
-    """
+    """Refuse what is not a sound campaign of a known version, and of exactly its schema."""
     end = time.monotonic() + _LONGEST_S
     connection.set_progress_handler(lambda: time.monotonic() > end, 100_000)
     _check_file(connection, path)

@@ -37,25 +37,15 @@ LEAST = 8
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FactoryCheck(Shown):
-    """The answer.
+    """The answer."""
 
-    Attributes:
-        changed: whether the geometry is another one than the factory measured.
-        p_value: of what of it is left, where nothing has changed.
-        moved_m: rms displacement of the target by what is left, as estimated, m.
-        moved_std_m: its standard deviation.
-        factory_m: rms misfit of the positions with the factory's kinematics alone, m.
-        nominal_m: the same with the maker's nominal ones.
-        noise_m: rms of the noise that is stated for the readings, m.
-    """
-
-    changed: bool
-    p_value: float
-    moved_m: float
-    moved_std_m: float
-    factory_m: float
-    nominal_m: float
-    noise_m: float
+    changed: bool  # whether the geometry is another one than the factory measured
+    p_value: float  # of what of it is left, where nothing has changed
+    moved_m: float  # rms displacement of the target by what is left, as estimated, m
+    moved_std_m: float  # its standard deviation
+    factory_m: float  # rms misfit of the positions with the factory's kinematics alone, m
+    nominal_m: float  # the same with the maker's nominal ones
+    noise_m: float  # rms of the noise that is stated for the readings, m
     readings: int
 
 

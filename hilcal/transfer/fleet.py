@@ -33,17 +33,11 @@ def _unseen(what: str, total: int) -> AbstractContextManager[Advance]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fleet:
-    """What is known of a fleet.
+    """What is known of a fleet."""
 
-    Attributes:
-        types: by type of arm; those that were pooled.
-        members: the campaigns that were used.
-        failures: those that were not, and types that could not be pooled.
-    """
-
-    types: tuple[Pooled, ...]
-    members: tuple[Member, ...]
-    failures: tuple[Failure, ...]
+    types: tuple[Pooled, ...]  # by type of arm; those that were pooled
+    members: tuple[Member, ...]  # the campaigns that were used
+    failures: tuple[Failure, ...]  # those that were not, and types that could not be pooled
 
     def _repr_html_(self) -> str:
         from hilcal.present.fleet import fleet_report  # notebooks alone need them

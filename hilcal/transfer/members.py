@@ -33,58 +33,36 @@ LIST = "arms.csv"
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A campaign file, and what the list beside it says.
-
-    Attributes:
-        name: its path within the directory.
-        arm: which arm; empty where that is not stated.
-        date: when it was measured, ISO 8601; empty where that is not stated.
-    """
+    """A campaign file, and what the list beside it says."""
 
     path: Path
-    name: str
-    arm: str = ""
-    date: str = ""
+    name: str  # its path within the directory
+    arm: str = ""  # which arm; empty where that is not stated
+    date: str = ""  # when it was measured, ISO 8601; empty where that is not stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Member:
-    """What a campaign taught.
+    """What a campaign taught."""
 
-    Attributes:
-        name: its path within the directory.
-        known: how that is known: "list", "serial number", "folder" or "file".
-        type: name of the arm's type.
-        date: when it was measured, ISO 8601.
-        posterior: of the arm's parameters.
-        added: effects of the arm that the diagnosis added to the baseline.
-        rms_m: 3-D position error on poses left out.
-        sizes: what it tells of the sizes of effects; None where nothing.
-    """
-
-    name: str
+    name: str  # its path within the directory
     arm: str
-    known: str
-    type: str
-    date: str
-    posterior: Posterior
-    added: tuple[str, ...]
+    known: str  # how that is known: "list", "serial number", "folder" or "file"
+    type: str  # name of the arm's type
+    date: str  # when it was measured, ISO 8601
+    posterior: Posterior  # of the arm's parameters
+    added: tuple[str, ...]  # effects of the arm that the diagnosis added to the baseline
     verdict: str
-    rms_m: float
-    sizes: SizeEvidence | None = None
+    rms_m: float  # 3-D position error on poses left out
+    sizes: SizeEvidence | None = None  # what it tells of the sizes of effects; None where nothing
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """A campaign that could not be used.
+    """A campaign that could not be used."""
 
-    Attributes:
-        name: its path within the directory.
-        reason: why, in a line.
-    """
-
-    name: str
-    reason: str
+    name: str  # its path within the directory
+    reason: str  # why, in a line
 
 
 def entries(directory: Path) -> tuple[Entry, ...]:

@@ -43,92 +43,60 @@ YEAR_S = 365.25 * 86400.0
 
 @dataclass(frozen=True, slots=True)
 class Odd:
-    """A parameter of one arm that is unlike those of the others of its type.
-
-    Attributes:
-        campaign: in which campaign, where it is a change of the arm; empty where it is the arm.
-        parameter: "effect.parameter".
-        off: by how much, SI.
-        sigma: the same in standard deviations of what the other arms let expect.
-        p_value: of that among all that were looked at.
-    """
+    """A parameter of one arm that is unlike those of the others of its type."""
 
     arm: str
-    campaign: str
-    parameter: str
-    off: float
+    campaign: str  # in which campaign, where it is a change of the arm; empty where it is the arm
+    parameter: str  # "effect.parameter"
+    off: float  # by how much, SI
     unit: str
-    sigma: float
-    p_value: float
+    sigma: float  # the same in standard deviations of what the other arms let expect
+    p_value: float  # of that among all that were looked at
 
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """One parameter of a type, SI.
+    """One parameter of a type, SI."""
 
-    Attributes:
-        parameter: "effect.parameter".
-        mean: μ of the type.
-        mean_std: its standard uncertainty.
-        between: standard deviation from arm to arm.
-        between_std: its standard error.
-        within: standard deviation from campaign to campaign of an arm; None where none was
-            measured twice.
-        per_year: β, common drift; None where no arm was measured at two times.
-        per_year_std: its standard uncertainty.
-    """
-
-    parameter: str
+    parameter: str  # "effect.parameter"
     unit: str
-    mean: float
-    mean_std: float
-    between: float
-    between_std: float
+    mean: float  # μ of the type
+    mean_std: float  # its standard uncertainty
+    between: float  # standard deviation from arm to arm
+    between_std: float  # its standard error
     within: float | None
-    per_year: float | None
-    per_year_std: float | None
+    """Standard deviation from campaign to campaign of an arm; None where none was measured
+    twice."""
+    per_year: float | None  # β, common drift; None where no arm was measured at two times
+    per_year_std: float | None  # its standard uncertainty
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosedEffect:
-    """An effect that diagnoses added.
-
-    Attributes:
-        arms: the arms that have it.
-        kind: "trait" of the type, "defect" of single arms, or "some".
-    """
+    """An effect that diagnoses added."""
 
     effect: str
-    arms: tuple[str, ...]
+    arms: tuple[str, ...]  # the arms that have it
     of: int
-    kind: str
+    kind: str  # "trait" of the type, "defect" of single arms, or "some"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pooled:
-    """What is known of arms of one type.
-
-    Attributes:
-        odd: what is unlike, the arms' first, most certain first.
-        seen: effects that diagnoses added, most frequent first.
-        wear: parameters whose common drift is certain.
-        prior: what to expect of another arm.
-        off: (A, K) each arm's parameters minus the mean of the type, SI.
-        off_std: (A, K) their standard uncertainties; infinite where an arm did not determine one.
-        sizes: of the effects of the type, by their names.
-    """
+    """What is known of arms of one type."""
 
     type: str
     arms: tuple[str, ...]
     campaigns: tuple[str, ...]
     parameters: tuple[Spread, ...]
-    odd: tuple[Odd, ...]
-    seen: tuple[DiagnosedEffect, ...]
-    wear: tuple[str, ...]
-    prior: Posterior
-    off: Floats
+    odd: tuple[Odd, ...]  # what is unlike, the arms' first, most certain first
+    seen: tuple[DiagnosedEffect, ...]  # effects that diagnoses added, most frequent first
+    wear: tuple[str, ...]  # parameters whose common drift is certain
+    prior: Posterior  # what to expect of another arm
+    off: Floats  # (A, K) each arm's parameters minus the mean of the type, SI
     off_std: Floats
-    sizes: tuple[TypeSize, ...]
+    """(A, K) their standard uncertainties; infinite where an arm did not determine one."""
+    sizes: tuple[TypeSize, ...]  # of the effects of the type, by their names
 
     @property
     def distance(self) -> Floats:

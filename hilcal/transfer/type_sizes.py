@@ -35,34 +35,21 @@ WIDTH = 1.96
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeEvidence:
-    """What a campaign tells of the sizes of E effects.
+    """What a campaign tells of the sizes of E effects."""
 
-    Attributes:
-        effects: their names.
-        information: (E, E) Bᵀ J B.
-        vector: (E,) Bᵀ (j − J mean).
-    """
-
-    effects: tuple[str, ...]
-    information: Floats
-    vector: Floats
+    effects: tuple[str, ...]  # their names
+    information: Floats  # (E, E) Bᵀ J B
+    vector: Floats  # (E,) Bᵀ (j − J mean)
 
 
 @dataclass(frozen=True, slots=True)
 class TypeSize:
-    """The size of an effect on arms of a type, divided by that on other arms.
+    """The size of an effect on arms of a type, divided by that on other arms."""
 
-    Attributes:
-        effect: its name.
-        factor: the size.
-        low: lower end of its 95 % interval.
-        high: upper end.
-    """
-
-    effect: str
-    factor: float
-    low: float
-    high: float
+    effect: str  # its name
+    factor: float  # the size
+    low: float  # lower end of its 95 % interval
+    high: float  # upper end
 
     @property
     def differs(self) -> bool:
@@ -71,12 +58,7 @@ class TypeSize:
 
 
 def size_evidence(start: Model, found: Fit) -> SizeEvidence | None:
-    """Return what the readings of a fit tell; None where they do not determine its frames.
-
-    Args:
-        start: frames, and effects that have to be in the model.
-        found: a fit of all readings. Of many, whole poses are taken from all over the campaign.
-    """
+    """Return what the readings of a fit tell; None where they do not determine its frames."""
     kept = found.readings[~found.outlier].as_stated()
     poses = np.unique(kept.pose)
     most = max(2, int(len(poses) * MOST_ROWS / (len(kept) * kept.m)))
@@ -90,12 +72,7 @@ def size_evidence(start: Model, found: Fit) -> SizeEvidence | None:
 
 
 def evidence_of(of: Variances, ordinary: dict[str, float]) -> SizeEvidence:
-    """Return what estimated variances tell.
-
-    Args:
-        of: the variances.
-        ordinary: factors of the cell, which were in their priors.
-    """
+    """Return what estimated variances tell."""
     problem, x = of.equations.problem, of.log_std
     mean, precision = problem.log_std_prior
     families = [f for f in problem.families.random if not f.known]

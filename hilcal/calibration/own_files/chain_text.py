@@ -40,50 +40,29 @@ Edits = list[tuple[Span, str]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChainPlace:
-    """One place of a chain.
+    """One place of a chain."""
 
-    Attributes:
-        name: of the element, for people.
-        line: of it, from 1.
-        place: (4, 4) in the frame before it.
-        joint: (4, 4) where the axis is behind it, z along the axis; None where nothing turns.
-        write: edits that give it another place; raises `InputError` where it cannot have one.
-    """
-
-    name: str
-    line: int
-    place: Floats
+    name: str  # of the element, for people
+    line: int  # of it, from 1
+    place: Floats  # (4, 4) in the frame before it
     joint: Floats | None
+    """(4, 4) where the axis is behind it, z along the axis; None where nothing turns."""
     write: Callable[[Floats], Edits]
+    """Edits that give it another place; raises `InputError` where it cannot have one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Redrawn:
-    """A chain with a corrected arm.
+    """A chain with a corrected arm."""
 
-    Attributes:
-        places: (4, 4) the new place of each step.
-        tip: (4, 4) from the flange of the arm to the tip of the file.
-        lost: (4, 4) what the file has no place for, behind its last joint.
-        rough: by how much its axes lay elsewhere than those of the nominal arm, m.
-    """
-
-    places: tuple[Floats, ...]
-    tip: Floats
-    lost: Floats
-    rough: float
+    places: tuple[Floats, ...]  # (4, 4) the new place of each step
+    tip: Floats  # (4, 4) from the flange of the arm to the tip of the file
+    lost: Floats  # (4, 4) what the file has no place for, behind its last joint
+    rough: float  # by how much its axes lay elsewhere than those of the nominal arm, m
 
 
 def redrawn(steps: Sequence[ChainPlace], nominal: Arm, arm: Arm, file: str) -> Redrawn:
-    """Return the places that a corrected arm has in a file.
-
-    Args:
-        steps: of the file, base to tip.
-        nominal: the arm that the campaign began with.
-
-    Raises:
-        InputError: the file is of another arm; says which axis lies elsewhere.
-    """
+    """Return the places that a corrected arm has in a file."""
     turning = [k for k, s in enumerate(steps) if s.joint is not None]
     if len(turning) != arm.n:
         names = ", ".join(escaped(steps[k].name) for k in turning)
@@ -181,11 +160,7 @@ def _other_zero(link: Floats, before: Floats, drawn: Floats) -> Floats:
 
 
 def edits_of(steps: Sequence[ChainPlace], places: Sequence[Floats]) -> tuple[Edits, list[str]]:
-    """Edits of all steps that move, and the names of these.
-
-    Raises:
-        InputError: a place cannot be written; names the line.
-    """
+    """Edits of all steps that move, and the names of these."""
     out: Edits = []
     names = []
     for step, place in zip(steps, places, strict=True):

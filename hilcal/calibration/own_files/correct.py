@@ -26,14 +26,10 @@ _DELTA = re.compile(r"^(\s*delta_(theta|a|d|alpha)\s*=\s*\[)([^\]\n]*)(\].*)$", 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A file with another arm in it.
-
-    Attributes:
-        said: what was changed, and what the file has no place for.
-    """
+    """A file with another arm in it."""
 
     content: bytes
-    said: str
+    said: str  # what was changed, and what the file has no place for
 
 
 def correct_file(

@@ -23,15 +23,7 @@ _TURNS = {"quat": 4, "axisangle": 4, "euler": 3, "xyaxes": 6, "zaxis": 3}
 
 
 def mjcf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
-    """Return the steps from a base body to a tip, a body or a site.
-
-    Args:
-        base: name of the body; the one that carries the first hinge where None.
-        tip: name of a body or a site; the last body with a hinge where None.
-
-    Raises:
-        InputError: no such chain, or one that cannot be read.
-    """
+    """Return the steps from a base body to a tip, a body or a site."""
     world = document.root.first("worldbody")
     if world is None:
         raise InputError(f"{document.name}: no <worldbody>; valid: an MJCF with the arm in it")

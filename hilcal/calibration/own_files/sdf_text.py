@@ -26,13 +26,9 @@ MODEL = "__model__"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SdfChain:
-    """A chain of an SDF, and how it is written.
+    """A chain of an SDF, and how it is written."""
 
-    Attributes:
-        steps: from the base link to the tip link; their `write` is that of `edits`.
-    """
-
-    steps: list[ChainPlace]
+    steps: list[ChainPlace]  # from the base link to the tip link; their `write` is that of `edits`
     document: Document
     joints: list[Node]
     model: "_Model"
@@ -156,15 +152,7 @@ class _Model:
 
 
 def sdf_chain(document: Document, base: str | None, tip: str | None) -> SdfChain:
-    """Return the chain from a base link to a tip link.
-
-    Args:
-        base: name of the link; the first one where None.
-        tip: name of the link; the only one behind the turning joints where None.
-
-    Raises:
-        InputError: no such chain, or one that cannot be read.
-    """
+    """Return the chain from a base link to a tip link."""
     models = list(document.root.every("model"))
     if not models:
         raise InputError(f"{document.name}: no <model>; valid: an SDF with the arm")

@@ -24,15 +24,7 @@ _TURNING, _FIXED = ("revolute", "continuous"), "fixed"
 
 
 def urdf_steps(document: Document, base: str | None, tip: str | None) -> list[ChainPlace]:
-    """Return the steps from a base link to a tip link.
-
-    Args:
-        base: name of the link, without what a xacro puts before it; the root link where None.
-        tip: the same of the last one; the only leaf behind the last joint where None.
-
-    Raises:
-        InputError: no such chain.
-    """
+    """Return the steps from a base link to a tip link."""
     parents: dict[str, tuple[str, Node]] = {}
     for joint in document.root.every("joint"):
         ends = [joint.first(tag) for tag in ("parent", "child")]

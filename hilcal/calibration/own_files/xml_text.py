@@ -21,26 +21,16 @@ _TAG = re.compile(r"<(?:\"[^\"]*\"|'[^']*'|[^<>\"'])*>")
 
 @dataclass(slots=True, eq=False)
 class Node:
-    """An element.
-
-    Attributes:
-        attributes: by name, as written.
-        line: from 1.
-        begin: where its start tag begins.
-        end: where its start tag ends.
-        close: where its end tag begins.
-        parent: None for the root.
-        children: in the order of the text.
-    """
+    """An element."""
 
     tag: str
-    attributes: dict[str, str]
-    line: int
-    begin: int
-    end: int
-    close: int = 0
-    parent: "Node | None" = None
-    children: list["Node"] = field(default_factory=list)
+    attributes: dict[str, str]  # by name, as written
+    line: int  # from 1
+    begin: int  # where its start tag begins
+    end: int  # where its start tag ends
+    close: int = 0  # where its end tag begins
+    parent: "Node | None" = None  # None for the root
+    children: list["Node"] = field(default_factory=list)  # in the order of the text
 
     def first(self, tag: str) -> "Node | None":
         """Return the first child of a name."""
@@ -56,14 +46,10 @@ class Node:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Document:
-    """A file.
-
-    Attributes:
-        text: with one character per byte.
-    """
+    """A file."""
 
     name: str
-    text: str
+    text: str  # with one character per byte
     root: Node
 
     def attribute(self, node: Node, name: str) -> Span | None:
@@ -83,11 +69,7 @@ class Document:
         return Span(0, begin, begin), f' {name}="{value}"'
 
     def numbers(self, node: Node, text: str, count: int) -> Floats:
-        """Return the numbers of an attribute or a text.
-
-        Raises:
-            InputError: others than that many.
-        """
+        """Return the numbers of an attribute or a text."""
         try:
             values = np.array([float(word) for word in text.split()])
         except ValueError:
@@ -100,11 +82,7 @@ class Document:
         return values
 
     def direction(self, node: Node, values: Floats) -> Floats:
-        """Return a vector of length 1.
-
-        Raises:
-            InputError: it has no direction.
-        """
+        """Return a vector of length 1."""
         size = float(np.linalg.norm(values))
         if size < SMALLEST:
             raise InputError(
@@ -114,11 +92,7 @@ class Document:
 
 
 def read_xml(path: Path) -> Document:
-    """Read a file.
-
-    Raises:
-        InputError: it is no XML, or has entities of its own.
-    """
+    """Read a file."""
     try:
         raw = limits.read_bytes(path, limits.PROGRAM)
     except OSError as error:

@@ -75,11 +75,7 @@ def read_ls(path: Path, frames_file: Path | None, tool: Floats | None) -> Progra
     """Read a program.
 
     Args:
-        frames_file: TOML with tools, user frames and turn axes; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
     known = controller_frames(frames_file, LS, tool)

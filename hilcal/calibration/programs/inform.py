@@ -62,11 +62,7 @@ def read_jbi(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     """Read a job.
 
     Args:
-        frames_file: TOML with tools, user frames, pulses per degree; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
     known = controller_frames(frames_file, INFORM, tool)

@@ -109,12 +109,7 @@ def read_krl(path: Path, frames_file: Path | None, tool: Floats | None) -> Progr
     """Read a `.src` file with the `.dat` file beside it.
 
     Args:
-        path: of the `.src` file.
-        frames_file: TOML, or the controller's `$config.dat`; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
     """
     beside = next(
         (

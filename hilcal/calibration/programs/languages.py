@@ -49,20 +49,13 @@ READERS: Mapping[str, Callable[[Path, Path | None, Floats | None], Program]] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UnderstoodProgram:
-    """A program with N points that are understood.
+    """A program with N points that are understood."""
 
-    Attributes:
-        program: the program; what is not understood of it is left.
-        q: (N, 6) joint values at which it is at them, rad.
-        tool: (4, 4) T_flange_tool that errors are stated for.
-        said: what is to be said of their branches.
-    """
-
-    program: Program
+    program: Program  # the program; what is not understood of it is left
     arm: Arm
-    q: Floats
-    tool: Floats
-    said: tuple[str, ...]
+    q: Floats  # (N, 6) joint values at which it is at them, rad
+    tool: Floats  # (4, 4) T_flange_tool that errors are stated for
+    said: tuple[str, ...]  # what is to be said of their branches
 
     @property
     def points(self) -> Points:

@@ -47,41 +47,29 @@ class Span:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProgramPoint:
-    """One point of a program, in the order of its first use.
+    """One point of a program, in the order of its first use."""
 
-    Attributes:
-        line: of its numbers, from 1.
-        name: for people, with its line.
-        numbers: where its numbers stand: joint values, or those of a pose.
-        values: (k,) these as written.
-        joints: whether they are joint values.
-        scale: (6,) what the language counts joint values in, per rad.
-        frame: (4, 4) T_base_frame that a pose counts from.
-        tool: (4, 4) T_flange_tool.
-        flags: the configuration as `Language.flags` has it; −99 where it is not stated.
-        config: where what of it may change stands; empty where it cannot.
-        obeyed: whether the controller takes the configuration that is stated; it goes on from the
-            point before otherwise.
-        made: text of the whole span `numbers[0]`, with places for the numbers and the changeable
-            configuration, where the point is computed in the program (`Offs(p, …)`); else "".
-        left: why it is left as it is; empty where it is understood.
-        blend_m: 0, since only URScript states it at the point.
-    """
-
-    line: int
-    name: str
-    numbers: tuple[Span, ...] = ()
-    values: Floats = field(default_factory=lambda: np.empty(0))
-    joints: bool = False
+    line: int  # of its numbers, from 1
+    name: str  # for people, with its line
+    numbers: tuple[Span, ...] = ()  # where its numbers stand: joint values, or those of a pose
+    values: Floats = field(default_factory=lambda: np.empty(0))  # (k,) these as written
+    joints: bool = False  # whether they are joint values
     scale: Floats = field(default_factory=lambda: np.full(JOINTS, np.degrees(1.0)))
+    """(6,) what the language counts joint values in, per rad."""
     frame: Floats = field(default_factory=lambda: np.eye(4))
-    tool: Floats = field(default_factory=lambda: np.eye(4))
+    """(4, 4) T_base_frame that a pose counts from."""
+    tool: Floats = field(default_factory=lambda: np.eye(4))  # (4, 4) T_flange_tool
     flags: tuple[int, ...] = ()
-    config: tuple[Span, ...] = ()
+    """The configuration as `Language.flags` has it; −99 where it is not stated."""
+    config: tuple[Span, ...] = ()  # where what of it may change stands; empty where it cannot
     obeyed: bool = True
+    """Whether the controller takes the configuration that is stated; it goes on from the point
+    before otherwise."""
     made: str = ""
-    left: str = ""
-    blend_m: float = 0.0
+    """Text of the whole span `numbers[0]`, with places for the numbers and the changeable
+    configuration, where the point is computed in the program (`Offs(p, …)`); else ""."""
+    left: str = ""  # why it is left as it is; empty where it is understood
+    blend_m: float = 0.0  # 0, since only URScript states it at the point
 
 
 UNSTATED = -99
@@ -90,12 +78,7 @@ UNSTATED = -99
 def used_again(
     old: ProgramPoint | None, new: ProgramPoint, line: int, what: str, obeyed: bool = False
 ) -> ProgramPoint:
-    """Return a point that a further motion, in a line, moves to: left where its frames differ.
-
-    Args:
-        what: the maker's word for the frame that it counts from.
-        obeyed: whether this motion takes the configuration that is stated.
-    """
+    """Return a point that a further motion, in a line, moves to: left where its frames differ."""
     if old is None or new.left:
         return new if old is None or not old.left else old
     if old.left:
@@ -107,44 +90,34 @@ def used_again(
 
 @dataclass(frozen=True, slots=True)
 class Language:
-    """How a maker writes points.
-
-    Attributes:
-        pose: T (4, 4) of the numbers of a pose.
-        numbers: the numbers of T (4, 4), near to those that were there.
-        decimals: of a position in mm, of the orientation, of joint values; at least these.
-        axes: (6, 3) directions of the axes of the maker's arms with spherical wrist, all joint
-            values zero, in axes of the controller's base.
-        flags: (K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there.
-        of_shape: (F,) which of these the shape of the arm tells, and not the joint values alone.
-        written: what stands at `ProgramPoint.config`, from the flags and the texts that are there.
-        padded: whether numbers stand in columns.
-    """
+    """How a maker writes points."""
 
     name: str
-    pose: Callable[[Floats], Floats]
+    pose: Callable[[Floats], Floats]  # T (4, 4) of the numbers of a pose
     numbers: Callable[[Floats, Floats], Floats]
+    """The numbers of T (4, 4), near to those that were there."""
     decimals: tuple[int, int, int]
+    """Of a position in mm, of the orientation, of joint values; at least these."""
     axes: tuple[tuple[int, int, int], ...]
+    """(6, 3) directions of the axes of the maker's arms with spherical wrist, all joint values
+    zero, in axes of the controller's base."""
     flags: Callable[[Floats, Ints], Ints]
+    """(K, F) configuration at joint values (K, 6), by the `languages.shape` (K, 2) there."""
     of_shape: tuple[bool, ...]
+    """(F,) which of these the shape of the arm tells, and not the joint values alone."""
     written: Callable[[Ints, Sequence[str]], list[str]]
-    padded: bool = False
+    """What stands at `ProgramPoint.config`, from the flags and the texts that are there."""
+    padded: bool = False  # whether numbers stand in columns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Program:
-    """A program.
-
-    Attributes:
-        texts: of its files, as they are.
-        points: in the order of their first use.
-    """
+    """A program."""
 
     language: Language
     suffixes: tuple[str, ...]
-    texts: tuple[str, ...]
-    points: tuple[ProgramPoint, ...]
+    texts: tuple[str, ...]  # of its files, as they are
+    points: tuple[ProgramPoint, ...]  # in the order of their first use
     encoding: str = "utf-8"
 
     @property
@@ -289,21 +262,17 @@ class _FramesFile(Section):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ControllerFrames:
-    """What the controller keeps apart from programs.
-
-    Attributes:
-        tools: (4, 4) T_flange_tool by number or name.
-        bases: (4, 4) T_base_frame by number or name.
-        pulses: (6,) pulses per rad; None where they are not given.
-        turn_axes: axes that the three turn numbers of a Fanuc are of, `$SCR_GRP[1].$TURN_AXIS`.
-        tool: (4, 4) of tools that are not in `tools`, from --tool; None without it.
-    """
+    """What the controller keeps apart from programs."""
 
     tools: Mapping[str, Floats] = field(default_factory=dict)
+    """(4, 4) T_flange_tool by number or name."""
     bases: Mapping[str, Floats] = field(default_factory=dict)
-    pulses: Floats | None = None
+    """(4, 4) T_base_frame by number or name."""
+    pulses: Floats | None = None  # (6,) pulses per rad; None where they are not given
     turn_axes: tuple[int, ...] | None = None
+    """Axes that the three turn numbers of a Fanuc are of, `$SCR_GRP[1].$TURN_AXIS`."""
     tool: Floats | None = None
+    """(4, 4) of tools that are not in `tools`, from --tool; None without it."""
 
 
 def controller_frames(
@@ -313,10 +282,6 @@ def controller_frames(
 
     Args:
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-        count: how many numbers a pose of the maker has.
-
-    Raises:
-        InputError: it is no TOML file, or cannot be used.
     """
     if path is None:
         return ControllerFrames(tool=tool)

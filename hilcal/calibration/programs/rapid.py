@@ -118,11 +118,7 @@ def read_rapid(path: Path, frames_file: Path | None, tool: Floats | None) -> Pro
     """Read a module.
 
     Args:
-        frames_file: TOML, or a module with tooldata and wobjdata; None where there is none.
         tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-
-    Raises:
-        InputError: it cannot be read, or something could change what its points mean.
     """
     text, encoding = read_text(path)
     module = frames_file is not None and frames_file.suffix.lower() != ".toml"
