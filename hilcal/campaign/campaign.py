@@ -56,7 +56,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import typed_now
 from hilcal.store.overview import overview
 from hilcal.store.purpose import refuse_fitting
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.store.revision import CELL, STORED, RevisionRecord
 from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.run_log import PLAN, RunLog

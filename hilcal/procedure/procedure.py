@@ -72,7 +72,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, read_plan
 from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
 from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 

@@ -8,7 +8,7 @@ from hilcal.config import CellConfig
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import load_arm
 from hilcal.store import schema
-from hilcal.store.campaign_file import ACCEPTED, CampaignFile
+from hilcal.store.campaign_file import ACCEPTED, CampaignFile, free_place
 from hilcal.store.procedure_log import ENTRY, ProcedureLog
 from hilcal.store.robot_file import ROBOT_FILE, text_of
 from hilcal.store.rows import insert_meta
@@ -43,7 +43,7 @@ def repair(path: Path) -> Repaired | None:
             return None
         first, why = bad
         with file.transaction() as connection:
-            original = _free(path)
+            original = free_place(path.parent, f"{path.name}.original")
             replace_file(original, connection.serialize(), must_be_new=True)
             found = connection.execute(
                 "SELECT id FROM revisions WHERE id >= ? OR id < 1 ORDER BY id", (first,)
@@ -98,10 +98,3 @@ def _delete(
     connection.executemany(delete, [(value,) for value in values])
     connection.execute(made)
 
-
-def _free(path: Path) -> Path:
-    """Return a name for the file as it was."""
-    found, k = path.with_name(f"{path.name}.original"), 2
-    while found.exists():
-        found, k = path.with_name(f"{path.name}.original-{k}"), k + 1
-    return found

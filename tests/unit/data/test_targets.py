@@ -13,7 +13,7 @@ from hilcal.errors import InputError
 from hilcal.readings.covariance import TrackerNoise
 from hilcal.readings.readings import Readings, States
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import cell_of
 

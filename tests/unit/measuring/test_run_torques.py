@@ -10,7 +10,7 @@ from hilcal.errors import InputError
 from hilcal.identification.torques import check_torques, require_torques
 from hilcal.measuring.progress import Remark
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.fake_bench import Bench
 from tests.support.fake_devices import TORQUE
