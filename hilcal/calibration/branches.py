@@ -40,9 +40,7 @@ def doubts(
     """Say why the branch of a waypoint is not certain; empty where it is.
 
     Args:
-        arm: of six joints, as those of UR.
         tool: (4, 4) T_flange_tool.
-        waypoints: N that are understood.
         q: (N, 6) joint values at which the nominal arm has the tool there, rad.
         near: (6,) joint values that the first waypoint is near to; None where none are given.
     """

@@ -48,11 +48,7 @@ class Budget:
 
 
 def budget(fit: Fit) -> Budget:
-    """Return the uncertainty of what a fit predicts at poses like its own that it has not seen.
-
-    Raises:
-        InputError: a fit of another scaling than gc.
-    """
+    """Return the uncertainty of what a fit predicts at poses like its own that it has not seen."""
     if fit.scaling != "gc":
         raise InputError(f"an uncertainty budget needs scaling gc, this fit has {fit.scaling}")
     used, cell = fit.readings[~fit.outlier], fit.model.cell

@@ -55,11 +55,7 @@ class ToolPoses:
 
     @property
     def std_m(self) -> Floats:
-        """(N,) standard deviation of the position, over three dimensions, m.
-
-        Raises:
-            InputError: it was left out.
-        """
+        """(N,) standard deviation of the position, over three dimensions, m."""
         return np.asarray(np.sqrt(np.trace(self._known(), axis1=1, axis2=2)))
 
     @property
@@ -68,9 +64,6 @@ class ToolPoses:
 
         Of a normal error with covariance Σ, |e|² ≈ g χ²_ν with the same mean and variance:
         g = tr Σ²/tr Σ, ν = (tr Σ)²/tr Σ² (Satterthwaite, Biometrics Bulletin 2 (1946) 110-114).
-
-        Raises:
-            InputError: the uncertainty was left out.
         """
         return band(self._known())
 
@@ -94,7 +87,7 @@ def band(covariance: Floats) -> Floats:
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Joint values that put the tool where it was asked to be; the rest is computed when asked for."""
+    """Joint values that put the tool where it was asked to be, and what follows from them."""
 
     inverse: Inverse  # joint values, and what is left
     _calibration: "Calibration"

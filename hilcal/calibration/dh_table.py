@@ -66,11 +66,7 @@ def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
     """Return the table of an arm.
 
     Args:
-        arm: without couplings.
         convention: "standard" (classic) or "modified" (Craig) rows.
-
-    Raises:
-        InputError: joints of the arm are coupled.
     """
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which a DH table cannot hold")

@@ -64,12 +64,7 @@ def corrected(calibration: Calibration) -> Corrected:
 
 
 def urdf(arm: Arm, note: str = "") -> str:
-    """Return an arm as URDF: links base_link, link_1 ..., tool0.
-
-    Args:
-        arm: without couplings.
-        note: stands in a comment at the top.
-    """
+    """Return an arm as URDF: links base_link, link_1 ..., tool0."""
     root = Element("robot", name=escaped(arm.name))
     SubElement(root, "link", name="base_link")
     links = ["base_link", *(f"link_{k}" for k in range(1, arm.n + 1)), "tool0"]
@@ -99,10 +94,6 @@ def matlab(arm: Arm, name: str, note: str = "") -> str:
     """Return a MATLAB function that builds an arm as a `rigidBodyTree` (Robotics System Toolbox).
 
     Bodies base, link_1 …, tool0; each joint turns about z of its fixed transform.
-
-    Args:
-        arm: without couplings.
-        note: stands in a comment at the top.
     """
     out = [f"function robot = {name}()"]
     out += [f"% {escaped(line)}" for line in note.split("\n")]
@@ -149,13 +140,8 @@ def ur_kinematics(
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
     Args:
-        nominal: the arm of the catalogue.
-        note: stands in a comment at the top.
         digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
             an error where the file has another. One of the file's content where None.
-
-    Raises:
-        InputError: it is no UR arm, or the digest is none.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")

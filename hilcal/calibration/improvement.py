@@ -152,14 +152,11 @@ def improvement(
     """Compare readings of the same points at uncorrected and at corrected joint values.
 
     Args:
-        calibration: by which the points were corrected.
-        p: what its fit knows of readings that it has not seen.
         before: readings at the uncorrected joint values; for deflections with the unloaded readings
             of the points.
         after: the same at the corrected ones, with the same poses, in the same order.
         goal: (M,) states of `before` that say where the tool was asked to be: where the nominal arm
             has it at their joint values; for deflections not used.
-        left_out: points that are missing in both, with the reason.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)

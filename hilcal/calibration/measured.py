@@ -53,9 +53,8 @@ class Measured:
         """Return where fitted states lie.
 
         Args:
-            p: what the fit knows of others.
-            noise: (D,) trace of the position's covariance of each measurement, by noise and
-                misfit, m².
+            noise: (D,) trace of the position's covariance of each measurement, by noise and misfit,
+                m².
             units: (n,) of the joints' values.
         """
         spread = noise * p.leverage / (1 - p.leverage)
@@ -71,7 +70,6 @@ class Measured:
         """Return what points leave, by variable.
 
         Args:
-            states: N points.
             std_m: (N,) standard deviation of the predictions; None where it is not known.
             turns: (n,) joints that are the same whole turns on.
         """

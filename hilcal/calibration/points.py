@@ -93,12 +93,7 @@ def read_points(
     """Read a table of points.
 
     Args:
-        path: any kind of table that `import` reads.
         loads: (6,) wrench by the name of the load.
-        mapping: what its columns hold, where they are not called as above.
-
-    Raises:
-        InputError: no such file, an unknown column, an incomplete group, an unknown load.
     """
     table, taken = (None, "") if mapping is not None else _plain(path, arm)
     if table is None:
@@ -157,9 +152,6 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
     Args:
         tool: (4, 4) T_flange_tool.
         near: (n,) joint values that the first point is near to, rad.
-
-    Raises:
-        InputError: no joint values to begin with, or a pose that the arm does not reach.
     """
     if points.wanted is None:
         return points.q
@@ -184,7 +176,6 @@ def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floa
     """Return joint values (K, n) at which the nominal arm has the tool at a pose.
 
     Args:
-        arm: the arm; each joint turns by itself.
         tool: (4, 4) T_flange_tool.
         near: (K, n) joint values to search from, rad; all over the range of the joints where None.
         goal: (4, 4) T_base_tool.

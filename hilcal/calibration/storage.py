@@ -53,22 +53,14 @@ _CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity", "registrati
 
 
 def write(c: Calibration, path: Path) -> None:
-    """Write a calibration to a file.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a calibration to a file."""
     content = json.dumps(to_json(c), indent=1, allow_nan=False)
     replace_file(path, content + "\n")
 
 
 @limits.bounded
 def read(path: Path, catalogue: Catalogue | None = None) -> Calibration:
-    """Read a calibration from a file.
-
-    Raises:
-        InputError: see `from_json`; or the file cannot be read.
-    """
+    """Read a calibration from a file."""
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
@@ -129,11 +121,7 @@ def to_json(c: Calibration) -> dict[str, object]:
 
 
 def from_json(content: Mapping[str, Any], catalogue: Catalogue | None = None) -> Calibration:
-    """Return the calibration that `to_json` wrote.
-
-    Raises:
-        InputError: another kind of document, a newer version, or an effect that is not at hand.
-    """
+    """Return the calibration that `to_json` wrote."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'no calibration; valid: a JSON document with "format": "{FORMAT}"')
     if content["version"] not in (BY_FACTOR, VERSION):

@@ -15,9 +15,6 @@ def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibr
 
     The limit of the standard deviation, beyond which a point is far from all fitted ones, is that
     of the sample, scaled to the number of readings of the stream.
-
-    Args:
-        source: what it is from, for people.
     """
     of_sample = Calibration.of(found.sample, source)
     values, vectors = np.linalg.eigh(found.covariance)

@@ -102,11 +102,7 @@ class Waypoint:
 
 
 def waypoints(program: str) -> tuple[Waypoint, ...]:
-    """Find the waypoints of a program, in the order of its text.
-
-    Raises:
-        InputError: there are none, or something that could change what they mean; names the line.
-    """
+    """Find the waypoints of a program, in the order of its text."""
     try:
         found = _waypoints(_Program.of(statements(program)))
     except RecursionError:
@@ -119,14 +115,7 @@ def waypoints(program: str) -> tuple[Waypoint, ...]:
 def program_points(
     path: Path, leave: bool = False
 ) -> tuple[str, tuple[Waypoint, ...], Points, Floats | None]:
-    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool.
-
-    Args:
-        leave: keep waypoints that are not understood as they are.
-
-    Raises:
-        InputError: see `waypoints`; or a waypoint that is not understood.
-    """
+    """Read a program: its text, its waypoints, the understood ones as points, and T_flange_tool."""
     try:
         # ends of lines stay as they are
         program = limits.read_bytes(path, limits.SCRIPT).decode("utf-8-sig")

@@ -63,11 +63,7 @@ class Statement:
 
 
 def statements(program: str) -> tuple[Statement, ...]:
-    """Parse a program.
-
-    Raises:
-        InputError: names the line that is not understood.
-    """
+    """Parse a program."""
     out: list[Statement] = []
     open_blocks: list[tuple[str, int]] = []
     at = made = 0

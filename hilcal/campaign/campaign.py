@@ -55,10 +55,10 @@ from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import typed_now
 from hilcal.store.overview import overview
-from hilcal.store.purpose import refuse_fitting
-from hilcal.store.rows import content_hash
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import CELL, STORED, RevisionRecord
 from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
+from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table
 from hilcal.types import Floats
@@ -501,7 +501,7 @@ class Campaign(Brief):
 
         Raises:
             InputError: it was fitted to other readings than those of this campaign, or these are
-                of a validation campaign (`store.purpose`).
+                of a validation campaign (`store.procedure_log`).
         """
         return self.file.append_revision(self.record(found, diagnosis, added, removed, parent))
 
@@ -608,11 +608,7 @@ def _named_from(fits: Sequence[Fit]) -> Sequence[Fit]:
 
 
 def estimated_noise(file: CampaignFile) -> NoiseEstimate | None:
-    """Return the noise as it was estimated at import, or after measuring; None where it is stated.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Return the noise as estimated at import, or after measuring; None where it is stated."""
     if file.about(PLAN) is None:
         return NoiseEstimate.from_json(file.about(NOISE))
     told = RunLog(file).last(NOISE)

@@ -51,10 +51,8 @@ def add_effect(
     """Add an effect to a revision's model, and store the fit as a revision that comes from it.
 
     Args:
-        o: the campaign.
         number: of the revision; None where there is none yet: `before` then becomes one, too, when
             the effect could be added.
-        judged: the diagnosis of `before`, which is kept with it.
 
     Raises:
         InputError: an effect that the model has already, or that these readings do not allow.
@@ -153,10 +151,7 @@ def change_cell(
     """Fit a revision's model in a changed cell, and store the fit as a revision that says so.
 
     Args:
-        o: the campaign, in the cell of the revision.
         number: of the revision; None where there is none yet: `before` then becomes one, too.
-        changes: as for `Campaign.with_cell`.
-        judged: the diagnosis of `before`, which is kept with it.
 
     Returns:
         The campaign in the changed cell, number and diagnosis of the new revision.

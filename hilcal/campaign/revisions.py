@@ -27,8 +27,8 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.command_line import COMMAND
-from hilcal.store.rows import content_hash
 from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
+from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
 _LARGEST = 1e9
@@ -58,8 +58,6 @@ def to_record(
         diagnosis: its document, see `present.diagnosis_document`, where it was diagnosed.
         added: the effect that made it from the revision before; without any change a new chain
             starts.
-        data_hash: `content_hash` of its readings.
-        removed: the effect that was taken out of the revision before.
         parent: number of the revision that it was made from, where that is not the one before.
     """
     effects, cell = found.model.effects, found.model.cell
@@ -144,12 +142,7 @@ def restore(
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
     Args:
-        cell: the cell of the campaign's configuration.
-        catalogue: has its effects; the installed ones unless given.
         stored: hash of the readings as the file stores them, where there is a file.
-
-    Raises:
-        InputError: readings were appended since, or the record is of another model.
     """
     if not _fitted_to(record, readings, stored):
         raise InputError(
@@ -189,11 +182,7 @@ def _fitted_to(record: RevisionRecord, readings: Readings, stored: str | None) -
 
 @contextmanager
 def sound(record: RevisionRecord) -> Iterator[None]:
-    """Say that a revision is damaged where its entries are not what this program stores.
-
-    Raises:
-        InputError: names the revision.
-    """
+    """Say that a revision is damaged where its entries are not what this program stores."""
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as error:
@@ -214,16 +203,7 @@ def _prior(record: RevisionRecord) -> Floats:
 def restore_model(
     record: RevisionRecord, cell: Cell, readings: Readings, catalogue: Catalogue | None = None
 ) -> tuple[Model, Floats]:
-    """Model and parameters (P,) of a revision, in the cell as it was registered then.
-
-    Args:
-        cell: the cell of the campaign's configuration.
-        readings: the readings that it was fitted to.
-        catalogue: has its effects; the installed ones unless given.
-
-    Raises:
-        InputError: the parameters are not those of the model.
-    """
+    """Model and parameters (P,) of a revision, in the cell as it was registered then."""
     with sound(record):
         return _restored(record, cell, readings, catalogue)
 

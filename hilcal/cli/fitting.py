@@ -58,7 +58,7 @@ from hilcal.present.registration import covariance_words, other_arm_line, torque
 from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
-from hilcal.store.purpose import purpose_of, refuse_fitting, release
+from hilcal.store.procedure_log import purpose_of, refuse_fitting, release
 from hilcal.stream.fit import fit_stream
 from hilcal.stream.fit import to_json as stream_json
 from hilcal.tables.files import is_parquet

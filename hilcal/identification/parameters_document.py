@@ -22,25 +22,15 @@ MOST_LISTED = 200
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Parameters:
-    """What the document holds.
+    """What the document holds."""
 
-    Attributes:
-        names: (P,) "effect.parameter".
-        units: (P,) SI.
-        value: (P,) as fitted, the undetermined ones as they are in the model.
-        std: (P,) standard uncertainties, infinite where the readings do not determine it.
-        identifiable: (P,) whether they do.
-        covariance: (P, P), NaN in rows and columns of those that they do not determine.
-        about: the rest of the document.
-    """
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    value: Floats
-    std: Floats
-    identifiable: Bools
-    covariance: Floats
-    about: Mapping[str, Any]
+    names: tuple[str, ...]  # (P,) "effect.parameter"
+    units: tuple[str, ...]  # (P,) SI
+    value: Floats  # (P,) as fitted, the undetermined ones as they are in the model
+    std: Floats  # (P,) standard uncertainties, infinite where the readings do not determine it
+    identifiable: Bools  # (P,) whether they do
+    covariance: Floats  # (P, P), NaN in rows and columns of those that they do not determine
+    about: Mapping[str, Any]  # the rest of the document
 
 
 def covariance_of(fit: Fit) -> Floats:
@@ -62,12 +52,7 @@ def covariance_of(fit: Fit) -> Floats:
 
 
 def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
-    """Return the document, SI.
-
-    Args:
-        fit: the fit.
-        source: what it is from: campaign, revision, hash of the readings.
-    """
+    """Return the document, SI."""
     u, model = fit.uncertainty, fit.model
     every = [(e, p) for e in model.effects for p in e.parameters]
     used = np.flatnonzero(u.identifiable & np.isfinite(u.std))
@@ -104,11 +89,7 @@ def to_json(fit: Fit, source: Mapping[str, object]) -> dict[str, object]:
 
 
 def from_json(content: Mapping[str, Any]) -> Parameters:
-    """Return what `to_json` wrote, every bit of it.
-
-    Raises:
-        InputError: another kind of document.
-    """
+    """Return what `to_json` wrote, every bit of it."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise InputError(f'no parameters; valid: a JSON document with "format": "{FORMAT}"')
     check_names({k: v for k, v in content.items() if k != "source"}, "parameters")
@@ -131,11 +112,7 @@ def from_json(content: Mapping[str, Any]) -> Parameters:
 
 @limits.bounded
 def read(path: str | Path) -> Parameters:
-    """Read the document from a file.
-
-    Raises:
-        InputError: no such file, or another kind of document.
-    """
+    """Read the document from a file."""
     try:
         return from_json(parse_json(limits.read_text(Path(path), limits.DOCUMENT)))
     except (OSError, LookupError, TypeError, ValueError) as error:

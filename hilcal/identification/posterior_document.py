@@ -47,11 +47,7 @@ def to_json(p: Posterior) -> dict[str, object]:
 
 
 def from_json(content: Mapping[str, Any]) -> Posterior:
-    """Return the posterior that `to_json` wrote.
-
-    Raises:
-        InputError: another kind of document, a newer version, or a damaged one.
-    """
+    """Return the posterior that `to_json` wrote."""
     if not isinstance(content, Mapping) or content.get("format") != FORMAT:
         raise InputError(f'no prior; valid: a JSON document with "format": "{FORMAT}"')
     if content.get("version") != VERSION:
@@ -68,11 +64,7 @@ def from_json(content: Mapping[str, Any]) -> Posterior:
 
 @limits.bounded
 def read(path: Path) -> Posterior:
-    """Read a posterior from a JSON file.
-
-    Raises:
-        InputError: see `from_json`; or the file cannot be read.
-    """
+    """Read a posterior from a JSON file."""
     try:
         content = parse_json(limits.read_text(path, limits.DOCUMENT))
     except (OSError, ValueError) as error:
@@ -84,11 +76,7 @@ def read(path: Path) -> Posterior:
 
 
 def write(p: Posterior, path: Path) -> None:
-    """Write a posterior to a JSON file.
-
-    Raises:
-        InputError: it cannot be written.
-    """
+    """Write a posterior to a JSON file."""
     replace_file(path, json.dumps(to_json(p), allow_nan=False) + "\n")
 
 
@@ -132,22 +120,14 @@ def _read(content: Mapping[str, Any]) -> Posterior:
 
 
 def _texts(values: object) -> tuple[str, ...]:
-    """Return a list of texts.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return a list of texts."""
     if not isinstance(values, list) or not all(isinstance(v, str) for v in values):
         raise ValueError("names that are none")
     return tuple(values)
 
 
 def _numbers(values: object, count: int) -> Floats:
-    """Return a list of finite numbers (count,).
-
-    Raises:
-        ValueError: it is none.
-    """
+    """Return a list of finite numbers (count,)."""
     found = np.array(values, dtype=float)
     if found.shape != (count,) or not np.isfinite(found).all():
         raise ValueError(f"numbers that are not {count} finite ones")

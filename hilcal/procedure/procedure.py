@@ -70,10 +70,17 @@ from hilcal.refinement import Refinement, refine
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, read_plan
-from hilcal.store.procedure_log import ENTRY, ProcedureLog, entry
-from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
-from hilcal.store.rows import content_hash
+from hilcal.store.procedure_log import (
+    CALIBRATION,
+    CORRECTED,
+    ENTRY,
+    PURPOSE,
+    VALIDATION,
+    ProcedureLog,
+    entry,
+)
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog, check_same_cell, create_run
 
 Measure = Callable[[CampaignFile, float | None], None]
@@ -509,11 +516,7 @@ class Procedure:
 
 
 def continued(run: Path, cell: Cell, config: CellConfig, catalogue: Catalogue) -> Procedure:
-    """Return a calibration as its campaign file has it.
-
-    Raises:
-        InputError: the campaign is of another cell, or not of a calibration.
-    """
+    """Return a calibration as its campaign file has it."""
     with CampaignFile.open(run, read_only=True) as campaign:
         settings, base_dir = settings_of(campaign), cell.base_dir.absolute()
         check_same_cell(campaign, config, base_dir)

@@ -9,8 +9,7 @@ from hilcal.names import quoted
 from hilcal.readings.whitening import Mode
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE, Plan, read_plan
-from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.purpose import CALIBRATION, CORRECTED, PURPOSE, VALIDATION
+from hilcal.store.procedure_log import CALIBRATION, CORRECTED, PURPOSE, VALIDATION, ProcedureLog
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats
 
@@ -112,11 +111,7 @@ class ProcedureStep:
 
 
 def next_step(run: Path) -> ProcedureStep:
-    """Return the next step of a calibration.
-
-    Raises:
-        InputError: the campaign is not one of a calibration, or a file is damaged.
-    """
+    """Return the next step of a calibration."""
     files = Files(run)
     if not run.exists():
         return ProcedureStep("plan", run)
@@ -161,11 +156,7 @@ def _asked_anew(log: ProcedureLog) -> bool:
 
 
 def opened(path: Path, purpose: str, run: Path, *, read_only: bool = True) -> CampaignFile:
-    """Open a file of a calibration.
-
-    Raises:
-        InputError: it is another one.
-    """
+    """Open a file of a calibration."""
     campaign = CampaignFile.open(path, read_only=read_only)
     if campaign.about(PURPOSE) != purpose or campaign.about(CALIBRATION) != identity(run):
         campaign.close()

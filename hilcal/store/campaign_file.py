@@ -22,7 +22,15 @@ from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
 from hilcal.store.command_line import typed_now
-from hilcal.store.revision import RevisionRecord, fitted_to, from_text, join, split, to_text, utc_now
+from hilcal.store.revision import (
+    RevisionRecord,
+    fitted_to,
+    from_text,
+    join,
+    split,
+    to_text,
+    utc_now,
+)
 from hilcal.store.robot_file import robot_file_of
 from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
 from hilcal.whole_file import replacing
@@ -74,11 +82,7 @@ class CampaignFile:
         """Make a campaign; the file appears only when it is complete.
 
         Args:
-            base_dir: the directory to which its relative paths refer.
-            source: where the readings come from, in words.
             overwrite: replace an existing campaign (never a file of another kind).
-            more: further texts about it, see `about`.
-            readings: the first ones; none unless given.
 
         Raises:
             InputError: the file exists, or cannot be written; see `append_readings`.
@@ -100,12 +104,8 @@ class CampaignFile:
         """Open a campaign and check that it is whole.
 
         Args:
-            read_only: write nothing, see `schema.connect`.
             check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
                 measure on, does not.
-
-        Raises:
-            InputError: no such file, another format, a newer version, damaged or truncated.
         """
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
@@ -192,15 +192,7 @@ class CampaignFile:
         )
 
     def append_readings(self, readings: Readings) -> int:
-        """Append readings in one transaction; names already known keep their numbers.
-
-        Returns:
-            The number of readings in the campaign.
-
-        Raises:
-            InputError: other quantities, joints or elements than the readings before; a known
-                pose with other commanded joints; not finite; the file cannot be written.
-        """
+        """Append readings in one transaction; names already known keep their numbers."""
         with self.transaction():
             return self.insert(readings)
 
@@ -220,11 +212,7 @@ class CampaignFile:
         return rows.insert_readings(self.connection, readings)
 
     def readings(self) -> Readings:
-        """All readings in the order in which they were appended.
-
-        Raises:
-            InputError: there are none yet, or they are damaged.
-        """
+        """All readings in the order in which they were appended."""
         layout = self._layout()
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
@@ -258,15 +246,14 @@ class CampaignFile:
         text = to_text(record)
         if key is not None and key not in self._read_meta():
             rows.insert_meta(self.connection, key, posterior)
-        needs = {
-            schema.CHOSEN_REVISION: record.parent is not None,
-            schema.CARRIED_PRIOR: key is not None,
-            schema.CHANGED_CELL: bool(record.cell),
-        }
-        schema.require(self.connection, max((v for v, needed in needs.items() if needed), default=0))
-        rows.insert(
-            self.connection, "revisions", [(number, text, rows.text_crc(str(number), text))]
+        schema.require(
+            self.connection,
+            schema.CHANGED_CELL * bool(record.cell),
+            schema.CARRIED_PRIOR * (key is not None),
+            schema.CHOSEN_REVISION * (record.parent is not None),
         )
+        row = (number, text, rows.text_crc(str(number), text))
+        rows.insert(self.connection, "revisions", [row])
         return number
 
     def accepted(self) -> int | None:
@@ -275,11 +262,7 @@ class CampaignFile:
         return found[-1] if found else None
 
     def accept(self, number: int | None) -> None:
-        """Make a revision the one that is used; None lets the latest one be used again.
-
-        Raises:
-            InputError: no such revision, or the file cannot be written.
-        """
+        """Make a revision the one that is used; None lets the latest one be used again."""
         if number is not None:
             self.revision(number)
         with self.transaction():
@@ -300,11 +283,7 @@ class CampaignFile:
         return found
 
     def revisions(self) -> tuple[RevisionRecord, ...]:
-        """All revisions, oldest first.
-
-        Raises:
-            InputError: they are damaged.
-        """
+        """All revisions, oldest first."""
         records, damaged = self._sound_revisions()
         if damaged is not None:
             raise InputError(f"{self.path}: {damaged[1]}; {_mend(self.path)}")
@@ -330,11 +309,7 @@ class CampaignFile:
         return tuple(records), None
 
     def revision(self, number: int) -> RevisionRecord:
-        """One revision.
-
-        Raises:
-            InputError: there is none of this number; names the valid ones.
-        """
+        """One revision."""
         records = self.revisions()
         if not 1 <= number <= len(records):
             valid = f"there are 1 to {len(records)}" if records else "there are none yet"
@@ -509,11 +484,7 @@ def new_campaign(
 
 
 def may_write(path: Path, overwrite: bool) -> None:
-    """Refuse to replace a file that is no campaign, or any without `overwrite`.
-
-    Raises:
-        InputError: names the file and the reason.
-    """
+    """Refuse to replace a file that is no campaign, or any without `overwrite`."""
     if not path.exists():
         return
     if not overwrite:

@@ -82,11 +82,7 @@ class Overview:
 
 
 def overview(file: CampaignFile) -> Overview:
-    """Return what a campaign file holds.
-
-    Raises:
-        InputError: it is damaged.
-    """
+    """Return what a campaign file holds."""
     log = None if file.about(PLAN) is None else RunLog(file)
     events = () if log is None else tuple(log.events())
     readings = file.readings() if file.n_readings else None
@@ -156,11 +152,7 @@ def _last(events: Sequence[Mapping[str, Any]], kind: str) -> Mapping[str, Any] |
 
 
 def to_json(o: Overview, path: str, covariance: str) -> dict[str, object]:
-    """Return the document of `info --json`.
-
-    Args:
-        covariance: what the covariances consist of, in words.
-    """
+    """Return the document of `info --json`."""
     return {
         "campaign": path,
         "created": o.created,

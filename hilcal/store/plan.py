@@ -73,11 +73,7 @@ class Plan(Brief):
 
 @limits.bounded
 def load_plan(path: Path) -> Plan:
-    """Read a plan file.
-
-    Raises:
-        InputError: unreadable, not a plan, or something in it that cannot be.
-    """
+    """Read a plan file."""
     try:
         text = limits.read_text(path, limits.DOCUMENT)
     except FileNotFoundError:
@@ -88,11 +84,7 @@ def load_plan(path: Path) -> Plan:
 
 
 def read_plan(text: str, where: str) -> Plan:
-    """Return the plan in a JSON document; `where` names it in messages.
-
-    Raises:
-        InputError: not a plan, or something in it that cannot be.
-    """
+    """Return the plan in a JSON document; `where` names it in messages."""
     data = read_json(text, where)
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f'{where}: not a plan; a plan has "format": "{FORMAT}"')
@@ -170,13 +162,6 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
     The reference pose becomes that of the campaign, so that the drift is measured over all of it. A
     pose of a known name at other joints gets another name; one at the same joints is the same
     pose, and its readings get new cycles, with unloaded readings of their own.
-
-    Args:
-        before: all that was planned before.
-        number: of the plan in the campaign, 2 or more.
-
-    Raises:
-        InputError: another number of joints, or only one of the two has a reference pose.
     """
     if plan.q.shape[1] != before.q.shape[1]:
         raise InputError(

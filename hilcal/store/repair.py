@@ -28,12 +28,6 @@ def repair(path: Path) -> Repaired | None:
     """Set aside the first bad revision, all after it, and what names one of them.
 
     Later revisions may have been made from it. The readings have to be sound.
-
-    Returns:
-        What was done; None where no revision is bad.
-
-    Raises:
-        InputError: not a campaign, a damaged reading, or a file that cannot be written.
     """
     with CampaignFile.open(path, check_revisions=False) as file:
         if file.n_readings:
@@ -55,11 +49,7 @@ def repair(path: Path) -> Repaired | None:
 
 
 def put_robot(path: Path, file: Path) -> None:
-    """Put the file of its robot into a campaign that does not hold it.
-
-    Raises:
-        InputError: it holds one, needs none, or that file is not one of such an arm.
-    """
+    """Put the file of its robot into a campaign that does not hold it."""
     with CampaignFile.open(path) as campaign:
         robot = CellConfig.from_json(campaign.config_json).robot
         if campaign.about(ROBOT_FILE) is not None or not Path(robot.model).suffix:
@@ -97,4 +87,3 @@ def _delete(
     delete = f"DELETE FROM {table} WHERE {key} = ?"  # noqa: S608
     connection.executemany(delete, [(value,) for value in values])
     connection.execute(made)
-

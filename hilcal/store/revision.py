@@ -10,7 +10,7 @@ from typing import Any
 from hilcal.config.changes import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
-from hilcal.store.stored_schema import Result, StoredOptions, check
+from hilcal.store.stored_schema import Revision, check
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -29,11 +29,7 @@ def utc_now() -> str:
 
 
 def seconds_of(date: str, where: str = "date") -> float:
-    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise.
-
-    Raises:
-        InputError: no date.
-    """
+    """Return seconds since 1970 of a date in ISO 8601, UTC unless it says otherwise."""
     try:
         found = datetime.fromisoformat(date)
     except ValueError:
@@ -87,11 +83,7 @@ class RevisionRecord:
 
 
 def change(added: str | None, removed: str | None, scatter: bool = False) -> str:
-    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model.
-
-    Args:
-        scatter: whether the arm's estimated scatter is in its covariance.
-    """
+    """Return what a revision changed, as "+ a", "− b" or "+ a − b"; empty for a first model."""
     if scatter and added is None and removed is None:
         return "arm's scatter"
     parts = [f"+ {added}"] if added else []
@@ -115,27 +107,14 @@ def from_text(text: str, number: int) -> RevisionRecord:
     """Record from its JSON text."""
     try:
         content = parse_json(text)
+        check(Revision, content)
         content["effects"] = tuple(content["effects"])
-        record = RevisionRecord(**content, number=number)
-        _check(record)
-        return record
+        r = RevisionRecord(**content, number=number)
+        names = [*r.effects, r.data_hash, r.program_version, r.created, r.added, r.removed]
+        check_names([name for name in names if name is not None], f"revision {number}, name")
+        return r
     except (LookupError, TypeError, AttributeError) as e:
         raise ValueError(str(e)) from e
-
-
-def _check(record: RevisionRecord) -> None:
-    """Refuse a record whose entries are of other kinds."""
-    if not isinstance(record.parameters_json, dict):
-        raise TypeError("parameters_json is no document")
-    texts = (*record.effects, record.data_hash, record.program_version, record.created)
-    named = (t for t in (record.added, record.removed) if t is not None)
-    if not all(isinstance(text, str) for text in (*texts, *named)):
-        raise TypeError("a name is no text")
-    check_names([*texts, *named], f"revision {record.number}, name")
-    check(StoredOptions, record.options)
-    check(Result, record.result_json)
-    if record.parent is not None and not isinstance(record.parent, int):
-        raise TypeError("parent is no number")
 
 
 def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
@@ -154,11 +133,8 @@ def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
 CARRIED = "carried_prior"
 """Key among the parameters of a revision: the prior that it was fitted with, as JSON."""
 _POSTERIOR, _HASH = "posterior", "posterior_sha256"
-
-
-def key_of(sha256: str) -> str:
-    """Key of a posterior in the file."""
-    return f"posterior {sha256}"
+_KEY = "posterior {}"
+"""Key of a posterior in the file, by its hash."""
 
 
 def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
@@ -170,7 +146,7 @@ def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
     sha256 = hashlib.sha256(text.encode()).hexdigest()
     named = {k: v for k, v in carried.items() if k != _POSTERIOR} | {_HASH: sha256}
     parameters = {**record.parameters_json, CARRIED: named}
-    return replace(record, parameters_json=parameters), key_of(sha256), text
+    return replace(record, parameters_json=parameters), _KEY.format(sha256), text
 
 
 def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
@@ -184,7 +160,7 @@ def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
         return record
     if not isinstance(carried, Mapping):
         raise ValueError("a prior is no document")
-    text = stored.get(key_of(str(carried.get(_HASH))))
+    text = stored.get(_KEY.format(carried.get(_HASH)))
     if text is None:
         raise ValueError("a prior is missing")
     whole = {k: v for k, v in carried.items() if k != _HASH} | {_POSTERIOR: parse_json(text)}

@@ -30,15 +30,7 @@ def robot_file_of(config_json: str, base_dir: str) -> dict[str, str]:
 def check_robot(
     path: Path, config_json: str, kept: str | None, calibration: str | None = None
 ) -> None:
-    """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path.
-
-    Args:
-        kept: what the campaign keeps of its robot's file.
-        calibration: the same of the file of its kinematics.
-
-    Raises:
-        InputError: says how to put it into the campaign.
-    """
+    """Refuse a campaign whose robot is in a file outside of it: whoever made it chose the path."""
     if calibration is None and (file := _told(config_json, "calibration")):
         raise InputError(
             f"{path}: its robot's kinematics are in a file that it does not hold, {file!r}, and "
@@ -54,11 +46,7 @@ def check_robot(
 
 
 def text_of(path: Path, key: str = ROBOT_FILE) -> dict[str, str]:
-    """Return a robot's file as a campaign keeps it; nothing where it cannot be read.
-
-    Raises:
-        InputError: the file is too large.
-    """
+    """Return a robot's file as a campaign keeps it; nothing where it cannot be read."""
     try:
         if not path.is_file():
             return {}

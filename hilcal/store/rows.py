@@ -265,16 +265,17 @@ def fetch_readings(
         sound = (np.abs(records) < LARGEST) | _lacking(records, layout)
         if bad := np.flatnonzero(~sound.all(axis=1))[:1].tolist():
             raise damaged(f" at reading {bad[0] + 1}")
-        if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= [len(n) for n in names[:2]]):
+        counts = [len(names[0]), len(names[1])]
+        if index[:, :2].min() < 0 or np.any(index[:, :2].max(axis=0) >= counts):
             raise damaged(" (names are missing)")
         readings = _unpacked(records, layout, index, names, observers)
         if bad := np.flatnonzero(~is_covariance(readings.covariance))[:1].tolist():
             why = "its covariance is not positive semi-definite"
             raise damaged(f" at reading {bad[0] + 1}: {why}")
-    s = readings.states
-    for what, number, of in (("targets", s.target, target_names), ("observers", s.observer, observers)):
-        if number is not None and not 0 <= number.min() <= number.max() < len(of):
-            raise damaged(f" ({what} are missing)")
+    for what, known in (("target", target_names), ("observer", observers)):
+        of = getattr(readings.states, what)
+        if of is not None and not 0 <= of.min() <= of.max() < len(known):
+            raise damaged(f" ({what}s are missing)")
     return readings
 
 

@@ -4,6 +4,7 @@ Each is checked where it comes out of the file. Keys beside those named here are
 """
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
@@ -54,21 +55,32 @@ class _Diagnosed(_Document):
     rejected: list[Text] = []
 
 
-class Result(_Document):
-    """What `identify` and `diagnose` reported of a revision."""
-
+class _Result(_Document):
     identify: _Identified
     diagnose: _Diagnosed | None = None
 
 
-class StoredOptions(_Document):
-    """What was chosen for a revision."""
-
+class _Options(_Document):
     readings: Literal["deflection", "absolute"]
     scaling: Literal["none", "gu", "gc"]
     effects: dict[str, dict[str, Any]]
     effects_from: dict[str, dict[str, str]] = {}
     cell: dict[str, dict[str, Any]] = {}
+
+
+class Revision(_Document):
+    """A revision, see `store.revision`."""
+
+    effects: list[Text]
+    added: Text | None
+    removed: Text | None = None
+    parent: Annotated[int, Strict()] | None = None
+    data_hash: Text
+    program_version: Text
+    created: Text = ""
+    options: _Options
+    parameters_json: dict[str, Any]
+    result_json: _Result
 
 
 class Detail(_Document):
@@ -158,7 +170,7 @@ class _Noise(_Happened):
     joint_std_rad: Number | None = None
 
 
-_EVENTS: Mapping[str, type[_Happened]] = {
+EVENTS: Mapping[str, type[_Happened]] = {
     "devices": _Devices,
     "tare": _Tare,
     "drift": _Drift,
@@ -204,7 +216,7 @@ class _Frozen(_Happened):
     readings_sha256: Text
 
 
-_ENTRIES: Mapping[str, type[_Happened]] = {
+ENTRIES: Mapping[str, type[_Happened]] = {
     "begun": _Begun,
     "refined": _Refined,
     "decided": _Decided,
@@ -226,16 +238,10 @@ def check(schema: type[BaseModel], content: object) -> None:
         raise ValueError(f"{where}: {first['msg']}") from None
 
 
-def check_event(content: object) -> None:
-    """Refuse what is no event of a session; raises as `check` does."""
-    _check_happened(content, _EVENTS)
-
-
-def check_entry(content: object) -> None:
-    """Refuse what is no entry of a calibration's log; raises as `check` does."""
-    _check_happened(content, _ENTRIES)
-
-
-def _check_happened(content: object, known: Mapping[str, type[_Happened]]) -> None:
+def check_event(content: object, known: Mapping[str, type[_Happened]] = EVENTS) -> None:
+    """Refuse what is no event of a session, or no entry of a log; raises as `check` does."""
     kind = content.get("kind") if isinstance(content, dict) else None
     check(known.get(kind, _Happened) if isinstance(kind, str) else _Happened, content)
+
+
+check_entry = partial(check_event, known=ENTRIES)

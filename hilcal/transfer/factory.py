@@ -60,7 +60,6 @@ def check_factory(
 
     Args:
         nominal: the arm as its maker designed it, its joints not yet counted as the cell says.
-        readings: of a few poses all over the workspace.
         catalogue: the effects; the installed ones where None.
 
     Raises:

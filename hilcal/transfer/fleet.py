@@ -128,11 +128,7 @@ def _type(
 
 
 def to_json(fleet: Fleet, priors: Mapping[str, str]) -> dict[str, object]:
-    """Return a fleet as JSON, SI.
-
-    Args:
-        priors: file of the prior by type.
-    """
+    """Return a fleet as JSON, SI."""
     return {
         "types": [{**_type_json(t), "prior": priors.get(t.type)} for t in fleet.types],
         "campaigns": [

@@ -22,7 +22,7 @@ from hilcal.readings.same_readings import prints
 from hilcal.refinement import refine
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.overview import overview
-from hilcal.store.purpose import refuse_fitting
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import seconds_of
 from hilcal.transfer.type_sizes import SizeEvidence, size_evidence
 from hilcal.types import Floats
@@ -66,11 +66,7 @@ class Failure:
 
 
 def entries(directory: Path) -> tuple[Entry, ...]:
-    """Return the campaigns in a directory and below it, by name.
-
-    Raises:
-        InputError: no directory, no campaigns, or a list that cannot be read.
-    """
+    """Return the campaigns in a directory and below it, by name."""
     if not directory.is_dir():
         raise InputError(f"{directory}: no directory; valid: one with campaign files, *.hilcal")
     paths = sorted(directory.rglob("*.hilcal"))

@@ -129,10 +129,6 @@ def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
 def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
     """Pool the campaigns of arms of one type.
 
-    Args:
-        members: of one type; effects that are traits are in all their models.
-        seen: effects that diagnoses added.
-
     Raises:
         CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
     """

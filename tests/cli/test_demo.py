@@ -19,7 +19,7 @@ from hilcal.errors import InputError
 from hilcal.present.progress import Say
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan
-from hilcal.store.purpose import purpose_of
+from hilcal.store.procedure_log import purpose_of
 from studies.random_campaigns import rehearse
 from tests.support.cli_cases import CELL, ok, quickly_planned, refused, rehearsal
 from tests.support.user_effect_cases import CLASS

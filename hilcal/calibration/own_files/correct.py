@@ -35,17 +35,7 @@ class Correction:
 def correct_file(
     path: Path, nominal: Arm, found: Corrected, base: str | None = None, tip: str | None = None
 ) -> Correction:
-    """Return a file with the corrected geometry in the place of its own.
-
-    Args:
-        path: a file of `KINDS`.
-        nominal: the arm that the campaign began with.
-        base: name of the link or body that the arm begins at.
-        tip: name of the link, body or site that is its flange.
-
-    Raises:
-        InputError: it cannot be read, is of another arm, or a place in it cannot be written.
-    """
+    """Return a file with the corrected geometry in the place of its own."""
     if path.suffix == ".conf":
         return _ur_conf(path, nominal, found.arm)
     document = read_xml(path)

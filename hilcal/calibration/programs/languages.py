@@ -70,11 +70,7 @@ class UnderstoodProgram:
         return replace(self, program=replace(self.program, points=points), q=self.q[kept])
 
     def corrected(self, q: Floats) -> dict[str, bytes]:
-        """Return the files by suffix, with joint values (N, 6) in place of `q`.
-
-        Raises:
-            InputError: see `Program.corrected`.
-        """
+        """Return the files by suffix, with joint values (N, 6) in place of `q`."""
         points, language = self.program.understood, self.program.language
         none = (UNSTATED,) * len(language.of_shape)
         stated = np.array([p.flags or none for p in points])
@@ -96,14 +92,8 @@ def understood(
     """Read a program.
 
     Args:
-        path: the program; the end of its name says of which maker.
-        frames: file with what the controller keeps apart from programs.
         tool: (4, 4) T_flange_tool of tools that neither has.
         near: (6,) joint values that the first pose is near to, rad.
-        leave: keep what is not understood as it is.
-
-    Raises:
-        InputError: it cannot be read, or a point is not understood; names the line.
     """
     try:
         program = READERS[path.suffix.lower()](path, frames, tool)
@@ -206,14 +196,10 @@ def resolve(
     """Return the joint values (N, 6) at which the nominal arm is at the points.
 
     Args:
-        program: N points of which are understood.
         near: (6,) joint values that the first pose is near to, rad; None where none are given.
 
     Returns:
         joint values; why those of a point are not certain, "" where they are; what is to be said.
-
-    Raises:
-        InputError: the arm has other joints, or does not reach a pose.
     """
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:

@@ -131,13 +131,9 @@ class Program:
         """Return the files, by suffix, with other points.
 
         Args:
-            found: N points of it.
             given: (N, 6) joint values of them as they were, rad.
             q: (N, 6) joint values that they get.
             flags: (N, F) configuration that they get.
-
-        Raises:
-            InputError: the configuration changes where it cannot be written; names the line.
         """
         edits: list[tuple[Span, str]] = []
         poses = evaluate(arm, q)
@@ -212,11 +208,7 @@ def edited(text: str, edits: Sequence[tuple[Span, str]]) -> str:
 
 
 def read_text(path: Path) -> tuple[str, str]:
-    """Text of a file with its line ends as they are, and its encoding.
-
-    Raises:
-        InputError: it cannot be read.
-    """
+    """Text of a file with its line ends as they are, and its encoding."""
     try:
         raw = limits.read_bytes(path, limits.SCRIPT)
     except OSError as error:

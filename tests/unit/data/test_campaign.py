@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from hilcal.errors import InputError
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.rows import content_hash
 from hilcal.store.revision import RevisionRecord
+from hilcal.store.rows import content_hash
 from hilcal.store.schema import sqlite_errors
 from tests.support.readings_cases import assert_same, readings, simple
 

@@ -16,8 +16,7 @@ from hilcal.procedure.state import DECIDED, FROZEN
 from hilcal.readings.same_readings import already
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import REFERENCE
-from hilcal.store.procedure_log import ProcedureLog
-from hilcal.store.purpose import purpose_of, release
+from hilcal.store.procedure_log import ProcedureLog, purpose_of, release
 from hilcal.store.run_log import RunLog
 from tests.support.paths import ROOT
 from tests.support.procedure_cases import Drawn, KilledError, again, drawn, small
