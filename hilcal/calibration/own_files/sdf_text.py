@@ -12,8 +12,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilcal.calibration.handover import origin_of
-from hilcal.calibration.own_files.chain_text import LEFT, ChainPlace, Edits, moved, numbers, z_to
-from hilcal.calibration.own_files.xml_text import Document, Node
+from hilcal.calibration.own_files.chain_text import (
+    LEFT,
+    ChainPlace,
+    Document,
+    Edits,
+    Node,
+    moved,
+    not_between,
+    numbers,
+    z_to,
+)
 from hilcal.calibration.programs.program import Span
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -76,16 +85,15 @@ class _Model:
         self.nodes: dict[str, Node] = {}
         for child in node.children:
             if child.tag in ("model", "include"):
-                raise self._refused(child, "a model in a model; valid: one model with the arm")
+                raise document.refused(child, "a model in a model; valid: one with the arm")
             if child.tag in ("link", "joint", "frame"):
                 name = child.attributes.get("name", "")
                 if name in self.nodes:
-                    raise self._refused(child, f"a second '{escaped(name)}'; valid: names of one")
+                    raise document.refused(
+                        child, f"a second '{escaped(name)}'; valid: names of one"
+                    )
                 self.nodes[name] = child
         self.joints = [n for n in self.nodes.values() if n.tag == "joint"]
-
-    def _refused(self, node: Node, what: str) -> InputError:
-        return InputError(f"{self.document.name}: line {node.line}: {what}")
 
     def text(self, node: Node | None) -> str:
         """Text of an element; empty where it is none."""
@@ -103,7 +111,8 @@ class _Model:
         if pose is None or not self.text(pose):
             return np.eye(4)
         if pose.attributes.get("degrees") == "true" or "rotation_format" in pose.attributes:
-            raise self._refused(pose, "a <pose> in degrees or quaternions; valid: x y z r p y, rad")
+            what = "a <pose> in degrees or quaternions; valid: x y z r p y, rad"
+            raise self.document.refused(pose, what)
         v = self.document.numbers(pose, self.text(pose), 6)
         return se3.matrix(se3.of_rpy(v[3:]), v[:3])
 
@@ -212,8 +221,5 @@ def _step(model: _Model, joint: Node) -> ChainPlace:
             along = at[:3, :3].T @ model.place(other)[:3, :3] @ along
         turn = se3.inverse(model.place(child)) @ at @ z_to(along)
     elif kind != "fixed":
-        raise InputError(
-            f"{model.document.name}: line {joint.line}: joint '{escaped(name)}' is {escaped(kind)};"
-            " valid between base and tip: revolute, continuous, fixed"
-        )
+        raise model.document.refused(joint, not_between(name, kind))
     return ChainPlace(name, joint.line, place, turn, lambda _: [])
