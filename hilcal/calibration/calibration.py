@@ -23,13 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.calibration.compensated import Compensation, ToolPoses
-from hilcal.calibration.compensation import Inverse, Pose, invert
+from hilcal.calibration.compensation import Compensation, Inverse, Pose, ToolPoses, invert
 from hilcal.calibration.compiled import Compiled, compiled
 from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Condition, Measured, conditions_of, needed
+from hilcal.calibration.measured import Condition, Measured, SensorMount, conditions_of, needed
 from hilcal.calibration.scatter import Scatter, scatter_of
-from hilcal.calibration.sensed import SensorMount
 from hilcal.calibration.tool import ToolPose, in_chain, tool_of, tool_poses
 from hilcal.effects.catalogue import Catalogue
 from hilcal.effects.protocol import FRAME_ROLES
@@ -51,6 +49,7 @@ from hilcal.robot.chain import evaluate
 from hilcal.robot.factory import SAME, flange_difference, of_dict, with_factory
 from hilcal.shown import Brief
 from hilcal.store.schema import is_campaign
+from hilcal.stream.fit import StreamFit
 from hilcal.types import Bools, Floats, Ints
 
 
@@ -422,3 +421,23 @@ class Calibration(Brief):
 
 def _unloaded(states: States) -> States:
     return replace(states, wrench=np.zeros((len(states), 6)))
+
+
+def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibration:
+    """Return the calibration: parameters and covariance of the stream, ranges of its sample.
+
+    The limit of the standard deviation, beyond which a point is far from all fitted ones, is that
+    of the sample, scaled to the number of readings of the stream.
+    """
+    of_sample = Calibration.of(found.sample, source)
+    values, vectors = np.linalg.eigh(found.covariance)
+    share = np.sqrt(len(found.sample.readings) / found.readings)
+    measured = of_sample.measured
+    return replace(
+        of_sample,
+        model=replace(found.model, readings=None, prior=None),
+        theta=found.theta,
+        root=vectors * np.sqrt(np.maximum(values, 0.0)),
+        measured=replace(measured, most_std_m=float(share * measured.most_std_m)),
+        learnt=None,
+    )

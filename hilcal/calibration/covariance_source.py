@@ -13,20 +13,37 @@ and its eigenvectors takes seconds, once, when an uncertainty is first asked for
 import base64
 import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.check_stored import check_numbers
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.model.model import Model
 from hilcal.readings.readings import ObserverName, Readings, States
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
+
+LARGEST = 1e9
+"""No length, angle, mass, force or parameter is as large, in SI units."""
+
+
+def check_numbers(
+    what: str, values: Floats | float, shape: Sequence[int] = (), *, least: float = -LARGEST
+) -> None:
+    """Refuse numbers of another shape, or that nothing in a cell has.
+
+    Raises:
+        ValueError: names them.
+    """
+    array = np.asarray(values, dtype=float)
+    if array.shape != tuple(shape):
+        raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
+    if not np.all((array >= least) & (array <= LARGEST)):
+        raise ValueError(f"{what} has a number that cannot be")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

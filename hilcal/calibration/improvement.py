@@ -23,7 +23,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, band
+from hilcal.calibration.compensation import BAND, band
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.identification.predictive import Predictive
 from hilcal.identification.residual import noise_floor, residual

@@ -17,17 +17,9 @@ import numpy as np
 
 from hilcal import __version__, limits
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.check_stored import (
-    check_arm,
-    check_cell,
-    check_conditions,
-    check_numbers,
-    check_spread,
-)
-from hilcal.calibration.covariance_source import CovarianceSource
-from hilcal.calibration.measured import Condition, Measured
+from hilcal.calibration.covariance_source import CovarianceSource, check_numbers
+from hilcal.calibration.measured import WORDS, Condition, Measured, SensorMount
 from hilcal.calibration.scatter import Scatter, ScatterSource
-from hilcal.calibration.sensed import SensorMount
 from hilcal.cell import Cell, Observer
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
@@ -274,3 +266,71 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     return [_plain(v) for v in value] if isinstance(value, tuple | list) else value
+
+
+def check_frames(what: str, frames: Floats) -> None:
+    """Refuse (..., 4, 4) matrices that are no rotation and translation."""
+    check_numbers(what, frames, (*frames.shape[:-2], 4, 4))
+    turn = frames[..., :3, :3]
+    orthonormal = np.allclose(turn @ np.swapaxes(turn, -1, -2), np.eye(3), atol=1e-6)
+    if not orthonormal or np.any(frames[..., 3, :] != [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(f"{what} is no frame")
+
+
+def check_arm(arm: Arm) -> None:
+    """Refuse an arm that cannot be.
+
+    Raises:
+        ValueError: says why.
+    """
+    n = arm.links.shape[0] - 1
+    if n < 1:
+        raise ValueError("the arm has no joints")
+    check_frames("links", arm.links)
+    check_numbers("masses", arm.masses, (n,), least=0.0)
+    check_numbers("coms", arm.coms, (n, 3))
+    check_numbers("payload", arm.payload, least=0.0)
+    for name, shape in (("coupling", (n, n)), ("drive", (n, n)), ("mimic", (n, n + 1))):
+        values = getattr(arm, name)
+        if values is not None:
+            check_numbers(name, values, shape)
+    if arm.sign is not None and not np.all(np.abs(arm.sign) == np.ones(n)):
+        raise ValueError("sign is not ±1 for each joint")
+    for ends in (arm.q_min, arm.q_max, arm.torque_max):
+        if ends.shape != (n,) or np.any(np.isnan(ends)):
+            raise ValueError("limits are not one for each joint")
+    if len(arm.joint_names) != n or not all(isinstance(name, str) for name in arm.joint_names):
+        raise ValueError("joints are not named each")
+
+
+def check_cell(cell: Cell) -> None:
+    """Refuse a cell that cannot be."""
+    for name in ("target", "registration"):
+        check_frames(name, getattr(cell, name))
+    check_numbers("load_point", cell.load_point, (3,))
+    if cell.targets is not None:
+        check_frames("targets", cell.targets)
+    check_numbers("tool_mass", cell.tool_mass, least=0.0)
+    check_numbers("tool_com", cell.tool_com, (3,))
+    check_numbers("gravity", cell.gravity, (3,))
+
+
+def check_spread(scatter: Scatter, measured: Measured, n: int) -> None:
+    """Refuse a scatter or ranges that cannot be."""
+    check_numbers("joint_std", scatter.joint_std, (n,), least=0.0)
+    check_numbers("std_m", scatter.std_m, least=0.0)
+    if np.isnan(measured.most_std_m):
+        raise ValueError("most_std_m is no number")
+    for r in measured.ranges:
+        if not isinstance(r.variable, str) or not isinstance(r.unit, str):
+            raise ValueError("a range without a name")
+        check_numbers(f"range of {r.variable}", np.array([r.low, r.high], dtype=float), (2,))
+
+
+def check_conditions(conditions: Mapping[str, Condition], n: int) -> None:
+    """Refuse conditions that cannot be."""
+    for name, c in conditions.items():
+        if name not in WORDS:
+            raise ValueError(f"{name!r} is no condition")
+        check_numbers(name, c.mean, (n,) if name in ("joint_temperature", "approach") else ())
+        check_numbers(f"variance by {name}", c.variance_m2, least=0.0)

@@ -53,11 +53,10 @@ from hilcal.readings.whitening import Mode, usual_mode
 from hilcal.refinement import Refinement
 from hilcal.shown import Brief
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import typed_now
+from hilcal.store.kept_texts import CALIBRATION_FILE, ROBOT_FILE, check_robot, typed_now
 from hilcal.store.overview import overview
 from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import CELL, STORED, RevisionRecord
-from hilcal.store.robot_file import CALIBRATION_FILE, ROBOT_FILE, check_robot
 from hilcal.store.rows import content_hash
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.tables.table import with_what_rounding_does, write_table

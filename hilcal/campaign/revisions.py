@@ -26,7 +26,7 @@ from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.readings import Readings
 from hilcal.readings.serial_noise import SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
-from hilcal.store.command_line import COMMAND
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text
 from hilcal.store.rows import content_hash
 from hilcal.types import Floats

@@ -53,7 +53,7 @@ from hilcal.present.fit import prior_lines
 from hilcal.present.live_viewer import LiveViewer
 from hilcal.present.plan import plan_facts
 from hilcal.present.progress import working
-from hilcal.procedure.decision import Decision
+from hilcal.procedure.next_plan import Decision
 from hilcal.procedure.procedure import Procedure, continued
 from hilcal.procedure.state import DECIDED, REFINED, VALIDATED, ProcedureStep, Settings
 from hilcal.readings.whitening import Mode

@@ -18,11 +18,11 @@ from hilcal.present.progress import counting
 from hilcal.present.registration import covariance_words, torque_lines
 from hilcal.readings.covariance import COVERS
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.kept_texts import ROBOT_FILE
 from hilcal.store.overview import overview, to_json
 from hilcal.store.repair import put_robot
 from hilcal.store.repair import repair as repaired
 from hilcal.store.revision import RevisionRecord
-from hilcal.store.robot_file import ROBOT_FILE
 
 
 def info(run: Run, as_json: Json = False) -> None:

@@ -10,14 +10,14 @@ from typing import Annotated
 
 import numpy as np
 
-from hilcal.calibration.branches import doubts
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import Compensation
+from hilcal.calibration.compensation import Compensation
 from hilcal.calibration.points import Points, on_branch, read_points
 from hilcal.calibration.programs.languages import READERS, UnderstoodProgram, understood
 from hilcal.calibration.urscript import (
     JOINTS,
     Waypoint,
+    doubts,
     movej_program,
     program_points,
     with_joints,

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from hilcal import numbers
-from hilcal.calibration.streamed import calibration_of_stream
+from hilcal.calibration.calibration import calibration_of_stream
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.cli.fits import (

@@ -1,15 +1,19 @@
-"""What a diagnosis leaves open, the measurements that would settle it, and why there are none."""
+"""Whether more is to be measured: what is in doubt, and what a further plan would tell."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilcal.calibration.calibration import Calibration
+from hilcal.calibration.compensation import band
+from hilcal.calibration.tool import tool_of
 from hilcal.campaign.campaign import Campaign
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import CheckedPlan, checked
 from hilcal.design.next import Next, PairPower, measure_next, measure_poses
-from hilcal.design.planner import Request
+from hilcal.design.planner import Request, make
+from hilcal.design.predicted import predicted
 from hilcal.design.summary import about, summarise
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.doubt import in_doubt
@@ -17,11 +21,14 @@ from hilcal.diagnosis.effect_ranking import Suspect
 from hilcal.diagnosis.more_poses import pose_powers
 from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.stepwise import remove
-from hilcal.errors import CannotAnswerError
+from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit
 from hilcal.names import quoted
 from hilcal.present.progress import Say
-from hilcal.procedure.state import reference_in
+from hilcal.procedure.state import Settings, duration_of, reference_in
+from hilcal.procedure.validation_plan import RECORDED
+from hilcal.readings.readings import States
+from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan
 from hilcal.types import Floats
 
@@ -196,3 +203,191 @@ def _differ(o: Campaign, s: Suspect) -> str:
         f"the model has one {s.coarse} for several joints; let them differ, and diagnose again: "
         f"hilcal add {quoted(o.path)} {quoted(s.effect)}"
     )
+
+
+WORTH = 0.05
+"""Share by which a further plan must lower the predicted error to be worth its time; a choice."""
+TOLD = 0.1
+"""Power that a further plan must add for a pair of suspects to be worth its time; a choice."""
+MOST_PLANS = 6
+"""Plans of a campaign at most; a choice: what five further plans have not settled, a sixth of the
+same size will not."""
+MOST = 200
+"""Points at which the error is predicted at most; a choice."""
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedError:
+    """Distances within which 95 % of points are after compensation, as the fit states them."""
+
+    now_m: float  # all of it
+    floor_m: float
+    """What no further reading lowers: the arm's repeatability, and what the model leaves."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Decision:
+    """What to do after a refinement."""
+
+    reason: str
+    """"adequate", "goal_met"; "doubt" or "goal" where a further plan is to be measured; "floor",
+    "no_gain", "inseparable", "time" or "plans" where more cannot be told or costs too much; the
+    verdict where no measurement would help."""
+    verdict: str
+    error: PredictedError
+    then_m: float | None = None  # the same after the further plan; None where it is about a doubt
+    suspects: tuple[str, ...] = ()  # effects in doubt
+    power: float | None = None  # least chance of separating two of them after the further plan
+    plan: Plan | None = None
+    """The further plan, that is measured unless the reason is "time"; None without one."""
+    seconds: float = 0.0  # how long it takes, cell s
+
+    @property
+    def measures(self) -> bool:
+        """Whether the further plan is to be measured."""
+        return self.reason in ("doubt", "goal")
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as an entry of the log holds it."""
+        return {
+            "reason": self.reason,
+            "verdict": self.verdict,
+            "predicted_m": self.error.now_m,
+            "floor_m": self.error.floor_m,
+            "then_m": self.then_m,
+            "suspects": list(self.suspects),
+            "power": self.power,
+            "readings": 0 if self.plan is None else len(self.plan.steps),
+            "seconds": self.seconds,
+        }
+
+
+def decide(
+    cell: Cell,
+    config: CellConfig,
+    settings: Settings,
+    d: Diagnosis,
+    plans: tuple[Plan, ...],
+    reference: Floats | None,
+    rng: np.random.Generator,
+    say: Say = lambda words: None,
+) -> Decision:
+    """Decide whether to measure more, and what.
+
+    A doubt between effects comes first; then a predicted error above the goal. A further plan is
+    measured where it would tell more and the time allows it. `d` is the diagnosis of the last fit,
+    `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
+    """
+    error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
+    verdict: str = d.verdict
+    further = _separating(cell, config, settings, d, error, reference, rng, say)
+    if further is None or not further.measures:
+        sharper = _sharpening(cell, config, settings, d, error, reference, rng, say)
+        if sharper is not None and (further is None or sharper.measures):
+            further = sharper
+    if further is None:
+        reached = settings.goal_m is not None and verdict == "adequate"
+        return Decision("goal_met" if reached else verdict, verdict, error)
+    if not further.measures:
+        return further
+    spent = sum(map(duration_of, plans))
+    if spent + further.seconds > settings.max_time_s:
+        return replace(further, reason="time")
+    if len(plans) >= MOST_PLANS:
+        return replace(further, reason="plans")
+    return further
+
+
+def predicted_error(calibration: Calibration, fitted: States, config: CellConfig) -> PredictedError:
+    """Predict the error after compensation where the robot will work.
+
+    At `[planning] work_q_rad` where it is given, else half-way between measured poses, under the
+    loads of the readings: the distance that 95 % of all these points are within.
+    """
+    states = _work(fitted, config)
+    columns = {k: v for k in RECORDED if (v := getattr(states, k)) is not None}
+    told = calibration.predict(states.q, states.wrench, recorded=columns)
+    assert told.covariance is not None  # noqa: S101  (asked for by default)
+    of = tool_of(calibration.model, calibration.theta, None)
+    chain = evaluate(calibration.model.cell.arm, states.q)
+    floor = calibration.scatter.covariance(of.model.cell, chain, told.position)
+    floor = floor + calibration.misfit * np.eye(3)
+    pooled = np.stack([told.covariance.mean(axis=0), floor.mean(axis=0)])
+    now, least = band(pooled)
+    return PredictedError(float(now), float(least))
+
+
+def _work(fitted: States, config: CellConfig) -> States:
+    loaded = np.flatnonzero(np.any(fitted.wrench != 0, axis=1))
+    rows = loaded if len(loaded) else np.arange(len(fitted))
+    rows = rows[np.linspace(0, len(rows) - 1, min(MOST, len(rows))).astype(np.int64)]
+    q = fitted.q[rows]
+    between = 0.5 * (q + np.roll(q, -max(len(q) // 3, 1), axis=0))
+    if config.planning.work_q_rad:
+        work = np.array(config.planning.work_q_rad, dtype=float)
+        between = work[np.arange(len(rows)) % len(work)]
+    return replace(fitted[rows], q=between, q_actual=None, target=None)
+
+
+def _separating(
+    cell: Cell,
+    config: CellConfig,
+    settings: Settings,
+    d: Diagnosis,
+    error: PredictedError,
+    reference: Floats | None,
+    rng: np.random.Generator,
+    say: Say,
+) -> Decision | None:
+    """Return what would settle a doubt; None where there is none."""
+    doubt = doubt_of(d, say)
+    if doubt is None:
+        return None
+    nothing = Decision("inseparable", d.verdict, error, suspects=doubt.suspects)
+    try:
+        found = separating(cell, config, doubt, None, rng, say, reference, usual=settings.poses)
+    except (CannotAnswerError, InputError):
+        return nothing
+    gain = max((p.then - p.now for p in found.powers if not p.not_separable), default=0.0)
+    power = min((p.then for p in found.powers if not p.not_separable), default=0.0)
+    if gain < TOLD:
+        return nothing
+    plan = plan_of(found, doubt.suspects)
+    return Decision("doubt", d.verdict, error, None, doubt.suspects, power, plan, duration_of(plan))
+
+
+def _sharpening(
+    cell: Cell,
+    config: CellConfig,
+    settings: Settings,
+    d: Diagnosis,
+    error: PredictedError,
+    reference: Floats | None,
+    rng: np.random.Generator,
+    say: Say,
+) -> Decision | None:
+    """Return what would lower the predicted error; None where it is as wanted."""
+    goal = settings.goal_m
+    if goal is None or error.now_m <= goal:
+        return None
+    if error.floor_m >= goal:
+        return Decision("floor", d.verdict, error)
+    say("planning what would lower the predicted error")
+    planning = config.planning.model_copy(update={"readings": d.fit.mode})
+    own = config.model_copy(update={"planning": planning})
+    try:
+        wanted = Request(settings.poses)
+        planned = make(cell, own, wanted, rng, d.fit, say, reference=reference)
+    except (CannotAnswerError, InputError):
+        return Decision("no_gain", d.verdict, error)
+    before = predicted(planned.problem, work=planned.work).position
+    after = planned.predicted.position
+    share = 1.0
+    if before is not None and after is not None and np.isfinite(after):
+        share = (after / before) ** 2 if np.isfinite(before) and before > 0 else 0.0
+    own_part = max(error.now_m**2 - error.floor_m**2, 0.0)
+    then = float(np.sqrt(error.floor_m**2 + share * own_part))
+    if then > (1.0 - WORTH) * error.now_m:
+        return Decision("no_gain", d.verdict, error, then)
+    plan = replace(planned.ordered.plan, about=about(planned))
+    return Decision("goal", d.verdict, error, then, plan=plan, seconds=duration_of(plan))

@@ -39,8 +39,7 @@ from hilcal.identification.carried import CarriedPrior
 from hilcal.identification.extrapolation import extrapolation
 from hilcal.identification.full_covariance import full_readings
 from hilcal.present.progress import Say
-from hilcal.procedure.corrected import corrected_plan, expected_of, paired
-from hilcal.procedure.decision import Decision, PredictedError, decide, predicted_error
+from hilcal.procedure.next_plan import Decision, PredictedError, decide, predicted_error
 from hilcal.procedure.state import (
     BEGUN,
     DECIDED,
@@ -60,7 +59,7 @@ from hilcal.procedure.state import (
     reference_of,
     settings_of,
 )
-from hilcal.procedure.validation_plan import validation_plan
+from hilcal.procedure.validation_plan import corrected_plan, expected_of, paired, validation_plan
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings

@@ -21,7 +21,7 @@ from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
-from hilcal.store.command_line import typed_now
+from hilcal.store.kept_texts import robot_file_of, typed_now
 from hilcal.store.revision import (
     RevisionRecord,
     fitted_to,
@@ -31,7 +31,6 @@ from hilcal.store.revision import (
     to_text,
     utc_now,
 )
-from hilcal.store.robot_file import robot_file_of
 from hilcal.store.rows import Layout, content_hash, layout_of, read_layout
 from hilcal.whole_file import replacing
 

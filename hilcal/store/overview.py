@@ -11,7 +11,7 @@ import numpy as np
 from hilcal.config import CellConfig
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import COMMAND
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import RevisionRecord
 from hilcal.store.run_log import PLAN, RunLog
 from hilcal.types import Floats

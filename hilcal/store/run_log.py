@@ -16,9 +16,9 @@ from hilcal.readings.covariance import COVERS, INSTRUMENT
 from hilcal.readings.readings import Readings
 from hilcal.store import rows, schema
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.kept_texts import KEYS, robot_file_of
 from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
-from hilcal.store.robot_file import KEYS, robot_file_of
 from hilcal.store.stored_schema import Detail, check, check_event
 
 PLAN = "plan"

@@ -27,8 +27,7 @@ from hilcal.regression.hierarchy import (
 )
 from hilcal.regression.schur import schur_complement
 from hilcal.store.revision import seconds_of, utc_now
-from hilcal.transfer.members import Member
-from hilcal.transfer.type_sizes import TypeSize, type_sizes
+from hilcal.transfer.members import Member, TypeSize, type_sizes
 from hilcal.types import Floats
 
 COMMON = 0.5

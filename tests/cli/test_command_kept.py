@@ -10,7 +10,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.present.html.sections import page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.command_line import COMMAND, typed, typed_now
+from hilcal.store.kept_texts import COMMAND, typed, typed_now
 from hilcal.store.overview import overview
 from hilcal.write_report import Asked, content_of
 from tests.support.campaigns import campaign, configuration

@@ -14,8 +14,8 @@ from hilcal.config import CellConfig, load_config
 from hilcal.errors import InputError
 from hilcal.robot.catalogue import configs_dir, load_arm
 from hilcal.store.campaign_file import CampaignFile
+from hilcal.store.kept_texts import ROBOT_FILE
 from hilcal.store.plan import Plan, Step
-from hilcal.store.robot_file import ROBOT_FILE
 from hilcal.store.run_log import check_same_cell
 from tests.support.cli_cases import ok, refused
 from tests.unit.discovery.test_discover import campaign as simulated

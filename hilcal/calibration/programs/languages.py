@@ -138,7 +138,7 @@ BORDER = 1e-4
 """rad; joint values as near to where a flag changes have both; a choice, above what numbers of four
 decimals leave open."""
 AS_NEAR = 0.05
-"""rad, see `calibration.branches.AS_NEAR`."""
+"""rad, see `calibration.urscript.AS_NEAR`."""
 
 
 def unlike(arm: Arm, language: Language) -> str:

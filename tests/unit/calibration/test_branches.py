@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from hilcal.calibration.branches import NEAREST, STRAIGHT, UNKNOWN, doubts
 from hilcal.calibration.compensation import invert
 from hilcal.calibration.points import Points, on_branch
-from hilcal.calibration.urscript import waypoints
+from hilcal.calibration.urscript import NEAREST, STRAIGHT, UNKNOWN, doubts, waypoints
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.chain import evaluate
 from hilcal.robot.se3 import rotation_vector

@@ -10,7 +10,7 @@ import pytest
 
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import band
+from hilcal.calibration.compensation import band
 from hilcal.calibration.covariance_source import CovarianceSource
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter

@@ -1,9 +1,14 @@
-"""Files that describe a robot, its model and its kinematics by the factory: a campaign keeps them.
+"""What a campaign keeps beside its readings: files of its robot, the command that made it.
 
-A campaign that was sent is read by that, on any machine, and reads no file outside of itself.
+A campaign that was sent is read by that, on any machine, and reads no file outside of itself. The
+command line sets the command as it was typed for as long as it works.
 """
 
 import json
+import shlex
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 
 from hilcal import limits
@@ -59,3 +64,24 @@ def _told(config_json: str, key: str) -> str:
     content = json.loads(config_json)
     robot = content.get("robot") if isinstance(content, dict) else None
     return str(robot.get(key) or "") if isinstance(robot, dict) else ""
+
+
+COMMAND = "command"
+"""Key of the command, among what a file says of itself and among the options of a revision."""
+_typed: ContextVar[str | None] = ContextVar("typed", default=None)
+
+
+@contextmanager
+def typed(words: Sequence[str]) -> Iterator[None]:
+    """Let what the block makes be said to be made by a command."""
+    token = _typed.set(shlex.join(words))
+    try:
+        yield
+    finally:
+        _typed.reset(token)
+
+
+def typed_now() -> dict[str, str]:
+    """Return the command that works, by its key; empty where there is none."""
+    words = _typed.get()
+    return {} if words is None else {COMMAND: words}
