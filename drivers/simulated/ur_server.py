@@ -163,7 +163,7 @@ class UrServer:
 
 def _rows(arm: Arm) -> Floats:
     """(4, 6) θ, a, d, α of an arm, as its controller tells them."""
-    from hilcal.calibration.handover import dh_rows  # slow to import
+    from hilcal.calibration.dh_table import dh_rows  # slow to import
 
     rows = dh_rows(arm)
     return np.stack([rows.offset, rows.a, rows.d, rows.alpha])

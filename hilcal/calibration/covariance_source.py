@@ -87,17 +87,15 @@ class CovarianceSource:
         check_numbers("covariance", r.covariance, (count, r.m, r.m))
         if r.common is not None:
             check_numbers("common", r.common, (count, r.m, r.common.shape[-1]))
-        for index, names in ((r.pose, r.pose_names), (r.load, r.load_names)):
-            if index.shape != (count,) or np.any((index < 0) | (index >= len(names))):
-                raise ValueError("readings without a pose or load")
-        if r.states.target is not None and np.any(
-            (r.states.target < 0) | (r.states.target >= max(len(r.target_names), 1))
-        ):
-            raise ValueError("readings without a target")
-        if r.states.observer is not None and np.any(
-            (r.states.observer < 0) | (r.states.observer >= len(r.observers))
-        ):
-            raise ValueError("readings without an observer")
+        indices = {
+            "pose": (r.pose, r.pose_names),
+            "load": (r.load, r.load_names),
+            "target": (r.target, r.target_names or ("",)),
+            "observer": (r.observer, r.observers or ("",)),
+        }
+        for name, (index, known) in indices.items():
+            if index.shape != (count,) or np.any((index < 0) | (index >= len(known))):
+                raise ValueError(f"readings without a known {name}")
 
     def to_json(self) -> dict[str, object]:
         """Return it as JSON; numbers of the readings with 7 digits."""

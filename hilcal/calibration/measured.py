@@ -165,8 +165,6 @@ class SensorMount:
     def load_wrench(self, cell: Cell, q: Floats, reading: Floats) -> Floats:
         """Return force and moment (N, 6) of the load at the load point, base axes, N and N·m.
 
-        As in a campaign, the arm is the nominal one.
-
         Args:
             q: (N, n) joint values, rad.
             reading: (N, 6) what the load adds to the sensor's reading, sensor axes.

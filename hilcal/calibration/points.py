@@ -201,11 +201,7 @@ def _everywhere(arm: Arm) -> Floats:
 
 
 def _nearest(arm: Arm, tool: Floats, name: str, near: Floats, goal: Floats) -> Floats:
-    """Return of all joint values (n,) of a pose those nearest to given ones.
-
-    The solution that Newton's method finds from there, where it is near; else the nearest of those
-    that it finds from everywhere.
-    """
+    """Return of all joint values (n,) of a pose those nearest to given ones."""
     starts = near[None]
     for _ in range(2):
         solved = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])

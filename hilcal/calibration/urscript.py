@@ -259,10 +259,7 @@ class _Program:
         return self.statements[k].blocks[: len(blocks)] == blocks
 
     def target(self, node: ast.expr, k: int) -> tuple[Floats | None, Floats | None] | None:
-        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none.
-
-        None where it is not understood.
-        """
+        """Joint values (6,) and pose (4, 4) of a waypoint, each None where it has none."""
         match node:
             case ast.Call(func=ast.Name("get_inverse_kin"), args=[pose, *more], keywords=named):
                 near = [*more, *(n.value for n in named if n.arg == "qnear")]

@@ -118,10 +118,7 @@ def from_text(text: str, number: int) -> RevisionRecord:
 
 
 def fitted_to(record: RevisionRecord) -> tuple[int, str] | None:
-    """Return how many readings a revision was fitted to, the first ones, and their stored hash.
-
-    None where the record does not say.
-    """
+    """Return how many readings a revision was fitted to, the first ones, and their stored hash."""
     identified = record.result_json.get("identify")
     count = identified.get("n_readings") if isinstance(identified, dict) else None
     stored = record.options.get(STORED)

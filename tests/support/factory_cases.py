@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilcal.calibration.handover import dh_rows
+from hilcal.calibration.dh_table import dh_rows
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm

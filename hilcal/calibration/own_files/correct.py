@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from hilcal import limits
-from hilcal.calibration.handover import Corrected, dh_rows
+from hilcal.calibration.dh_table import dh_rows
+from hilcal.calibration.handover import Corrected
 from hilcal.calibration.own_files.chain_text import LEFT, SAME, edits_of, moved, read_xml, redrawn
 from hilcal.calibration.own_files.mjcf_text import mjcf_steps
 from hilcal.calibration.own_files.sdf_text import sdf_chain

@@ -324,11 +324,7 @@ def _turned(arm: Arm, q: Floats) -> Floats:
 
 
 def longest_tool(points: Sequence[ProgramPoint]) -> tuple[Floats, tuple[str, ...]]:
-    """(4, 4) T_flange_tool of the points, of several the longest, and what is to be said.
-
-    Joint values that put the flange where it should be put every tool there; what is stated of the
-    remaining errors holds for one of them.
-    """
+    """(4, 4) T_flange_tool of the points, of several the longest, and what is to be said."""
     poses = [p for p in points if not p.joints] or list(points)
     first = max(poses, key=lambda p: float(np.linalg.norm(p.tool[:3, 3])))
     if all(np.allclose(p.tool, first.tool, atol=1e-9) for p in poses):

@@ -282,12 +282,7 @@ class ControllerFrames:
         return next(named, None)
 
     def pose(self, what: str, name: str, words: str, none: str = "0") -> Floats | str:
-        """Pose (4, 4) of a tool or base, or why it is not known.
-
-        Args:
-            words: what it is called, for people.
-            none: name of that which is no tool, or the base itself.
-        """
+        """Pose (4, 4) of a tool or base, or why it is not known."""
         given = self.given(what, name)
         if given is not None or name.upper() == none:
             return np.eye(4) if given is None else given
@@ -356,11 +351,7 @@ class ProgramReader:
         return InputError(f"{self.path.name}: line {line}: {what}; valid: {valid}")
 
     def take(self, key: str, new: ProgramPoint, line: int, obeyed: bool = False) -> None:
-        """Take the point of a motion; one that is there is left where its frames differ.
-
-        Args:
-            obeyed: whether this motion takes the configuration that is stated.
-        """
+        """Take the point of a motion; one that is there is left where its frames differ."""
         old = self.found.get(key)
         if old is None or (new.left and not old.left):
             self.found[key] = new

@@ -275,9 +275,13 @@ class _RapidReader(ProgramReader):
             return bare.at_joints(spans[:JOINTS], values[:JOINTS], np.eye(4))
         if not np.isclose(np.linalg.norm(values[3:POSE]), 1.0, atol=1e-3):
             return replace(bare, left="its quaternion is not of length 1")
-        stated, config = values[POSE : POSE + 4], tuple(spans[POSE : POSE + 3])
-        more = {"flags": tuple(int(v) for v in stated), "config": config}
-        return replace(bare, numbers=tuple(spans[:POSE]), values=values[:POSE], **more)
+        return replace(
+            bare,
+            numbers=tuple(spans[:POSE]),
+            values=values[:POSE],
+            flags=tuple(int(v) for v in values[POSE : POSE + 4]),
+            config=tuple(spans[POSE : POSE + 3]),
+        )
 
     def _made(self, text: str, made: re.Match[str], at: int, line: int) -> ProgramPoint:
         """Return the point that `Offs` or `RelTool` makes, to be written in its place."""

@@ -12,15 +12,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.handover import (
-    UR_JOINTS,
-    corrected,
-    dh_rows,
-    frames,
-    to_toml,
-    ur_kinematics,
-    urdf,
-)
+from hilcal.calibration.dh_table import dh_rows, to_toml
+from hilcal.calibration.handover import UR_JOINTS, corrected, frames, ur_kinematics, urdf
 from hilcal.calibration.own_files.correct import correct_file
 from hilcal.drivers.simulated.world import World
 from hilcal.identification.baseline import with_effects

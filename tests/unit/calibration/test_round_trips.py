@@ -16,15 +16,8 @@ from scipy.spatial.transform import Rotation
 import hilcal as hc
 from hilcal.calibration.calibration import Calibration
 from hilcal.calibration.compiled import Compiled, compiled
-from hilcal.calibration.handover import (
-    CONVENTIONS,
-    UR_JOINTS,
-    dh_rows,
-    flange_poses,
-    to_toml,
-    ur_kinematics,
-    urdf,
-)
+from hilcal.calibration.dh_table import CONVENTIONS, dh_rows, flange_poses, to_toml
+from hilcal.calibration.handover import UR_JOINTS, ur_kinematics, urdf
 from hilcal.calibration.measured import Measured
 from hilcal.calibration.scatter import Scatter
 from hilcal.calibration.storage import from_json, to_json

@@ -13,7 +13,8 @@ import pinocchio as pin
 import pytest
 
 import hilcal as hc
-from hilcal.calibration.handover import dh_rows, flange_poses, to_toml, urdf
+from hilcal.calibration.dh_table import dh_rows, flange_poses, to_toml
+from hilcal.calibration.handover import urdf
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.drivers.simulated.rehearsal import Rehearsal, case_of_plan, read_plan

@@ -37,7 +37,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from hilcal.calibration import storage
-from hilcal.calibration.handover import dh_rows, to_csv, to_toml, ur_kinematics, urdf
+from hilcal.calibration.dh_table import dh_rows, to_csv, to_toml
+from hilcal.calibration.handover import ur_kinematics, urdf
 from hilcal.calibration.points import read_points
 from hilcal.calibration.urscript import movej_program, waypoints
 from hilcal.cli.compensating import _csv

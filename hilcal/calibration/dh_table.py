@@ -1,0 +1,266 @@
+"""An arm of any constant transforms as a Denavit-Hartenberg table, and what that cannot hold.
+
+Between two joints every transform is, with the common normal of their axes,
+
+    L = Rz(φ) Tz(s) Tx(a) Rx(α) Tz(t) Rz(ψ)
+
+and the parts about z join the joints' offsets and distances, so rows hold the relative places of
+all axes exactly. Nearly parallel axes have a far common normal: d of both joints is large there,
+and cancels. What rows cannot hold is where the first axis lies in the base, and how the flange sits
+on the last one:
+
+    T_base_flange = B Π_i row_i(q_i) E
+
+with B without a part about z at its end, E without one at its beginning. They are stated beside the
+rows, as `base_m_rad` and `flange_m_rad`.
+
+Source: Craig, *Introduction to Robotics*, sections 3.3 and 3.4; Hayati, "Robot arm geometric link
+parameter estimation", IEEE CDC 1983, for parallel axes.
+"""
+
+import csv
+import io
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import tomli_w
+
+from hilcal.errors import InputError
+from hilcal.names import csv_text, escaped
+from hilcal.robot import se3
+from hilcal.robot.arm import Arm
+from hilcal.robot.chain import evaluate
+from hilcal.types import Floats
+
+Convention = Literal["standard", "modified"]
+CONVENTIONS: tuple[Convention, ...] = ("standard", "modified")
+PARALLEL = 1e-9
+"""rad; axes at a smaller angle are taken for parallel, which moves the tool by a nanometre."""
+CROSSED = 0.1
+"""rad; from this angle on the end of a chain is part of the rows, as a link is; a choice."""
+EXACT = 1e-9
+"""m; differences below it are not worth a word."""
+TRIALS = 200
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DhRows:
+    """A table of n joints."""
+
+    convention: Convention  # of the rows, see `robot.dh.arm_from_dh`
+    a: Floats  # (n,) m
+    d: Floats  # (n,) m
+    alpha: Floats  # (n,) rad
+    offset: Floats  # (n,) rad
+    base: Floats  # (4, 4) B
+    flange: Floats  # (4, 4) E
+    base_moves: float = 0.0  # most that the flange moves where B is left out, m
+    flange_moves: float = 0.0  # the same of E, m
+    table_moves: float = 0.0  # the same of both together
+    disagreement: float = 0.0  # most that the flange is elsewhere with B and E, m: rounding
+    slides: tuple[int, ...] = ()  # joints that slide, counted from 0: q adds to d
+
+
+def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
+    """Return the table of an arm.
+
+    Args:
+        convention: "standard" (classic) or "modified" (Craig) rows.
+    """
+    if arm.coupling is not None or arm.drive is not None:
+        raise InputError(f"{arm.name}: joints are coupled, which a DH table cannot hold")
+    n = arm.n
+    before, after = np.zeros((n + 1, 2)), np.zeros((n + 1, 2))  # angle, distance along z
+    across = np.zeros((n + 1, 2))  # a, α
+    for k in range(1, n):
+        before[k], across[k], after[k] = _common_normal(arm.links[k])
+    base, flange = np.eye(4), np.eye(4)
+    first, last = arm.links[0], arm.links[n]
+    if convention == "modified" and _tilt(first) > CROSSED:
+        start, across[0], after[0] = _common_normal(first)
+        base = se3.screw(2, *start)
+    else:
+        after[0] = _twist_last(first)
+        base = first @ se3.screw(2, *-after[0])
+    if convention == "standard" and _tilt(last) > CROSSED:
+        before[n], across[n], end = _common_normal(last)
+        flange = se3.screw(2, *end)
+    else:
+        before[n] = twist_first(last)
+        flange = se3.screw(2, *-before[n]) @ last
+    along = after[:n] + before[1:]
+    shift = 1 if convention == "standard" else 0
+    a, alpha = across[shift : n + shift].T
+    slides = tuple(np.flatnonzero(arm.slides).tolist())
+    rows = DhRows(
+        convention, a, along[:, 1], alpha, _wrapped(along[:, 0]), base, flange, slides=slides
+    )
+    return _judged(rows, arm)
+
+
+def row_transforms(rows: DhRows, q: Floats) -> Floats:
+    """(N, n, 4, 4) transforms of the rows at joint values (N, n), rad; m where joints slide."""
+    out = np.empty((*q.shape, 4, 4))
+    for k in range(q.shape[1]):
+        across = se3.screw(0, rows.alpha[k], rows.a[k])
+        for i, value in enumerate(q[:, k]):
+            angle, travel = (0.0, value) if k in rows.slides else (value, 0.0)
+            turn = se3.screw(2, angle + rows.offset[k], rows.d[k] + travel)
+            out[i, k] = turn @ across if rows.convention == "standard" else across @ turn
+    return out
+
+
+def flange_poses(rows: DhRows, q: Floats, *, whole: bool = True) -> Floats:
+    """(N, 4, 4) poses of the flange by the rows, with B and E unless `whole` is False."""
+    place = np.broadcast_to(rows.base if whole else np.eye(4), (len(q), 4, 4))
+    for part in np.moveaxis(row_transforms(rows, q), 1, 0):
+        place = place @ part
+    return np.asarray(place @ rows.flange if whole else place)
+
+
+def to_csv(rows: DhRows, arm: Arm) -> str:
+    """Return the rows alone, in m and rad."""
+    stream = io.StringIO()
+    out = csv.writer(stream, lineterminator="\n")
+    out.writerow(("joint", "a_m", "d_m", "alpha_rad", "offset_rad"))
+    numbers = zip(*(x.tolist() for x in (rows.a, rows.d, rows.alpha, rows.offset)), strict=True)
+    for name, row in zip(arm.joint_names, numbers, strict=True):
+        out.writerow((csv_text(name), *map(repr, row)))
+    return stream.getvalue()
+
+
+def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
+    """Return a file of the robot catalogue, which `[robot] model = "F.toml"` of a cell reads.
+
+    Args:
+        arm: gives masses, limits and payload; what its description lacks is left out.
+    """
+    com = _centres(rows, arm)
+    content: dict[str, object] = {
+        "title": escaped(title),
+        **({"payload_kg": float(arm.payload)} if np.isfinite(arm.payload) else {}),
+        "source": escaped(f"{arm.source}; corrected by calibration"),
+        "convention": rows.convention,
+        "base_m_rad": se3.six(rows.base),
+        "flange_m_rad": se3.six(rows.flange),
+    }
+    if arm.repeatability is not None:
+        content["repeatability_m"] = arm.repeatability
+    content["joints"] = [
+        {
+            "name": escaped(arm.joint_names[k]),
+            "a_m": float(rows.a[k]),
+            "d_m": float(rows.d[k]),
+            "alpha_deg": float(np.degrees(rows.alpha[k])),
+            "offset_deg": float(np.degrees(rows.offset[k])),
+            "mass_kg": float(arm.masses[k]),
+            "com_m": com[k].tolist(),
+            **_ranges(arm, k),
+        }
+        for k in range(arm.n)
+    ]
+    law = {
+        "standard": "B * product of Rz(q + offset) Tz(d) Tx(a) Rx(alpha) * E",
+        "modified": "B * product of Rx(alpha) Tx(a) Rz(q + offset) Tz(d) * E",
+    }[rows.convention]
+    head = (
+        f"# T_base_flange = {law},\n"
+        "# B = base_m_rad and E = flange_m_rad: x, y, z and rotation vector, m and rad. Programs\n"
+        "# that read the rows alone put the flange up to "
+        f"{1e3 * rows.table_moves:.4f} mm elsewhere.\n"
+    )
+    return head + tomli_w.dumps(content)
+
+
+def _ranges(arm: Arm, k: int) -> dict[str, object]:
+    """Kind, limits and torque of a joint, as a row has them."""
+    low, high, torque = (float(x[k]) for x in (arm.q_min, arm.q_max, arm.torque_max))
+    if arm.slides[k]:
+        out: dict[str, object] = {"type": "prismatic", "q_min_m": low, "q_max_m": high}
+        return out | ({"force_max_N": torque} if np.isfinite(torque) else {})
+    out = {"q_min_deg": float(np.degrees(low)), "q_max_deg": float(np.degrees(high))}
+    return out | ({"torque_max_Nm": torque} if np.isfinite(torque) else {})
+
+
+def _judged(rows: DhRows, arm: Arm) -> DhRows:
+    """Return the rows with what they cannot hold, at random joint values."""
+    q = np.random.default_rng(20250309).uniform(-np.pi, np.pi, (TRIALS, arm.n))
+    chain = evaluate(arm, q)
+    there = se3.matrix(chain.rotation[-1], chain.position[-1])
+    held = flange_poses(rows, q, whole=False)
+
+    def moved(poses: Floats) -> float:
+        return float(np.linalg.norm((poses - there)[:, :3, 3], axis=1).max())
+
+    return DhRows(
+        rows.convention, rows.a, rows.d, rows.alpha, rows.offset, rows.base, rows.flange,
+        base_moves=moved(held @ rows.flange),
+        flange_moves=moved(rows.base @ held),
+        table_moves=moved(held),
+        disagreement=moved(rows.base @ held @ rows.flange),
+        slides=rows.slides,
+    )  # fmt: skip
+
+
+def _centres(rows: DhRows, arm: Arm) -> Floats:
+    """(n, 3) centres of mass in DH frame i, after row i."""
+    parts = row_transforms(rows, np.zeros((1, arm.n)))[0]
+    body, frame, out = np.eye(4), rows.base, np.empty((arm.n, 3))
+    for k in range(arm.n):
+        body, frame = body @ arm.links[k], frame @ parts[k]
+        point = body[:3, :3] @ arm.coms[k] + body[:3, 3]
+        out[k] = frame[:3, :3].T @ (point - frame[:3, 3])
+    return out
+
+
+def _common_normal(link: Floats) -> tuple[Floats, Floats, Floats]:
+    """(φ, s), (a, α) and (ψ, t) of a transform; φ within a quarter turn."""
+    x, y, z = link[:3, 2]
+    sine = float(np.hypot(x, y))
+    p = link[:3, 3]
+    if sine > PARALLEL:
+        phi, alpha = np.arctan2(x, -y), np.arctan2(sine, z)
+    else:
+        phi = np.arctan2(p[1], p[0]) if np.hypot(p[0], p[1]) > 0 else 0.0
+        alpha = 0.0 if z > 0 else np.pi
+    if abs(phi) > np.pi / 2 + 1e-9:
+        phi -= np.copysign(np.pi, phi)
+        alpha = -alpha
+    across = np.array([np.cos(phi), np.sin(phi), 0.0])
+    a = float(across @ p)
+    t = 0.0
+    if sine > PARALLEL:
+        t = float(across[1] * p[0] - across[0] * p[1]) / np.sin(alpha)
+    s = float(p[2] - t * np.cos(alpha))
+    turned = (se3.screw(2, phi) @ se3.screw(0, alpha))[:3, :3].T @ link[:3, :3]
+    psi = np.arctan2(turned[1, 0], turned[0, 0])
+    return np.array([phi, s]), np.array([a, alpha]), np.array([psi, t])
+
+
+def twist_first(link: Floats) -> Floats:
+    """Angle and distance of Rz Tz at the beginning of a transform, the rest having none."""
+    return np.array([_about_z(link), link[2, 3]])
+
+
+def _twist_last(link: Floats) -> Floats:
+    """Angle and distance of Rz Tz at the end of a transform, the rest having none."""
+    return np.array([_about_z(link), link[:3, 2] @ link[:3, 3]])
+
+
+def _about_z(link: Floats) -> float:
+    """Part of a rotation about z, the other being about a horizontal axis."""
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    z, w = Rotation.from_matrix(link[:3, :3]).as_quat()[2:]
+    return float(2.0 * np.arctan2(z, w)) if np.hypot(z, w) > 1e-9 else 0.0
+
+
+def _tilt(link: Floats) -> float:
+    return float(np.arctan2(np.hypot(link[0, 2], link[1, 2]), abs(link[2, 2])))
+
+
+def _wrapped(angle: Floats) -> Floats:
+    """Angles within half a turn; those that are nothing but rounding are zero."""
+    out = angle - 2 * np.pi * np.rint(angle / (2 * np.pi))
+    return np.where(np.abs(out) < 1e-15, 0.0, out)
