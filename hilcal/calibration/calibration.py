@@ -34,12 +34,7 @@ from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.errors import InputError
 from hilcal.identification.fit import Fit
 from hilcal.identification.predictive import position_factor, predictive
-from hilcal.identification.robot_frames import (
-    RobotFrames,
-    one_of_each,
-    robot_frames,
-    whole_turns,
-)
+from hilcal.identification.robot_frames import RobotFrames, one_of_each, robot_frames, whole_turns
 from hilcal.model.model import Model, Prediction
 from hilcal.readings.readings import States
 from hilcal.readings.whitening import Mode
@@ -121,6 +116,10 @@ class Calibration(Brief):
         # A deflection is the difference of two readings.
         readings = 2 if found.mode == "deflection" else 1
         loads = () if model.cell.config is None else model.cell.config.loads
+        learnt = None
+        if model.prior is None:  # else the covariance does not follow from these readings alone
+            stated = p.excess.of_readings(used, found.mode)
+            learnt = CovarianceSource(stated, p.prior, p.noise, kappa)
         made = cls(
             model=replace(model, readings=None, prior=None),
             theta=found.theta,
@@ -132,15 +131,7 @@ class Calibration(Brief):
             loads={load.name: load.wrench(model.cell.gravity) for load in loads},
             source=dict(source or {}),
             sensor=SensorMount.of(model.cell),
-            # With a carried prior the covariance does not follow from these readings alone.
-            learnt=None
-            if model.prior is not None
-            else CovarianceSource(
-                p.excess.of_readings(used, found.mode),
-                p.prior,
-                p.noise,
-                kappa,
-            ),
+            learnt=learnt,
         )
         return replace(made, conditions=conditions_of(model, used.states, made._moves))
 
@@ -225,7 +216,7 @@ class Calibration(Brief):
         if wanted is not None:
             given = np.broadcast_to(np.asarray(wanted, dtype=float), (len(states), 4, 4))
             goal = np.array(given[:, :3, :3]), np.array(given[:, :3, 3])
-        fast = self._compiled if of is self._tracked else compiled(of, self.mode)
+        fast = self._kernel(of)
         if isinstance(fast, Compiled):
             found, left = fast.compensate(states, goal)
             inverse = Inverse(found, left[:, 0], left[:, 1])
@@ -251,10 +242,12 @@ class Calibration(Brief):
         """The model for the compiled kernel, with the tracked target as the tool."""
         return compiled(self._tracked, self.mode)
 
+    def _kernel(self, of: ToolPose) -> Compiled | tuple[str, ...]:
+        return self._compiled if of is self._tracked else compiled(of, self.mode)
+
     def without_kernel(self, tool: Floats | None = None) -> tuple[str, ...]:
         """Names of what the compiled kernel has no form for: some hundred times slower with it."""
-        of = self._tool(tool)
-        found = self._compiled if of is self._tracked else compiled(of, self.mode)
+        found = self._kernel(self._tool(tool))
         return () if isinstance(found, Compiled) else found
 
     def _invert(self, of: ToolPose, states: States, goal: tuple[Floats, Floats]) -> Inverse:

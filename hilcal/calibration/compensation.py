@@ -55,11 +55,7 @@ class Inverse:
 
 
 def invert(
-    arm: Arm,
-    poses: Callable[[Floats, Ints], Pose],
-    q: Floats,
-    rotation: Floats,
-    position: Floats,
+    arm: Arm, poses: Callable[[Floats, Ints], Pose], q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
     """Find joint values.
 

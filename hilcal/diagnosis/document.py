@@ -30,11 +30,7 @@ def to_json(d: "Diagnosis") -> dict[str, object]:
         "where": [asdict(v) for v in d.misfit_breakdown],
         "suspects": [suspect_json(s) for s in d.suspects],
         "not_shown": list(d.not_shown),
-        "tests": {
-            "count": d.tested,
-            "level": FALSE_ALARM,
-            "each": FALSE_ALARM / max(d.tested, 1),
-        },
+        "tests": {"count": d.tested, "level": FALSE_ALARM, "each": FALSE_ALARM / max(d.tested, 1)},
         "apart": [
             {"effect": a.effect, "unlike": a.unlike, "times": a.times if a.possible else None}
             for a in d.separability

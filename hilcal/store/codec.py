@@ -107,10 +107,10 @@ def read_document(
     if not isinstance(content, dict) or content.get("format") != form:
         raise InputError(f'no {what}; valid: a JSON document with "format": "{form}"')
     if content.get("version") not in versions:
-        known = " and ".join(map(str, versions))
+        known = "version" + "s" * (len(versions) > 1) + " " + " and ".join(map(str, versions))
         raise InputError(
             f"a {what} of version {content.get('version')}, written by hilcal "
-            f"{content.get('hilcal')}; this program reads version{'s' * (len(versions) > 1)} {known}"
+            f"{content.get('hilcal')}; this program reads {known}"
         )
     check_names({k: v for k, v in content.items() if k != "source"}, what)
     try:

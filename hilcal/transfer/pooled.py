@@ -261,14 +261,7 @@ def _changed(
         return []
     worst = unlike(np.array(change), np.array(spread))
     return [
-        _odd(
-            o,
-            members[after[o.unit]].arm,
-            members[after[o.unit]].name,
-            names,
-            scale,
-            members,
-        )
+        _odd(o, members[after[o.unit]].arm, members[after[o.unit]].name, names, scale, members)
         for o in worst
     ]
 

@@ -19,13 +19,7 @@ from hilcal.calibration.points import Points, solutions
 from hilcal.calibration.programs.fanuc import read_ls
 from hilcal.calibration.programs.inform import read_jbi
 from hilcal.calibration.programs.krl import read_krl
-from hilcal.calibration.programs.program import (
-    JOINTS,
-    UNSTATED,
-    Language,
-    Program,
-    ProgramPoint,
-)
+from hilcal.calibration.programs.program import JOINTS, UNSTATED, Language, Program, ProgramPoint
 from hilcal.calibration.programs.rapid import read_rapid
 from hilcal.errors import InputError
 from hilcal.names import escaped
@@ -244,12 +238,7 @@ def resolve(
 
 
 def _one(
-    arm: Arm,
-    language: Language,
-    p: ProgramPoint,
-    before: Floats | None,
-    stated: Ints,
-    asked: Bools,
+    arm: Arm, language: Language, p: ProgramPoint, before: Floats | None, stated: Ints, asked: Bools
 ) -> tuple[Floats, str]:
     """Joint values of a pose, and why they are not certain; raises as `resolve` does."""
     goal = p.frame @ language.pose(p.values)

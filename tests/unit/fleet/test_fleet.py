@@ -23,14 +23,7 @@ from hilcal.transfer.members import Failure, Member, entries, member_of
 from hilcal.transfer.pooled import effects_seen, pooled
 from hilcal.types import Floats
 from tests.support.calibrate_process import CELL
-from tests.support.campaigns import (
-    cell_of,
-    configuration,
-    noiseless,
-    plan,
-    with_noise,
-    world_of,
-)
+from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.cli_cases import Capsys, ok, refused
 
 SPREAD = 0.15

@@ -304,12 +304,7 @@ def test_a_joint_that_passes_zero_changes_its_turn(arms: dict[str, Arm], tmp_pat
         ("rapid", "fine,tool0;", "fine,tPen;", "the tool 'tPen' is not in the program; give it by"),
         ("rapid", "[FALSE,TRUE,", "[FALSE,FALSE,", "the work object 'wTable' is not fixed"),
         ("rapid", ",[9E+09,", ",[150,", "an external axis moves"),
-        (
-            "fanuc",
-            "CNT100    ;",
-            "CNT100 Offset,PR[1]    ;",
-            "line 12 uses or changes it",
-        ),
+        ("fanuc", "CNT100    ;", "CNT100 Offset,PR[1]    ;", "line 12 uses or changes it"),
         ("fanuc", "L P[3]", "L PR[3]", "line 15: a position register"),
         ("fanuc", "L P[3]", "L P[R[1]]", "P[1] (line 19): line 15 uses or changes it otherwise"),
         ("fanuc", "R[1]=R[1]+1", "UFRAME[1]=PR[2]", "line 14: 'UFRAME[1]=' changes a frame"),
