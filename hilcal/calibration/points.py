@@ -101,11 +101,9 @@ def read_points(
             mapping, taken = _guessed(path, arm)
         table = _mapped(path, arm, mapping)
     groups = _groups(arm)
-    found = {k: table.matrix(names) for k, names in groups.items() if names[0] in table.number}
-    q = found.pop("q_rad", None)
-    if "q_deg" in found:
-        q = found.pop("q_deg")
-        q = np.where(arm.slides, 1e-3 * q, np.radians(q))
+    there = [group for group in groups if group[1][0] in table.number]
+    found = {what: table.matrix(names) * factor for what, names, factor in there}
+    q = found.pop("q", None)
     if q is not None and np.any(large := (np.abs(q) > LARGEST) & ~arm.slides):
         k = int(np.argmax(np.any(large, axis=1)))
         raise InputError(
@@ -120,8 +118,8 @@ def read_points(
     wanted = _poses(found, q, arm)
     if q is None and wanted is None:
         raise InputError(
-            f"{path}: neither joint values nor poses; valid: columns {groups['q_rad'][0]} … "
-            f"{groups['q_rad'][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
+            f"{path}: neither joint values nor poses; valid: columns {groups[0][1][0]} … "
+            f"{groups[0][1][-1]}, or x_m, y_m, z_m with rx_rad, ry_rad, rz_rad"
         )
     if q is None:
         q = np.full((len(names), arm.n), np.nan)
@@ -289,31 +287,35 @@ def _mapped(path: Path, arm: Arm, mapping: PointMapping) -> ColumnTable:
     return replace(table, text=text)
 
 
-def _groups(arm: Arm) -> dict[str, tuple[str, ...]]:
-    """Columns by what they give; those of one group come together."""
-    q, n = joint_columns(arm.units), arm.n
-    return {
-        "q_rad": q,
-        "q_deg": tuple(f"{n}m" if n.endswith("_m") else n.replace("_rad", "_deg") for n in q),
-        "position_m": POSITION,
-        "position_mm": tuple(name.replace("_m", "_mm") for name in POSITION),
-        "rotation_rad": ROTATION,
-        "rotation_deg": tuple(name.replace("_rad", "_deg") for name in ROTATION),
-        "wrench": WRENCH,
-        "sensed": tuple(f"sensor_{name}" for name in WRENCH),
-        "air_temperature": ("air_degC",),
-        "joint_temperature": temperature_columns(n),
-        "load_time": ("load_time_s",),
-        "time": ("time_s",),
-        "approach": approach_columns(n),
-    }
+_Groups = list[tuple[str, tuple[str, ...], Floats | float]]
+
+
+def _groups(arm: Arm) -> _Groups:
+    """What columns give, their names, and the factor to SI; those of one group come together."""
+    q, n, degree = joint_columns(arm.units), arm.n, np.pi / 180
+    others = tuple(f"{c}m" if c.endswith("_m") else c.replace("_rad", "_deg") for c in q)
+    return [
+        ("q", q, 1.0),
+        ("q", others, np.where(arm.slides, 1e-3, degree)),
+        ("position", POSITION, 1.0),
+        ("position", tuple(name.replace("_m", "_mm") for name in POSITION), 1e-3),
+        ("rotation", ROTATION, 1.0),
+        ("rotation", tuple(name.replace("_rad", "_deg") for name in ROTATION), degree),
+        ("wrench", WRENCH, 1.0),
+        ("sensed", tuple(f"sensor_{name}" for name in WRENCH), 1.0),
+        ("air_temperature", ("air_degC",), 1.0),
+        ("joint_temperature", temperature_columns(n), 1.0),
+        ("load_time", ("load_time_s",), 1.0),
+        ("time", ("time_s",), 1.0),
+        ("approach", approach_columns(n), 1.0),
+    ]
 
 
 def _checked(
-    path: Path, header: Sequence[str], groups: Mapping[str, tuple[str, ...]], arm: Arm
+    path: Path, header: Sequence[str], groups: _Groups, arm: Arm
 ) -> tuple[Sequence[str], Sequence[str]]:
     """Check a header; returns its text and its number columns."""
-    known = [name for names in groups.values() for name in names]
+    known = [name for _, names, _ in groups for name in names]
     exchanged = set(known_columns(arm.units))
     ours = {*known, *exchanged} - {"pose", "load", "target"}
     for name in header:
@@ -327,20 +329,17 @@ def _checked(
             )
         if header.count(name) > 1:
             raise InputError(f"{path}: column '{name}' is there twice")
-    for names in groups.values():
+    first: dict[str, list[str]] = {"hung": ["load"] * ("load" in header)}
+    for what, names, _ in groups:
         missing = [name for name in names if name not in header]
         if missing and len(missing) < len(names):
             raise InputError(f"{path}: column '{missing[0]}' is missing beside its group")
-    for a, b in (
-        ("q_rad", "q_deg"),
-        ("position_m", "position_mm"),
-        ("rotation_rad", "rotation_deg"),
-    ):
-        if groups[a][0] in header and groups[b][0] in header:
-            raise InputError(f"{path}: both {groups[a][0]} and {groups[b][0]}; give one of them")
-    told = [n for n in ("load", WRENCH[0], groups["sensed"][0]) if n in header]
-    if len(told) > 1:
-        raise InputError(f"{path}: both {told[0]} and {told[1]}; give one of them")
+        if not missing:
+            key = "hung" if what in ("wrench", "sensed") else what
+            first.setdefault(key, []).append(names[0])
+    for given in first.values():
+        if len(given) > 1:
+            raise InputError(f"{path}: both {given[0]} and {given[1]}; give one of them")
     text = [name for name in ("pose", "load") if name in header]
     return text, [name for name in header if name in known]
 
@@ -358,11 +357,7 @@ def _load(table: ColumnTable, row: int, loads: Mapping[str, Floats]) -> Floats:
 
 def _poses(found: dict[str, Floats], q: Floats | None, arm: Arm) -> Floats | None:
     """(N, 4, 4) poses, taken out of what was found; None where there are none."""
-    position, rotation = found.pop("position_m", None), found.pop("rotation_rad", None)
-    if "position_mm" in found:
-        position = 1e-3 * found.pop("position_mm")
-    if "rotation_deg" in found:
-        rotation = np.radians(found.pop("rotation_deg"))
+    position, rotation = found.pop("position", None), found.pop("rotation", None)
     if position is None and rotation is None:
         return None
     if position is None or (rotation is None and q is None):

@@ -262,6 +262,68 @@ class Decision:
         }
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Question:
+    """Whether to measure more, after a diagnosis."""
+
+    cell: Cell
+    config: CellConfig
+    settings: Settings
+    d: Diagnosis  # of the last fit
+    error: PredictedError
+    reference: Floats | None  # (n,) joints of the reference pose of the plans so far, rad
+    rng: np.random.Generator
+    say: Say
+
+    def separating(self) -> Decision | None:
+        """Return what would settle a doubt; None where there is none."""
+        doubt = doubt_of(self.d, self.say)
+        if doubt is None:
+            return None
+        nothing = Decision("inseparable", self.d.verdict, self.error, suspects=doubt.suspects)
+        poses, site = self.settings.poses, (self.cell, self.config)
+        try:
+            found = separating(*site, doubt, None, self.rng, self.say, self.reference, poses)
+        except (CannotAnswerError, InputError):
+            return nothing
+        separable = [p for p in found.powers if not p.not_separable]
+        if max((p.then - p.now for p in separable), default=0.0) < TOLD:
+            return nothing
+        plan, power = plan_of(found, doubt.suspects), min(p.then for p in separable)
+        seconds = duration_of(plan)
+        return replace(nothing, reason="doubt", power=power, plan=plan, seconds=seconds)
+
+    def sharpening(self) -> Decision | None:
+        """Return what would lower the predicted error; None where it is as wanted."""
+        goal, error = self.settings.goal_m, self.error
+        if goal is None or error.now_m <= goal:
+            return None
+        decision = Decision("no_gain", self.d.verdict, error)
+        if error.floor_m >= goal:
+            return replace(decision, reason="floor")
+        self.say("planning what would lower the predicted error")
+        planning = self.config.planning.model_copy(update={"readings": self.d.fit.mode})
+        config, asked = self.config.model_copy(update={"planning": planning}), self.settings.poses
+        try:
+            planned = make(
+                *(self.cell, config, Request(asked), self.rng, self.d.fit, self.say),
+                reference=self.reference,
+            )
+        except (CannotAnswerError, InputError):
+            return decision
+        before = predicted(planned.problem, work=planned.work).position
+        after, share = planned.predicted.position, 1.0
+        if before is not None and after is not None and np.isfinite(after):
+            share = (after / before) ** 2 if np.isfinite(before) and before > 0 else 0.0
+        of_parameters = max(error.now_m**2 - error.floor_m**2, 0.0)
+        then = float(np.sqrt(error.floor_m**2 + share * of_parameters))
+        if then > (1.0 - WORTH) * error.now_m:
+            return replace(decision, then_m=then)
+        plan = replace(planned.ordered.plan, about=about(planned))
+        seconds = duration_of(plan)
+        return replace(decision, reason="goal", then_m=then, plan=plan, seconds=seconds)
+
+
 def decide(
     cell: Cell,
     config: CellConfig,
@@ -279,23 +341,20 @@ def decide(
     `plans` are those so far, `reference` (n,) the joints of their reference pose, rad.
     """
     error = predicted_error(Calibration.of(d.fit), d.fit.readings.states, config)
-    verdict: str = d.verdict
-    further = _separating(cell, config, settings, d, error, reference, rng, say)
+    question = _Question(cell, config, settings, d, error, reference, rng, say)
+    further = question.separating()
     if further is None or not further.measures:
-        sharper = _sharpening(cell, config, settings, d, error, reference, rng, say)
+        sharper = question.sharpening()
         if sharper is not None and (further is None or sharper.measures):
             further = sharper
     if further is None:
-        reached = settings.goal_m is not None and verdict == "adequate"
-        return Decision("goal_met" if reached else verdict, verdict, error)
+        reached = settings.goal_m is not None and d.verdict == "adequate"
+        return Decision("goal_met" if reached else d.verdict, d.verdict, error)
     if not further.measures:
         return further
-    spent = sum(map(duration_of, plans))
-    if spent + further.seconds > settings.max_time_s:
+    if sum(map(duration_of, plans)) + further.seconds > settings.max_time_s:
         return replace(further, reason="time")
-    if len(plans) >= MOST_PLANS:
-        return replace(further, reason="plans")
-    return further
+    return replace(further, reason="plans") if len(plans) >= MOST_PLANS else further
 
 
 def predicted_error(calibration: Calibration, fitted: States, config: CellConfig) -> PredictedError:
@@ -327,67 +386,3 @@ def _work(fitted: States, config: CellConfig) -> States:
         work = np.array(config.planning.work_q_rad, dtype=float)
         between = work[np.arange(len(rows)) % len(work)]
     return replace(fitted[rows], q=between, q_actual=None, target=None)
-
-
-def _separating(
-    cell: Cell,
-    config: CellConfig,
-    settings: Settings,
-    d: Diagnosis,
-    error: PredictedError,
-    reference: Floats | None,
-    rng: np.random.Generator,
-    say: Say,
-) -> Decision | None:
-    """Return what would settle a doubt; None where there is none."""
-    doubt = doubt_of(d, say)
-    if doubt is None:
-        return None
-    nothing = Decision("inseparable", d.verdict, error, suspects=doubt.suspects)
-    try:
-        found = separating(cell, config, doubt, None, rng, say, reference, usual=settings.poses)
-    except (CannotAnswerError, InputError):
-        return nothing
-    gain = max((p.then - p.now for p in found.powers if not p.not_separable), default=0.0)
-    power = min((p.then for p in found.powers if not p.not_separable), default=0.0)
-    if gain < TOLD:
-        return nothing
-    plan = plan_of(found, doubt.suspects)
-    return Decision("doubt", d.verdict, error, None, doubt.suspects, power, plan, duration_of(plan))
-
-
-def _sharpening(
-    cell: Cell,
-    config: CellConfig,
-    settings: Settings,
-    d: Diagnosis,
-    error: PredictedError,
-    reference: Floats | None,
-    rng: np.random.Generator,
-    say: Say,
-) -> Decision | None:
-    """Return what would lower the predicted error; None where it is as wanted."""
-    goal = settings.goal_m
-    if goal is None or error.now_m <= goal:
-        return None
-    if error.floor_m >= goal:
-        return Decision("floor", d.verdict, error)
-    say("planning what would lower the predicted error")
-    planning = config.planning.model_copy(update={"readings": d.fit.mode})
-    own = config.model_copy(update={"planning": planning})
-    try:
-        wanted = Request(settings.poses)
-        planned = make(cell, own, wanted, rng, d.fit, say, reference=reference)
-    except (CannotAnswerError, InputError):
-        return Decision("no_gain", d.verdict, error)
-    before = predicted(planned.problem, work=planned.work).position
-    after = planned.predicted.position
-    share = 1.0
-    if before is not None and after is not None and np.isfinite(after):
-        share = (after / before) ** 2 if np.isfinite(before) and before > 0 else 0.0
-    own_part = max(error.now_m**2 - error.floor_m**2, 0.0)
-    then = float(np.sqrt(error.floor_m**2 + share * own_part))
-    if then > (1.0 - WORTH) * error.now_m:
-        return Decision("no_gain", d.verdict, error, then)
-    plan = replace(planned.ordered.plan, about=about(planned))
-    return Decision("goal", d.verdict, error, then, plan=plan, seconds=duration_of(plan))

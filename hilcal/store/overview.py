@@ -130,16 +130,12 @@ def _count(index: Sequence[int], names: Sequence[str]) -> dict[str, int]:
 def _instruments(events: Sequence[Mapping[str, Any]]) -> tuple[MeasuringDevice, ...]:
     found: dict[tuple[str, str], MeasuringDevice] = {}
     for event in events:
-        for answer in event["answers"] if event["kind"] == "devices" else ():
-            facts, name = dict(answer["facts"]), str(answer["name"])
-            told = _SERIAL.search(name)
-            serial = facts.get("serial number") or (told and told[1].rstrip(",;"))
-            found.setdefault(
-                (answer["device"], name),
-                MeasuringDevice(
-                    answer["device"], answer["driver"], name, serial, facts, event["utc"]
-                ),
-            )
+        for a in event["answers"] if event["kind"] == "devices" else ():
+            facts, name = dict(a["facts"]), str(a["name"])
+            m = _SERIAL.search(name)
+            serial = facts.get("serial number") or (m and m[1].rstrip(",;"))
+            device = MeasuringDevice(a["device"], a["driver"], name, serial, facts, event["utc"])
+            found.setdefault((device.device, name), device)
     return tuple(found.values())
 
 

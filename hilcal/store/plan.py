@@ -1,5 +1,6 @@
 """A plan: which states to measure, in which order. Data that a person can edit."""
 
+import itertools
 import json
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -93,56 +94,51 @@ def read_plan(text: str, where: str) -> Plan:
     check_names(data, where)
     names, q = _poses(data.get("poses"), where)
     steps = _steps(data.get("steps"), names, where)
-    known = {"format", "version", "poses", "steps"}
-    about = {key: value for key, value in data.items() if key not in known}
-    return Plan(names, q, steps, about)
+    known = ("format", "version", "poses", "steps")
+    return Plan(names, q, steps, {key: x for key, x in data.items() if key not in known})
+
+
+def _entries(data: object, what: str, where: str) -> list[Any]:
+    """A list of poses or steps that is not empty."""
+    if not isinstance(data, list) or not data:
+        raise InputError(f'{where}: "{what}s" must be a list of at least one {what}')
+    limits.check_planned(where, f"{what}s", len(data))
+    return data
 
 
 def _poses(data: object, where: str) -> tuple[tuple[str, ...], Floats]:
     """Names and joint angles of the poses."""
-    if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "poses" must be a list of at least one pose')
-    limits.check_planned(where, "poses", len(data))
-    names: dict[str, None] = {}
-    rows: list[list[float]] = []
-    for k, pose in enumerate(data, start=1):
+    rows: dict[str, list[float]] = {}
+    for k, pose in enumerate(_entries(data, "pose", where), start=1):
         if not isinstance(pose, dict) or set(pose) != {"name", "q_rad"}:
             raise InputError(f'{where}: pose {k} must have exactly the keys "name" and "q_rad"')
         name, q = pose["name"], pose["q_rad"]
         if not isinstance(name, str) or not name:
             raise InputError(f"{where}: pose {k}: name {name!r} must be a text that is not empty")
-        if name in names:
+        if name in rows:
             raise InputError(f"{where}: two poses have the name {name!r}; names must differ")
+        count = len(next(iter(rows.values()), ()))
         numbers = isinstance(q, list) and all(
             isinstance(x, int | float) and not isinstance(x, bool) and abs(x) < LARGEST for x in q
         )
-        if not numbers or not q or (rows and len(q) != len(rows[0])):
-            count = f"{len(rows[0])} " if rows else ""
+        if not numbers or not q or (count and len(q) != count):
             raise InputError(
-                f"{where}: pose {name!r}: q_rad must be a list of {count}finite numbers, rad, "
-                f"below {LARGEST:g}"
+                f"{where}: pose {name!r}: q_rad must be a list of {count or ''} finite numbers, "
+                f"rad, below {LARGEST:g}"
             )
-        names[name] = None
-        rows.append([float(x) for x in q])
-    return tuple(names), np.array(rows)
+        rows[name] = [float(x) for x in q]
+    return tuple(rows), np.array(list(rows.values()))
 
 
 def _steps(data: object, names: tuple[str, ...], where: str) -> tuple[Step, ...]:
     """Steps in order."""
-    if not isinstance(data, list) or not data:
-        raise InputError(f'{where}: "steps" must be a list of at least one step')
-    limits.check_planned(where, "steps", len(data))
     steps: dict[Step, int] = {}
-    known = frozenset(names)
-    for k, step in enumerate(data, start=1):
-        if not isinstance(step, dict) or not {"pose", "load"} <= set(step) <= {
-            "pose",
-            "load",
-            "cycle",
-        }:
+    for k, step in enumerate(_entries(data, "step", where), start=1):
+        keys = set(step) if isinstance(step, dict) else set()
+        if not {"pose", "load"} <= keys <= {"pose", "load", "cycle"}:
             raise InputError(f'{where}: step {k} must have "pose" and "load", and may have "cycle"')
         pose, load, cycle = step["pose"], step["load"], step.get("cycle", 0)
-        if not isinstance(pose, str) or pose not in known:
+        if not isinstance(pose, str) or pose not in names:
             hint = suggest(str(pose), names)
             raise InputError(f"{where}: step {k}: there is no pose {pose!r}{hint}")
         if not isinstance(load, str) or not load:
@@ -178,7 +174,8 @@ def with_new_names(plan: Plan, before: Plan, number: int) -> Plan:
         if name == REFERENCE:
             joints = known[name]
         elif name in known and np.abs(joints - known[name]).max() > SAME_POSE:
-            name = _free(f"{name}-{number}", taken)
+            free = (f"{name}-{number}{f'-{k}' * (k > 1)}" for k in itertools.count(1))
+            name = next(new for new in free if new not in taken)
             taken.add(name)
         elif name in known:
             joints = known[name]
@@ -201,22 +198,10 @@ def joined(before: Plan, done: frozenset[Step], further: Plan) -> Plan:
     """
     kept = tuple(s for s in before.steps if s in done)
     used = {s.pose for s in kept} | {REFERENCE}
-    more = [
-        k
-        for k, name in enumerate(before.pose_names)
-        if name in used and name not in further.pose_names
-    ]
+    more = [k for k, p in enumerate(before.pose_names) if p in used and p not in further.pose_names]
     return Plan(
         (*further.pose_names, *(before.pose_names[k] for k in more)),
         np.vstack([further.q, before.q[more]]),
         (*kept, *further.steps),
         further.about,
     )
-
-
-def _free(name: str, taken: set[str]) -> str:
-    """Return a name that is not taken."""
-    out, k = name, 2
-    while out in taken:
-        out, k = f"{name}-{k}", k + 1
-    return out

@@ -10,7 +10,7 @@ from typing import Any
 from hilcal.config.changes import Changes
 from hilcal.errors import InputError
 from hilcal.names import check_names
-from hilcal.store.stored_schema import Revision, check
+from hilcal.store.stored_schema import REVISION, check
 from hilcal.toml import parse_json
 
 STORED = "stored_sha256"
@@ -107,7 +107,7 @@ def from_text(text: str, number: int) -> RevisionRecord:
     """Record from its JSON text."""
     try:
         content = parse_json(text)
-        check(Revision, content)
+        check(REVISION, content)
         content["effects"] = tuple(content["effects"])
         r = RevisionRecord(**content, number=number)
         names = [*r.effects, r.data_hash, r.program_version, r.created, r.added, r.removed]

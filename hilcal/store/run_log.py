@@ -19,7 +19,7 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.kept_texts import KEYS, robot_file_of
 from hilcal.store.plan import Plan, Step, joined, read_plan, with_new_names
 from hilcal.store.revision import utc_now
-from hilcal.store.stored_schema import Detail, check, check_event
+from hilcal.store.stored_schema import DETAIL, check, check_event
 
 PLAN = "plan"
 """Key of the plan among the texts about a campaign; further ones are "plan 2" and so on."""
@@ -186,7 +186,7 @@ class RunLog:
                     f"reading {number}"
                 )
             pose, load, cycle = self._step(key)
-            found = rows.stored_json(self._campaign.path, text, partial(check, Detail))
+            found = rows.stored_json(self._campaign.path, text, partial(check, DETAIL))
             out.append({**found, "step": {"pose": pose, "load": load, "cycle": cycle}})
         return out
 
