@@ -10,7 +10,7 @@ out of J only costs a step or two, each about 10³ times closer.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -25,6 +25,9 @@ from hilcal.robot import se3
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import Chain, evaluate, joint_jacobian
 from hilcal.types import Bools, Floats, Ints
+
+if TYPE_CHECKING:
+    from hilcal.calibration.calibration import Calibration
 
 TOLERANCE = 1e-10
 """Residual at which a point is solved, m and rad."""
@@ -70,8 +73,9 @@ def invert(
     scale = np.array([arm.reach] * 3 + [1.0] * 3)
     for _ in range(MOST_STEPS):
         r, p, chain = poses(q[active], active)
-        e = _error(r, p, rotation[active], position[active])
-        left[active] = np.stack([np.linalg.norm(part, axis=1) for part in (e[:, :3], e[:, 3:])], 1)
+        turn = se3.rotation_vector(se3.product(rotation[active], np.swapaxes(r, 1, 2)))
+        e = np.concatenate([position[active] - p, turn], axis=1)  # what is missing, base axes
+        left[active] = np.linalg.norm(e.reshape(-1, 2, 3), axis=2)
         u, s, vt = np.linalg.svd(_jacobian(arm, chain, p), full_matrices=False)
         step = np.einsum("nji,nj,nkj,nk->ni", vt, 1.0 / np.maximum(s, 1e-6), u, e / scale)
         going = left[active].max(axis=1) > TOLERANCE
@@ -94,13 +98,8 @@ def invert_nominal(
     arm: Arm, tool: Floats, q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
     """Find joint values at which the nominal arm has a tool; one pose or N, else as `invert`."""
-    return invert(
-        arm,
-        lambda at, _: nominal_pose(arm, tool, at),
-        q,
-        np.broadcast_to(rotation, (len(q), 3, 3)),
-        np.broadcast_to(position, (len(q), 3)),
-    )
+    goal = np.broadcast_to(rotation, (len(q), 3, 3)), np.broadcast_to(position, (len(q), 3))
+    return invert(arm, lambda at, _: nominal_pose(arm, tool, at), q, *goal)
 
 
 def singular(arm: Arm, chain: Chain, position: Floats) -> Bools:
@@ -116,18 +115,23 @@ def _jacobian(arm: Arm, chain: Chain, position: Floats) -> Floats:
     return jacobian if arm.coupling is None else np.asarray(jacobian @ arm.coupling)
 
 
-def _error(r: Floats, p: Floats, rotation: Floats, position: Floats) -> Floats:
-    """(N, 6) displacement and turn that are missing, base axes."""
-    turn = se3.rotation_vector(se3.product(rotation, np.swapaxes(r, 1, 2)))
-    return np.concatenate([position - p, turn], axis=1)
-
-
-if TYPE_CHECKING:
-    from hilcal.calibration.calibration import Calibration
-
-
 BAND = 0.95
 """Share of points whose error lies within the stated band."""
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSize:
+    """Sizes of 3-D position errors, m."""
+
+    mean_m: float
+    rms_m: float
+    max_m: float
+
+    @classmethod
+    def of(cls, errors: Floats) -> "ErrorSize":
+        """Return the sizes of (N,) distances."""
+        rms = float(np.sqrt(np.mean(errors**2)))
+        return cls(float(errors.mean()), rms, float(errors.max()))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -281,9 +285,9 @@ class Compensation:
             "base_in_tracker": se3.six(of.base_in_tracker()),
             "base_is": of.frames.base_is,
             "n_points": len(names),
-            "error_before": _block(self.before.error_m),
+            "error_before": asdict(ErrorSize.of(self.before.error_m)),
             "error_after": {
-                "std_m": _rms(after.std_m),
+                "std_m": ErrorSize.of(after.std_m).rms_m,
                 "band_m": float(after.band_m.max()),
                 "band_share": BAND,
             },
@@ -305,11 +309,3 @@ class Compensation:
                 for k, name in enumerate(names)
             ],
         }
-
-
-def _block(values: Floats) -> dict[str, float]:
-    return {"mean_m": float(values.mean()), "rms_m": _rms(values), "max_m": float(values.max())}
-
-
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.mean(values**2)))

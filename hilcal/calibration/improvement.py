@@ -23,28 +23,13 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensation import BAND, band
+from hilcal.calibration.compensation import BAND, ErrorSize, band
 from hilcal.calibration.tool import tool_of, tool_poses
 from hilcal.identification.predictive import Predictive
 from hilcal.identification.residual import noise_floor, residual
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Bools, Floats
-
-
-@dataclass(frozen=True, slots=True)
-class ErrorSize:
-    """Sizes of 3-D position errors, m."""
-
-    mean_m: float
-    rms_m: float
-    max_m: float
-
-    @classmethod
-    def of(cls, errors: Floats) -> "ErrorSize":
-        """Return the sizes of (N,) distances."""
-        rms = float(np.sqrt(np.mean(errors**2)))
-        return cls(float(errors.mean()), rms, float(errors.max()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,20 +106,15 @@ class Improvement:
 
     def to_dict(self) -> dict[str, object]:
         """Return it as JSON, SI."""
-        rows = zip(self.poses, self.loads, self.before_m, self.after_m, self.band_m, strict=True)
+        numbers = (x.tolist() for x in (self.before_m, self.after_m, self.band_m))
+        rows = zip(self.poses, self.loads, *numbers, strict=True)
         return {
             "readings": self.mode,
             "error": asdict(self.everything),
             "loads": [asdict(part) for part in self.by_load],
             "band_share": BAND,
             "points": [
-                {
-                    "pose": pose,
-                    "load": load,
-                    "before_m": float(before),
-                    "after_m": float(after),
-                    "band_m": float(width),
-                }
+                {"pose": pose, "load": load, "before_m": before, "after_m": after, "band_m": width}
                 for pose, load, before, after, width in rows
             ],
             "left_out": [{"point": name, "why": why} for name, why in self.left_out],

@@ -10,11 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilcal.cell import Cell
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.robot_frames import one_of_each, robot_frames
 from hilcal.model.model import Model, Prediction
-from hilcal.readings.readings import States
 from hilcal.robot import se3
 from hilcal.types import Floats, Ints
 
@@ -54,6 +52,17 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         cell = replace(model.cell, targets=None, target_names=(), targets_known=())
         cell = replace(cell, target=at.flange @ pose, target_known=True)
         own = replace(model, cell=cell, effects=tuple(named))
+    state = one_of_each(own.cell)
+    if own.cell.targets is not None:
+        state = replace(state, target=np.zeros(1, dtype=np.int64))
+    situation = own.predict(state, theta[kept]).situation
+    pairs = list(zip(own.effects, own.slices(), strict=True))
+    moving = [
+        (e, mine)
+        for e, mine in pairs
+        if e.role not in FRAME_ROLES
+        and any(c.field in ("target", "base") for c in e.columns(situation))
+    ]
     return ToolPose(
         model=own,
         theta=theta[kept],
@@ -62,8 +71,8 @@ def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
         pose=at.flange @ nominal,
         registered=at.registered,
         base=at.chain,
-        frames=_base_frames(own),
-        moving=_moving(own, theta[kept]),
+        frames=tuple((e, mine) for e, mine in pairs if e.role == "registration"),
+        moving=tuple(moving),
     )
 
 
@@ -91,26 +100,3 @@ def in_chain(tool: ToolPose, rotation: Floats, position: Floats) -> tuple[Floats
     """Poses (N, 3, 3) and (N, 3) in the axes of the fitted chain, from those in base axes."""
     turn = tool.base[:3, :3].T
     return se3.product(turn, rotation), se3.apply(turn, position - tool.base[:3, 3])
-
-
-def _moving(model: Model, theta: Floats) -> tuple[tuple[Effect, slice], ...]:
-    """Effects that move base or target and are no frames, with where their parameters are."""
-    situation = model.predict(_one(model.cell), theta).situation
-    return tuple(
-        (e, mine)
-        for e, mine in zip(model.effects, model.slices(), strict=True)
-        if e.role not in FRAME_ROLES
-        and any(c.field in ("target", "base") for c in e.columns(situation))
-    )
-
-
-def _base_frames(model: Model) -> tuple[tuple[Effect, slice], ...]:
-    """Effects that say where the base is, with where their parameters are."""
-    pairs = zip(model.effects, model.slices(), strict=True)
-    return tuple((e, mine) for e, mine in pairs if e.role == "registration")
-
-
-def _one(cell: Cell) -> States:
-    """Return one state of the first target."""
-    first = one_of_each(cell)
-    return first if cell.targets is None else replace(first, target=np.zeros(1, dtype=np.int64))

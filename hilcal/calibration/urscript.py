@@ -197,7 +197,8 @@ class _Program:
                     given = {name: None}
                     elements.add(name)
             for name, value in given.items():
-                if _of_urscript(name):
+                words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
+                if name in words or _HARMLESS.fullmatch(name) or _WHERE.fullmatch(name):
                     raise InputError(
                         f"line {s.line}: '{name}' is a name of URScript's own; valid: another name"
                     )
@@ -405,12 +406,6 @@ def _check_calls(p: _Program, s: Statement) -> None:
                 f"line {s.line}: it is not known what '{name[:40]}' does to a waypoint; valid: "
                 "motions, set_tcp, payload, inputs, outputs, arithmetic and functions of its own"
             )
-
-
-def _of_urscript(name: str) -> bool:
-    """Whether a name has a meaning that a program must not change."""
-    words = ("p", *MOVES, *_OTHER_MOVES, *_STOPS, *_SETUP)
-    return name in words or bool(_HARMLESS.fullmatch(name) or _WHERE.fullmatch(name))
 
 
 def _is_pose(node: ast.expr) -> bool:

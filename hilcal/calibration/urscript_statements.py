@@ -103,7 +103,9 @@ def statements(program: str) -> tuple[Statement, ...]:
             continue
         text, shift = _as_python(body, word)
         node = _parsed(text, number, word)
-        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, _called(node)))
+        calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
+        called = {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
+        out.append(Statement(number, made, begin + shift, text, node, blocks, kinds, called))
     if open_blocks:
         raise _refused(number, f"the program ends inside of {open_blocks[-1][0]}")
     return tuple(out)
@@ -173,11 +175,6 @@ def _parts(node: ast.stmt) -> Iterator[ast.AST]:
             yield node.value
         case _:
             raise ValueError
-
-
-def _called(node: ast.stmt) -> dict[ast.Call, str]:
-    calls = (n for n in ast.walk(node) if isinstance(n, ast.Call))
-    return {n: n.func.id for n in calls if isinstance(n.func, ast.Name)}
 
 
 def _known(node: ast.AST, text: str) -> bool:

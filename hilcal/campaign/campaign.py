@@ -8,19 +8,7 @@ from typing import Any, Self
 import numpy as np
 
 from hilcal.calibration.calibration import Calibration
-from hilcal.campaign.revisions import (
-    chain,
-    chain_in_cell,
-    check_sources,
-    history,
-    is_again,
-    mode_of,
-    restore,
-    restore_model,
-    restore_predictive,
-    sound,
-    to_record,
-)
+from hilcal.campaign import revisions
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
 from hilcal.config.changes import INSTRUMENT_NOISE, Changes, changed
@@ -287,7 +275,7 @@ class Campaign(Brief):
         """Kind of readings: that of the revision in use, else as planned and the readings allow."""
         record = self.in_use()
         if record is not None:
-            return mode_of(record)
+            return revisions.mode_of(record)
         return usual_mode(self.readings, self.config.planning.readings)
 
     def fit(self, revision: int | None = None) -> Fit:
@@ -301,10 +289,12 @@ class Campaign(Brief):
 
     def restore(self, record: RevisionRecord) -> Fit:
         """Return the fit of a stored revision; raises as `fit` does."""
-        check_sources(record, self.path, self.catalogue)
+        revisions.check_sources(record, self.path, self.catalogue)
         self._require_its_cell(record)
         try:
-            return restore(record, self.cell, self.readings, self.catalogue, self.data_hash)
+            return revisions.restore(
+                record, self.cell, self.readings, self.catalogue, self.data_hash
+            )
         except InputError as error:
             raise InputError(f"{error}{self._until_used(record.number)}") from None
 
@@ -345,17 +335,19 @@ class Campaign(Brief):
     def fitted_readings(self, record: RevisionRecord) -> Readings:
         """Return the readings that a revision was fitted to; later ones come after them."""
         self._require_its_cell(record)
-        with sound(record):
+        with revisions.sound(record):
             return self.readings[: int(record.result_json["identify"]["n_readings"])]
 
     def restore_model(self, record: RevisionRecord) -> tuple[Model, Floats]:
         """Return model and parameters (P,) of a stored revision; raises as `fit` does."""
-        check_sources(record, self.path, self.catalogue)
-        return restore_model(record, self.cell, self.fitted_readings(record), self.catalogue)
+        revisions.check_sources(record, self.path, self.catalogue)
+        return revisions.restore_model(
+            record, self.cell, self.fitted_readings(record), self.catalogue
+        )
 
     def predictive(self, record: RevisionRecord, model: Model, theta: Floats) -> Predictive:
         """Return what a stored revision knows of readings that it has not seen."""
-        return restore_predictive(record, model, theta, self.fitted_readings(record))
+        return revisions.restore_predictive(record, model, theta, self.fitted_readings(record))
 
     def calibration(self, revision: int | None = None) -> Calibration:
         """Return a stored fit ready for use, see `Calibration`; raises as `fit` does."""
@@ -395,7 +387,9 @@ class Campaign(Brief):
     def history(self, revision: int | None = None) -> History:
         """Return how the model of a revision was reached, which `diagnose` takes."""
         record = self.in_use(revision)
-        return history(() if record is None else chain(self.file.revisions(), record.number))
+        return revisions.history(
+            () if record is None else revisions.chain(self.file.revisions(), record.number)
+        )
 
     def append(self, found: Fit | Diagnosis | Refinement) -> int:
         """Store a fit, a diagnosed fit, or all steps of a refinement; revisions only append.
@@ -428,9 +422,9 @@ class Campaign(Brief):
         """
         if not records:
             return ()
-        last = chain(self.file.revisions())[-len(records) :]
+        last = revisions.chain(self.file.revisions())[-len(records) :]
         there = last and last[0].made_from == parent and len(last) == len(records)
-        if there and all(map(is_again, records, last)):
+        if there and all(map(revisions.is_again, records, last)):
             return tuple(r.number for r in last)
         numbers: list[int] = []
         for record in records:
@@ -475,7 +469,7 @@ class Campaign(Brief):
         if hashed != content_hash(self.readings):
             raise InputError(f"{self.path}: the fit is of other readings than this campaign's")
         document = None if diagnosis is None else to_json(diagnosis)
-        record = to_record(found, document, added, hashed, removed, parent)
+        record = revisions.to_record(found, document, added, hashed, removed, parent)
         more: dict[str, Any] = {STORED: self.data_hash, **typed_now()}
         if self.changes:
             more[CELL] = self.changes
@@ -511,7 +505,7 @@ class Campaign(Brief):
             _, found = self.fit_in_use(say)
             say("diagnosing it")
             return [Chapter(1, None, found, diagnose(found, say=say))]
-        records = chain_in_cell(self.file.revisions(), last.number)
+        records = revisions.chain_in_cell(self.file.revisions(), last.number)
         fits = []
         for record in records:
             say(f"restoring revision {record.number}")

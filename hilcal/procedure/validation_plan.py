@@ -74,7 +74,8 @@ def validation_plan(
         name: found.allowed[:, found.loads.index(name)] & space.passable(base, found.q, name)
         for name in (UNLOADED, *loads)
     }
-    usual = _usual(fitted, found.q)
+    last = fitted.states[np.full(len(found.q), len(fitted) - 1)]
+    usual = replace(last, q=found.q, q_actual=None, target=None)
     for name in loads:
         wrench = calibration.loads.get(name, np.zeros(6))
         good[name] &= good[UNLOADED] & ~_far(calibration, usual, wrench)
@@ -155,12 +156,6 @@ def _far(calibration: Calibration, states: States, wrench: Floats) -> Bools:
     return far
 
 
-def _usual(fitted: Readings, q: Floats) -> States:
-    """Return states at joint angles (N, n), all else as in the last reading."""
-    last = fitted.states[np.full(len(q), len(fitted) - 1)]
-    return replace(last, q=q, q_actual=None, target=None)
-
-
 POINTS, LEFT_OUT = "points", "left_out"
 """Keys of a plan's file: what was expected of each point, and which are missing."""
 
@@ -187,16 +182,11 @@ def points_of(readings: Readings, mode: str) -> CorrectedPoints:
     }
     rows, unloaded = [], []
     for k in np.flatnonzero(first).tolist():
-        if readings.pose_names[readings.pose[k]] == REFERENCE:
-            continue
-        if mode == "absolute":
+        base = -1 if mode == "absolute" else at.get((int(readings.pose[k]), int(readings.cycle[k])))
+        taken = mode == "absolute" or not readings.unloaded[k]
+        if taken and base is not None and readings.pose_names[readings.pose[k]] != REFERENCE:
             rows.append(k)
-            unloaded.append(-1)
-        elif not readings.unloaded[k]:
-            base = at.get((int(readings.pose[k]), int(readings.cycle[k])))
-            if base is not None:
-                rows.append(k)
-                unloaded.append(base)
+            unloaded.append(base)
     loads = tuple(readings.load_names[readings.load[k]] for k in rows)
     poses = [readings.pose_names[readings.pose[k]] for k in rows]
     names = tuple(
@@ -245,8 +235,7 @@ def corrected_plan(
         bad = _blocked(space, found.q, reference, [of.loads[k] for k in order]) | bad
         if not bad:
             say("checking every motion in a dry run")
-            told = _told(of, order, found)
-            made = _with_targets(plan, of, order, found.q, told, left)
+            made = _with_targets(plan, of, order, found, left)
             refuse(dry_run(cell, config, made), "the run at corrected targets")
             return made
         left |= {of.names[order[k]]: why for k, why in bad.items()}
@@ -304,34 +293,20 @@ def _blocked(space: Space, q: Floats, reference: Floats, loads: Sequence[str]) -
     return out
 
 
-def _told(of: CorrectedPoints, order: Ints, found: Compensation) -> list[dict[str, Any]]:
-    before, band = found.before.error_m, found.after.band_m
-    return [
-        {
-            "pose": of.names[k],
-            "load": of.loads[k],
-            "expected_before_m": float(before[i]),
-            "band_m": float(band[i]),
-        }
-        for i, k in enumerate(order)
-    ]
-
-
 def _with_targets(
-    plan: Plan,
-    of: CorrectedPoints,
-    order: Ints,
-    q: Floats,
-    told: list[dict[str, Any]],
-    left: Mapping[str, str],
+    plan: Plan, of: CorrectedPoints, order: Ints, found: Compensation, left: Mapping[str, str]
 ) -> Plan:
     """Return the plan with the corrected joint values in the place of the nominal ones."""
-    corrected = {of.names[k]: row for k, row in zip(order, q, strict=True)}
+    corrected = {of.names[k]: row for k, row in zip(order, found.q, strict=True)}
     rows = [corrected.get(n, old) for n, old in zip(plan.pose_names, plan.q, strict=True)]
+    expected = zip(order, found.before.error_m.tolist(), found.after.band_m.tolist(), strict=True)
     about = {
         **plan.about,
         "purpose": "corrected",
-        POINTS: told,
+        POINTS: [
+            {"pose": of.names[k], "load": of.loads[k], "expected_before_m": off, "band_m": band}
+            for k, off, band in expected
+        ],
         LEFT_OUT: [{"point": name, "why": why} for name, why in left.items()],
     }
     return Plan(plan.pose_names, np.array(rows), plan.steps, about)
@@ -341,9 +316,11 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     """Return the readings of the same points at uncorrected and at corrected joint values.
 
     For deflections both come with the unloaded readings of the points, from the validation: the
-    corrected readings take the pose and the cycle of the uncorrected ones.
+    corrected readings take the pose and the cycle of the uncorrected ones. They share no error: of
+    several targets only the first one is compared.
     """
-    validation, corrected = _plain(validation), _plain(corrected)
+    alone = {"common": None, "stated": None, "arm_scatter": None, "serial": None}
+    validation, corrected = (replace(x, **alone) for x in (validation, corrected))
     of = points_of(validation, mode)
     first = np.flatnonzero(corrected.target == 0)
     there = {corrected.pose_names[corrected.pose[k]]: int(k) for k in first}
@@ -356,11 +333,6 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
         return before, moved
     free = validation[np.unique(bases)]
     return Readings.joined([free, before]), Readings.joined([free, moved])
-
-
-def _plain(readings: Readings) -> Readings:
-    """Return readings that share no error; of several targets only the first one is compared."""
-    return replace(readings, common=None, stated=None, arm_scatter=None, serial=None)
 
 
 def expected_of(plan: Plan) -> tuple[list[dict[str, Any]], list[tuple[str, str]]]:

@@ -18,7 +18,6 @@ from hilcal.transfer.members import (
     Member,
     entries,
     member_of,
-    member_with,
     prints_of,
 )
 from hilcal.transfer.pooled import Pooled, effects_seen, pooled
@@ -76,11 +75,12 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         if isinstance(result, Failure):
             continue
         of = kinds.setdefault(result.type, [])
-        if of and not _alike(of[0][1], result):
+        links, first = result.posterior.links, (of[0][1] if of else result).posterior.links
+        if links.shape == first.shape and np.abs(links - first).max() <= SAME_M:
+            of.append((entry, result))
+        else:
             why = f"its {result.type} has other nominal links than that of {of[0][1].name}"
             failures.append(Failure(result.name, why))
-            continue
-        of.append((entry, result))
     types, members = [], []
     for kind, of in kinds.items():
         try:
@@ -94,16 +94,10 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         failures += lost
     if not types:
         first = failures[0]
+        what = f"{first.name}: {first.reason}"
         more = f" ({len(failures) - 1} more)" if len(failures) > 1 else ""
-        raise CannotAnswerError(
-            f"{directory}: nothing can be pooled: {first.name}: {first.reason}{more}"
-        )
+        raise CannotAnswerError(f"{directory}: nothing can be pooled: {what}{more}")
     return Fleet(tuple(types), tuple(members), tuple(failures))
-
-
-def _alike(a: Member, b: Member) -> bool:
-    one, other = a.posterior.links, b.posterior.links
-    return one.shape == other.shape and bool(np.abs(one - other).max() <= SAME_M)
 
 
 def _type(
@@ -116,7 +110,7 @@ def _type(
     lacking = [k for k, m in enumerate(members) if not set(traits) <= set(m.added)]
     lost: list[Failure] = []
     if traits and lacking:
-        run = partial(member_with, effects=traits)
+        run = partial(member_of, effects=traits)
         with counting(f"campaigns again, with {', '.join(traits)}", len(lacking)) as advance:
             again = engine.map(run, [of[k][0] for k in lacking], advance=advance)
         for k, result in zip(lacking, again, strict=True):

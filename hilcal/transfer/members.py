@@ -214,59 +214,47 @@ def prints_of(entry: Entry) -> Floats:
         return np.zeros((0, 0))
 
 
-def member_of(entry: Entry) -> Member | Failure:
-    """Fit and diagnose a campaign; its revision in use, where it has one. Nothing is stored."""
-    return _guarded(entry, None)
+def member_of(entry: Entry, effects: tuple[str, ...] = ()) -> Member | Failure:
+    """Fit and diagnose a campaign; its revision in use, where it has one. Nothing is stored.
 
-
-def member_with(entry: Entry, effects: tuple[str, ...]) -> Member | Failure:
-    """Fit a campaign with the effects that most arms of its type have, and those it has itself."""
-    return _guarded(entry, effects)
-
-
-def _guarded(entry: Entry, effects: tuple[str, ...] | None) -> Member | Failure:
+    Args:
+        effects: that most arms of its type have: it is fitted with them and those it has itself.
+    """
     try:
         with Campaign.open(entry.path, read_only=True) as run:
             return _member(entry, run, effects)
     except HilcalError as error:
         return Failure(entry.name, str(error).removeprefix(f"{entry.path}: "))
     except Exception as error:  # one campaign must not end the others'
-        told = failure_of(error)
-        return Failure(entry.name, str(told or f"unexpected {type(error).__name__}: {error}"))
+        known = failure_of(error)
+        return Failure(entry.name, str(known or f"unexpected {type(error).__name__}: {error}"))
 
 
-def _member(entry: Entry, run: Campaign, effects: tuple[str, ...] | None) -> Member:
+def _member(entry: Entry, run: Campaign, effects: tuple[str, ...]) -> Member:
     refuse_fitting(run.file)
     record, mode = run.in_use(), run.mode()
     start = baseline(run.cell, run.readings, mode, run.catalogue)
-    verdict = ""
-    if record is not None:
+    if record is None:
+        path = refine(start, run.readings, mode)
+        found, verdict = path.fit, str(path.verdict)
+    else:
         found = run.restore(record)
         judged = record.result_json.get("diagnose")
         verdict = str(judged["verdict"]) if judged else diagnose(found).verdict
-    else:
-        path = refine(start, run.readings, mode)
-        found, verdict = path.fit, path.verdict
-    if effects is not None:
+    if effects:
         names = dict.fromkeys((*(e.name for e in found.model.effects), *effects))
         options = {e.name: e.options for e in found.model.effects}
         model = with_effects(run.cell, found.readings, mode, names, options, run.catalogue)
         found = fit(model, found.readings, mode)
-    return _of_fit(entry, run, found, start, verdict)
-
-
-def _of_fit(entry: Entry, run: Campaign, found: Fit, start: Model, verdict: str) -> Member:
-    of = overview(run.file)
-    serial = next(
-        (i.serial_number for i in of.instruments if i.device == "arm" and i.serial_number), None
-    )
-    arm, known = entry.arm, "list"
-    if not arm and serial:
-        arm, known = serial, "serial number"
-    if not arm:
-        folder = Path(entry.name).parent
-        named = str(folder) != "."
-        arm, known = (str(folder), "folder") if named else (Path(entry.name).stem, "file")
+    of, folder = overview(run.file), Path(entry.name).parent
+    serials = (i.serial_number or "" for i in of.instruments if i.device == "arm")
+    named = {
+        "list": entry.arm,
+        "serial number": next(filter(None, serials), ""),
+        "folder": "" if folder == Path() else str(folder),
+        "file": Path(entry.name).stem,
+    }
+    known, arm = next((how, name) for how, name in named.items() if name)
     posterior = Posterior.of(found, Source(entry.name, 0, of.created))
     return Member(
         name=entry.name,

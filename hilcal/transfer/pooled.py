@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from scipy.stats import norm
@@ -143,15 +144,20 @@ def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled
         raise CannotAnswerError(
             f"no parameter of an arm of the type {first.arm} is determined by campaigns of two arms"
         )
-    scale = _per_name(members, names, "scale")
+    scales, units = _by_name(members, "scale"), _by_name(members, "units")
+    scale = np.array([scales[name] for name in names])
     found = _found(members, arms, names, scale)
     h, unlike_arms = hierarchy(found)
-    odd = [_odd(o, arms[o.unit], "", names, scale, members) for o in unlike_arms]
-    odd += _changed(members, found, arms, h, names, scale)
+    late, changed = _changed(found, h)
+    of_arms = [(o, arms[o.unit], "") for o in unlike_arms]
+    of_campaigns = [(o, members[late[o.unit]].arm, members[late[o.unit]].name) for o in changed]
+    odd = []
+    for o, arm, campaign in (*of_arms, *of_campaigns):
+        name, off = names[o.parameter], float(o.off * scale[o.parameter])
+        odd.append(Odd(arm, campaign, name, off, units[name], o.sigma, o.p_value))
     years = np.sqrt(np.diag(h.covariance)[len(names) :])
     certain = 2 * norm.sf(np.abs(h.slope) / np.where(years > 0, years, np.inf)) * len(names)
     timed = bool(np.any(h.slope != 0))
-    units = _units(members)
     spreads = [
         Spread(
             parameter=name,
@@ -202,17 +208,11 @@ def _common(members: Sequence[Member]) -> tuple[tuple[PosteriorEffect, ...], tup
     return tuple(e for e in effects if e.name in used), names
 
 
-def _per_name(members: Sequence[Member], names: Sequence[str], field: str) -> Floats:
-    values: dict[str, float] = {}
+def _by_name(members: Sequence[Member], field: str) -> dict[str, Any]:
+    """Values of a field of the posteriors, by the names of the parameters."""
+    found: dict[str, Any] = {}
     for m in members:
-        values |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
-    return np.array([values[name] for name in names], dtype=float)
-
-
-def _units(members: Sequence[Member]) -> dict[str, str]:
-    found: dict[str, str] = {}
-    for m in members:
-        found |= dict(zip(m.posterior.names, m.posterior.units, strict=True))
+        found |= dict(zip(m.posterior.names, getattr(m.posterior, field), strict=True))
     return found
 
 
@@ -237,19 +237,12 @@ def _found(
     return FleetEstimates(mean, information, arm, (seconds - begun[arm]) / YEAR_S)
 
 
-def _changed(
-    members: Sequence[Member],
-    found: FleetEstimates,
-    arms: Sequence[str],
-    h: Hierarchy,
-    names: Sequence[str],
-    scale: Floats,
-) -> list[Odd]:
-    """Campaigns in which an arm has changed since its campaign before, unlike other arms."""
-    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(len(names)))
+def _changed(found: FleetEstimates, h: Hierarchy) -> tuple[list[int], Sequence[Unlike]]:
+    """Later campaigns of arms, and those in which one has changed since before, unlike others."""
+    covariance = np.linalg.inv(found.information + 1e-8 * np.eye(found.mean.shape[1]))
     variance = np.diagonal(covariance, axis1=1, axis2=2)
     after, change, spread = [], [], []
-    for a in range(len(arms)):
+    for a in range(int(found.arm.max()) + 1):
         mine = np.flatnonzero(found.arm == a)
         mine = mine[np.argsort(found.time[mine], kind="stable")]
         for before, now in pairwise(mine):
@@ -257,26 +250,7 @@ def _changed(
             after.append(int(now))
             change.append(found.mean[now] - found.mean[before] - years * h.slope)
             spread.append(variance[now] + variance[before])
-    if not after:
-        return []
-    worst = unlike(np.array(change), np.array(spread))
-    return [
-        _odd(o, members[after[o.unit]].arm, members[after[o.unit]].name, names, scale, members)
-        for o in worst
-    ]
-
-
-def _odd(
-    o: Unlike,
-    arm: str,
-    campaign: str,
-    names: Sequence[str],
-    scale: Floats,
-    members: Sequence[Member],
-) -> Odd:
-    name = names[o.parameter]
-    off = float(o.off * scale[o.parameter])
-    return Odd(arm, campaign, name, off, _units(members)[name], o.sigma, o.p_value)
+    return after, unlike(np.array(change), np.array(spread)) if after else []
 
 
 def _prior(

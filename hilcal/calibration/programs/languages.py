@@ -93,23 +93,19 @@ def understood(
         program = READERS[path.suffix.lower()](path, frames, tool)
     except InputError as error:
         raise InputError(escaped(str(error))) from None
-    points = tuple(
-        p if _usable(p) else replace(p, left="numbers that are none, in it, its tool or its base")
-        for p in program.points
-    )
-    program = replace(program, points=points)
+    points = []
+    for p in program.points:
+        every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
+        usable = (np.abs(every) < LARGEST).all()
+        left = p.left if usable else "numbers that are none, in it, its tool or its base"
+        points.append(replace(p, left=left))
+    program = replace(program, points=tuple(points))
     _refuse(path, program.points, leave)
     q, doubts, said = resolve(program, arm, near)
     longest, more = longest_tool(program.understood)
     found = UnderstoodProgram(program, arm, q, longest, said + more).without(doubts)
     _refuse(path, found.program.points, leave)
     return found
-
-
-def _usable(p: ProgramPoint) -> bool:
-    """Whether its numbers are such that an arm has."""
-    every = np.concatenate([p.values, p.frame.ravel(), p.tool.ravel()])
-    return bool((np.abs(every) < LARGEST).all())
 
 
 def _refuse(path: Path, points: tuple[ProgramPoint, ...], leave: bool) -> None:
@@ -148,16 +144,10 @@ def unlike(arm: Arm, language: Language) -> str:
         )
         return f"axis {k + 1} with all joint values zero is {is_}, not {should}"
     p = chain.position[:JOINTS, 0]
-    gaps = [_gap(p[k], axes[k], p[4], axes[4]) for k in (3, 5)]
-    if max(gaps) > MEET:
-        return f"axes 4 to 6 miss each other by {1e3 * max(gaps):.3g} mm"
-    return ""
-
-
-def _gap(p: Floats, a: Floats, other: Floats, b: Floats) -> float:
-    """Distance of two lines, m."""
-    n = np.cross(a, b)
-    return float(abs((p - other) @ n) / np.linalg.norm(n))
+    normals = {k: np.cross(axes[k], axes[4]) for k in (3, 5)}
+    gaps = [abs((p[k] - p[4]) @ n) / np.linalg.norm(n) for k, n in normals.items()]
+    missed = max(gaps)
+    return f"axes 4 to 6 miss each other by {1e3 * missed:.3g} mm" if missed > MEET else ""
 
 
 def shape(arm: Arm, q: Floats) -> Ints:
