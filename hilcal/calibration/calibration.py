@@ -226,11 +226,7 @@ class Calibration(Brief):
 
     @cached_property
     def controller(self) -> Arm:
-        """The arm by which the controller computes poses, as far as it was told; else the nominal.
-
-        Raises:
-            InputError: what is kept of it is damaged.
-        """
+        """The arm by which the controller computes poses, as far as known; else the nominal one."""
         arm, told = self.model.cell.arm, self.source.get("kinematics")
         if told is None or arm.sign is not None or arm.coupling is not None:
             return arm
@@ -358,13 +354,10 @@ class Calibration(Brief):
         std: bool,
         untold: tuple[str, ...] = (),
     ) -> ToolPoses:
-        """Return where a tool is.
+        """Return where a tool is at N points.
 
-        Args:
-            states: N points.
-            nominal: orientation (N, 3, 3) and position (N, 3) that errors are counted from.
-            std: also state the uncertainty.
-            untold: columns of the states that are means of `conditions`.
+        `nominal` (N, 3, 3) and (N, 3) are orientations and positions that errors are counted from, `untold`
+        columns of the states that are means of `conditions`.
         """
         prediction = of.model.predict(states, of.theta)
         rotation, position = tool_poses(of, prediction)
@@ -419,8 +412,7 @@ def _unloaded(states: States) -> States:
 def calibration_of_stream(found: StreamFit, source: Mapping[str, Any]) -> Calibration:
     """Return the calibration: parameters and covariance of the stream, ranges of its sample.
 
-    The limit of the standard deviation, beyond which a point is far from all fitted ones, is that
-    of the sample, scaled to the number of readings of the stream.
+    The limit of the standard deviation is that of the sample, scaled to the number of readings.
     """
     of_sample = Calibration.of(found.sample, source)
     values, vectors = np.linalg.eigh(found.covariance)

@@ -60,13 +60,7 @@ class Inverse:
 def invert(
     arm: Arm, poses: Callable[[Floats, Ints], Pose], q: Floats, rotation: Floats, position: Floats
 ) -> Inverse:
-    """Find joint values.
-
-    Args:
-        q: (N, n) joint values to begin with.
-        rotation: (N, 3, 3) wanted orientation of the tool, base axes.
-        position: (N, 3) wanted position, base axes, m.
-    """
+    """Find joint values for wanted orientations (N, 3, 3) and positions (N, 3), from q (N, n)."""
     q, count = q.copy(), len(q)
     left = np.full((count, 2), np.inf)
     active = np.arange(count)
@@ -274,8 +268,8 @@ class Compensation:
     def to_dict(self, names: Sequence[str]) -> dict[str, object]:
         """Return the document of `compensate --json`, SI; `names` are those of the points.
 
-        `expected_error_m` is the rms error to be expected at the corrected joint values: what the
-        inversion leaves, and the standard deviation of the position.
+        `expected_error_m` is rms: what the inversion leaves, and the standard deviation of the
+        position.
         """
         of, after, inside = self._calibration, self.after, self.inside
         expected = np.hypot(self.inverse.residual_m, after.std_m)

@@ -301,9 +301,8 @@ class Compiled:
     ) -> tuple[Floats, Floats]:
         """Joint values (N, n) and residuals (N, 2), m and rad.
 
-        Args:
-            goal: (N, 3, 3) wanted orientations and (N, 3) positions, m, base axes; those that the
-                nominal arm (for deflections: the unloaded arm) has at q where None.
+        `goal` are wanted orientations (N, 3, 3) and positions (N, 3), m, base axes; those that the
+        nominal arm (for deflections: the unloaded arm) has at q where None.
         """
         from hilcal.calibration.kernel import invert_all
 

@@ -34,11 +34,7 @@ LARGEST = 1e9
 def check_numbers(
     what: str, values: Floats | float, shape: Sequence[int] = (), *, least: float = -LARGEST
 ) -> None:
-    """Refuse numbers of another shape, or that nothing in a cell has.
-
-    Raises:
-        ValueError: names them.
-    """
+    """Refuse numbers of another shape, or that nothing in a cell has, by a ValueError."""
     array = np.asarray(values, dtype=float)
     if array.shape != tuple(shape):
         raise ValueError(f"{what} has shape {array.shape}; expected {tuple(shape)}")
@@ -56,11 +52,7 @@ class CovarianceSource:
     factor: float  # κ
 
     def root(self, model: Model, theta: Floats, mode: Mode) -> Floats:
-        """Return R (P, P) with κ C = R Rᵀ.
-
-        Args:
-            theta: (P,) its parameters.
-        """
+        """Return R (P, P) with κ C = R Rᵀ; `theta` (P,) are its parameters."""
         w = whitening(self.readings, mode, "gc")
         prediction = model.predict(self.readings.states, theta)
         a = whitened_jacobian(model, prediction, theta, w, np.arange(model.size))

@@ -63,11 +63,7 @@ class DhRows:
 
 
 def dh_rows(arm: Arm, convention: Convention = "standard") -> DhRows:
-    """Return the table of an arm.
-
-    Args:
-        convention: "standard" (classic) or "modified" (Craig) rows.
-    """
+    """Return the table of an arm, of "standard" (classic) or "modified" (Craig) rows."""
     if arm.coupling is not None or arm.drive is not None:
         raise InputError(f"{arm.name}: joints are coupled, which a DH table cannot hold")
     n = arm.n
@@ -131,11 +127,7 @@ def to_csv(rows: DhRows, arm: Arm) -> str:
 
 
 def to_toml(rows: DhRows, arm: Arm, title: str) -> str:
-    """Return a file of the robot catalogue, which `[robot] model = "F.toml"` of a cell reads.
-
-    Args:
-        arm: gives masses, limits and payload; what its description lacks is left out.
-    """
+    """Return a file of the robot catalogue with masses, limits and payload of an arm."""
     com = _centres(rows, arm)
     content: dict[str, object] = {
         "title": escaped(title),

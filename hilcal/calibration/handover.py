@@ -47,9 +47,7 @@ class Corrected:
 def corrected(calibration: Calibration) -> Corrected:
     """Return the arm with the constant effects of a calibration in its transforms.
 
-    Raises:
-        CannotAnswerError: the calibration is of deflections, which do not show constant errors.
-        InputError: joints of the arm are coupled.
+    Deflections do not show constant errors: of these it raises a CannotAnswerError.
     """
     if calibration.mode == "deflection":
         raise CannotAnswerError(
@@ -139,9 +137,8 @@ def ur_kinematics(
 ) -> tuple[str, Floats]:
     """Return UR's kinematics file, and (4, 4) from its last frame to the flange.
 
-    Args:
-        digest: the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
-            an error where the file has another. One of the file's content where None.
+    `digest` is the driver's name of the connected arm's own calibration, "calib_…"; the driver logs
+    an error where the file has another. One of the file's content where None.
     """
     if not nominal.name.startswith("ur") or arm.n != len(UR_JOINTS):
         raise InputError(f"{nominal.name}: UR's kinematics file is for UR arms")
@@ -174,11 +171,7 @@ def frames(calibration: Calibration, found: Corrected, beyond_flange: Floats | N
     `base_in_tracker` is the one base of all that is handed out, `base_is` how it is known.
     `tool_on_flange` is that of the corrected arm. A controller computes with its own arm: its tool
     centre point has the constant part of the last link with it, under "controller", in m and, as
-    PolyScope shows them, in mm.
-
-    Args:
-        beyond_flange: (4, 4) from the last frame of UR's kinematics file to the flange; None where
-            that file is not written.
+    PolyScope shows them, in mm. `beyond_flange` (4, 4) is what `ur_kinematics` returns, or None.
     """
     tool, base = calibration.tool_pose(), calibration.base_in_tracker()
     nominal, arm = calibration.model.cell.arm, found.arm

@@ -131,12 +131,9 @@ def improvement(
 ) -> Improvement:
     """Compare readings of the same points at uncorrected and at corrected joint values.
 
-    Args:
-        before: readings at the uncorrected joint values; for deflections with the unloaded readings
-            of the points.
-        after: the same at the corrected ones, with the same poses, in the same order.
-        goal: (M,) states of `before` that say where the tool was asked to be: where the nominal arm
-            has it at their joint values; for deflections not used.
+    Both have the same poses in the same order, for deflections with the unloaded readings of the
+    points. `goal` are states of `before` at which the nominal arm has the tool where it was asked
+    to be; not used for deflections.
     """
     first, _, _ = _errors(calibration, p, before, goal)
     last, covariance, noise = _errors(calibration, p, after, goal)

@@ -90,11 +90,7 @@ class _OtherNamesError(InputError):
 def read_points(
     path: Path, arm: Arm, loads: Mapping[str, Floats], mapping: PointMapping | None = None
 ) -> Points:
-    """Read a table of points.
-
-    Args:
-        loads: (6,) wrench by the name of the load.
-    """
+    """Read a table of points; `loads` are wrenches (6,) by the name of the load."""
     table, taken = (None, "") if mapping is not None else _plain(path, arm)
     if table is None:
         if mapping is None:
@@ -142,14 +138,10 @@ def _plain(path: Path, arm: Arm) -> tuple[ColumnTable | None, str]:
 
 
 def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Floats:
-    """Return the joint values (N, n) at which the nominal arm has the tool at the points.
+    """Return the joint values (N, n) at which the nominal arm has the tool (4, 4) at the points.
 
     Of all solutions of a pose, that nearest to the joint values that are given with it, else to
-    those of the point before it.
-
-    Args:
-        tool: (4, 4) T_flange_tool.
-        near: (n,) joint values that the first point is near to, rad.
+    those of the point before it, of the first one to `near` (n,), rad.
     """
     if points.wanted is None:
         return points.q
@@ -171,12 +163,9 @@ def on_branch(points: Points, arm: Arm, tool: Floats, near: Floats | None) -> Fl
 
 
 def solutions(arm: Arm, tool: Floats, near: Floats | None, goal: Floats) -> Floats:
-    """Return joint values (K, n) at which the nominal arm has the tool at a pose.
+    """Return joint values (K, n) at which the nominal arm has the tool (4, 4) at a pose (4, 4).
 
-    Args:
-        tool: (4, 4) T_flange_tool.
-        near: (K, n) joint values to search from, rad; all over the range of the joints where None.
-        goal: (4, 4) T_base_tool.
+    They are sought from `near` (K, n), rad; all over the range of the joints where None.
     """
     starts = _everywhere(arm) if near is None else near
     found = invert_nominal(arm, tool, starts, goal[:3, :3], goal[:3, 3])

@@ -35,12 +35,7 @@ class ToolPose:
 
 
 def tool_of(model: Model, theta: Floats, pose: Floats | None) -> ToolPose:
-    """Return the tracked target as fitted, or a tool with another pose.
-
-    Args:
-        theta: (P,) its parameters.
-        pose: (4, 4) T_flange_tool; the (first) tracked target where None.
-    """
+    """Return the tracked target as fitted, or a tool with another pose T_flange_tool (4, 4)."""
     every = np.arange(model.size)
     at = robot_frames(model, theta)
     if pose is None:

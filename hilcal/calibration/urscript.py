@@ -450,12 +450,10 @@ UNKNOWN = "the branch of the waypoint before it is not known"
 def doubts(
     arm: Arm, tool: Floats, waypoints: Sequence[Waypoint], q: Floats, near: Floats | None
 ) -> list[str]:
-    """Say why the branch of a waypoint is not certain; empty where it is.
+    """Say why the branch of each of N waypoints is not certain; empty where it is.
 
-    Args:
-        tool: (4, 4) T_flange_tool.
-        q: (N, 6) joint values at which the nominal arm has the tool there, rad.
-        near: (6,) joint values that the first waypoint is near to; None where none are given.
+    At joint values q (N, 6) the nominal arm has the tool (4, 4) there; `near` (6,) are those that
+    the first one is near to, rad, None where none are given.
     """
     if not waypoints:
         return []

@@ -158,8 +158,7 @@ class Campaign(Brief):
     def unchangeable(self, changes: Changes | None = None) -> dict[tuple[str, str], str]:
         """Return sections and keys of the cell that these readings do not let change, and why.
 
-        Args:
-            changes: in the cell with all of which they are asked for; those of now where None.
+        With all of `changes` in it; with those of now where None.
         """
         found: dict[tuple[str, str], str] = {}
         noise, changes = self.file.about(NOISE), self.changes if changes is None else changes
@@ -248,11 +247,7 @@ class Campaign(Brief):
         return next(reversed(self.file.revisions()), None)
 
     def in_use(self, revision: int | None = None) -> RevisionRecord | None:
-        """Return the revision that is used: as asked, else the accepted, else the latest one.
-
-        Raises:
-            InputError: no such revision.
-        """
+        """Return the revision that is used: as asked, else the accepted, else the latest one."""
         number = self.file.accepted() if revision is None else revision
         return self.latest() if number is None else self.file.revision(number)
 
@@ -264,11 +259,7 @@ class Campaign(Brief):
         return record
 
     def accept(self, revision: int | None) -> None:
-        """Make a revision the one that is used unless another is asked for; None: the latest.
-
-        Raises:
-            InputError: no such revision.
-        """
+        """Make a revision the one that is used unless another is asked for; None: the latest."""
         self.file.accept(revision)
 
     def mode(self) -> Mode:
@@ -307,12 +298,7 @@ class Campaign(Brief):
             )
 
     def require_gc(self, number: int | None, scaling: str, what: str) -> None:
-        """Refuse a fit whose residual is not whitened; says how to get one.
-
-        Args:
-            number: of its revision; None for a baseline that is not kept.
-            what: is to be done with it.
-        """
+        """Refuse a fit, of revision `number`, whose residual is not whitened."""
         if scaling != "gc":
             raise InputError(
                 f"revision {number} has scaling {scaling}; {what} needs gc: run hilcal identify "
@@ -320,11 +306,7 @@ class Campaign(Brief):
             )
 
     def _until_used(self, number: int | None) -> str:
-        """Words to go after "run hilcal identify again": what it lacks until commands use it.
-
-        Args:
-            number: of the revision that will not do.
-        """
+        """Words after "run hilcal identify again": what the new fit lacks until it is used."""
         if number is None or number != self.file.accepted():
             return ""
         return (
@@ -481,10 +463,6 @@ class Campaign(Brief):
         """Return number and fit of the revision in use; without any, fit the baseline.
 
         Nothing is stored; the number is None where the baseline was fitted.
-
-        Raises:
-            InputError: see `fit`.
-            CannotAnswerError: the readings do not determine the baseline.
         """
         record = self.in_use(revision)
         if record is not None:

@@ -50,13 +50,9 @@ def add_effect(
 ) -> Changed:
     """Add an effect to a revision's model, and store the fit as a revision that comes from it.
 
-    Args:
-        number: of the revision; None where there is none yet: `before` then becomes one, too, when
-            the effect could be added.
-
-    Raises:
-        InputError: an effect that the model has already, or that these readings do not allow.
-        CannotAnswerError: fewer measured elements than identifiable parameters.
+    Where there is no revision yet, `number` is None, and `before` becomes one, too, when the effect
+    could be added. Raises an InputError where the model has the effect already, or the readings do
+    not allow it, and a CannotAnswerError where they are too few.
     """
     named = write_effect(effect, options)
     say(f"adding {named}")
@@ -113,14 +109,8 @@ def refit(o: Campaign, record: RevisionRecord, say: Say, history: History = NOTH
 
     Frames that were unknown are in it where the cell does not know them now. What the revision has
     beside its effects it has again, estimated anew: another campaign's prior, a background, the
-    arm's scatter. Nothing is stored.
-
-    Args:
-        history: how its model was reached, where the new revision is made from it.
-
-    Raises:
-        InputError: an effect that the readings do not allow.
-        CannotAnswerError: the readings do not determine the model.
+    arm's scatter. Nothing is stored. `history` is how its model was reached. Raises as `add_effect`
+    does.
     """
     mode = mode_of(record)
     frames = o.catalogue.unknown_frames(o.at(record.cell).cell)
@@ -150,15 +140,8 @@ def change_cell(
 ) -> tuple[Campaign, int, Diagnosis]:
     """Fit a revision's model in a changed cell, and store the fit as a revision that says so.
 
-    Args:
-        number: of the revision; None where there is none yet: `before` then becomes one, too.
-
-    Returns:
-        The campaign in the changed cell, number and diagnosis of the new revision.
-
-    Raises:
-        InputError: changes that are not valid; see `refit`.
-        CannotAnswerError: see `refit`.
+    Returns the campaign in that cell, number and diagnosis of the new revision. Where there is none
+    yet, `number` is None, and `before` becomes one, too. Raises as `add_effect` does.
     """
     there = o.with_cell(changes)
     record = o.record(before) if number is None else o.file.revision(number)

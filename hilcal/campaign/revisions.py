@@ -51,12 +51,10 @@ def to_record(
     removed: str | None = None,
     parent: int | None = None,
 ) -> RevisionRecord:
-    """Store a fit: enough to find it again, and what was reported of it.
+    """Return what is stored of a fit: enough to find it again, and what was reported of it.
 
-    Args:
-        added: the effect that made it from the revision before; without any change a new chain
-            starts.
-        parent: number of the revision that it was made from, where that is not the one before.
+    Without an effect `added` or `removed` a new chain starts; `parent` is the number of the
+    revision that it was made from, where that is not the one before.
     """
     model, cell, readings = found.model, found.model.cell, found.readings
     files = {name: model.catalogue.file_of(name) for name in model.names}
@@ -125,8 +123,7 @@ def restore(
 ) -> Fit:
     """Find a stored fit again: the same model from the stored parameters, quickly.
 
-    Args:
-        stored: hash of the readings as the file stores them, where there is a file.
+    `stored` is the hash of the readings as the file stores them, where there is a file.
     """
     if not _fitted_to(record, readings, stored):
         raise InputError(
@@ -255,11 +252,7 @@ def carried_of(record: RevisionRecord) -> CarriedPrior | None:
 def restore_predictive(
     record: RevisionRecord, model: Model, theta: Floats, readings: Readings
 ) -> Predictive:
-    """Return what a stored fit knows of readings that it has not seen.
-
-    Args:
-        theta: (P,) its parameters.
-    """
+    """Return what a stored fit with parameters (P,) knows of readings that it has not seen."""
     stored: Mapping[str, Any] = record.parameters_json
     with sound(record):
         prior, mode = _prior(record), mode_of(record)

@@ -75,14 +75,10 @@ def separating(
     reference: Floats | None = None,
     usual: int = 20,
 ) -> Next:
-    """Plan the measurements that separate the suspects of a doubt.
+    """Plan the measurements that separate the suspects of a doubt, or raise a CannotAnswerError.
 
     As many readings as so many poses take, as many as the doubt needs, or `usual` where neither is
     known. `reference` (n,) are the joints of the campaign's reference pose, rad.
-
-    Raises:
-        InputError: suspects that cannot be.
-        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
     """
     before, effects = doubt.fit, doubt.suspects
     if doubt.alone is None:
@@ -125,10 +121,7 @@ def next_plan(
 
     As many readings as so many poses take; what the doubt needs where None. `cell` is given where
     it is not the campaign's any more. To `compare` criteria and numbers of poses takes longer.
-
-    Raises:
-        InputError: suspects that cannot be, or a plan that may not be run.
-        CannotAnswerError: no measurement separates any two of them, or no plan can be made.
+    Raises as `separating` does.
     """
     config, numbers = (o.config, o.cell) if cell is None else cell
     found = separating(numbers, config, doubt, poses, rng, say, reference_in(o.file), POSES)
@@ -142,8 +135,7 @@ def next_plan(
 def doubt_to_settle(o: Campaign, d: Diagnosis, say: Say) -> Doubt:
     """Return what a diagnosis leaves open, and a fit whose model does not hold the suspects.
 
-    Raises:
-        CannotAnswerError: nothing is in doubt; says what else to do.
+    Raises a CannotAnswerError where nothing is in doubt; it says what else to do.
     """
     found = doubt_of(d, say)
     if found is not None:

@@ -154,12 +154,7 @@ class Procedure:
     # the first plan
 
     def plan(self, say: Say = lambda words: None) -> CheckedPlan:
-        """Choose the first plan; nothing is stored yet.
-
-        Raises:
-            InputError: numbers or names that cannot be.
-            CannotAnswerError: the cell leaves too few poses.
-        """
+        """Choose the first plan; nothing is stored yet. A cell may leave too few poses."""
         rng, config, asked = self._rng(_FIRST), self._planned(), Request(self.settings.poses)
         chosen = make(self.cell, config, asked, rng, None, say, self.catalogue)
         known = {**about(chosen), "remarks": list(remarks(chosen))}
@@ -298,11 +293,7 @@ class Procedure:
     # testing what is never fitted
 
     def plan_validation(self, say: Say = lambda words: None) -> Plan:
-        """Choose poses and loads of the validation campaign, and make its file.
-
-        Raises:
-            CannotAnswerError: no pose is left.
-        """
+        """Choose poses and loads of the validation campaign, and make its file."""
         with Campaign.open(self.run, self.catalogue, read_only=True) as o:
             say("restoring the model")
             calibration, record = self._calibration(o)
@@ -362,11 +353,7 @@ class Procedure:
             )
 
     def correct(self, say: Say = lambda words: None) -> Plan:
-        """Correct the joint targets of the validation poses, and make the file of their run.
-
-        Raises:
-            CannotAnswerError: no point can be corrected.
-        """
+        """Correct the joint targets of the validation poses, and make the file of their run."""
         with (
             Campaign.open(self.run, self.catalogue) as o,
             opened(self.files.validation, VALIDATION, self.run) as unseen,

@@ -80,12 +80,7 @@ class CampaignFile:
     ) -> Self:
         """Make a campaign; the file appears only when it is complete.
 
-        Args:
-            overwrite: replace an existing campaign (never a file of another kind).
-
-        Raises:
-            InputError: the file exists, or cannot be written; see `append_readings`.
-            DeviceError: the disk is full or failed.
+        It may `overwrite` an existing campaign, never a file of another kind.
         """
         path = Path(path)
         meta = {"config": config_json, "base_dir": base_dir, "source": source}
@@ -102,9 +97,7 @@ class CampaignFile:
     ) -> Self:
         """Open a campaign and check that it is whole.
 
-        Args:
-            check_revisions: refuse bad ones (`bad_revision`); what needs the readings alone, as to
-                measure on, does not.
+        Bad revisions (`bad_revision`) are refused, unless the readings alone are needed.
         """
         path = Path(path)
         if path.exists() and not (path.is_file() or path.is_dir()):
@@ -160,12 +153,7 @@ class CampaignFile:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Store everything of a block, or nothing.
-
-        Raises:
-            InputError: it cannot be stored.
-            DeviceError: the disk is full or failed, or see `check_place`.
-        """
+        """Store everything of a block, or nothing; raises as `check_place` does, too."""
         self._written = True
         try:
             with schema.sqlite_errors(self.path), schema.transaction(self.connection) as open_file:
@@ -176,11 +164,7 @@ class CampaignFile:
         self.check_place()
 
     def check_place(self) -> None:
-        """Refuse to go on where the open file is not the one of its name any more.
-
-        Raises:
-            MovedFileError: it was deleted, replaced or moved; says where its readings are.
-        """
+        """Raise a MovedFileError where the open file is not the one of its name any more."""
         if identity(self.path) == self._identity:
             return
         if self._now is None:
@@ -224,15 +208,7 @@ class CampaignFile:
         return content_hash(self.readings()[:count])
 
     def append_revision(self, record: RevisionRecord) -> int:
-        """Append a model revision.
-
-        Returns:
-            Its number, 1, 2, ...; `record.number` is not looked at.
-
-        Raises:
-            InputError: the file cannot be written.
-            ValueError: a number in it is not finite.
-        """
+        """Append a model revision; returns its number, 1, 2, ..., whatever the record has."""
         with self.transaction():
             return self.insert_revision(record)
 
@@ -318,9 +294,9 @@ class CampaignFile:
     def bad_revision(self) -> tuple[int, str] | None:
         """Return the first revision that is damaged, or was fitted to other readings, and why.
 
-        The hash of a revision is that of the first readings: of those that it was fitted to, or, as
-        programs before stored it, of some more, which were appended while it was fitted. Either
-        proves that the readings which it was fitted to are as they were.
+        Its hash is that of the first readings: of those that it was fitted to, or, as programs
+        before stored it, of some more, which were appended while it was fitted. Either proves that
+        they are as they were.
         """
         records, damaged = self._sound_revisions()
         fitted = [(r.number, *told) for r in records if (told := fitted_to(r)) is not None]

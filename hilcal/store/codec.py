@@ -40,11 +40,7 @@ def encode(value: Any) -> Any:
 
 
 def decode(kind: Any, content: Any) -> Any:
-    """Return the value of a type that `encode` made JSON of.
-
-    Raises:
-        ValueError, TypeError or LookupError: the content is of another type.
-    """
+    """Return the value of a type that `encode` made JSON of; others raise as conversions do."""
     origin, of = get_origin(kind), get_args(kind)
     if origin in (Union, types.UnionType):  # of a type and None
         return None if content is None else decode(of[0], content)
@@ -97,13 +93,7 @@ def write_document(path: Path, content: Mapping[str, object], indent: int | None
 def read_document(
     content: object, what: str, form: str, versions: tuple[int, ...], read: Callable[[Any], T]
 ) -> T:
-    """Return what a document holds; refuses another kind of it, a newer version, a damaged one.
-
-    Args:
-        what: is read, for people.
-        form: its key "format".
-        read: makes the value of the content.
-    """
+    """Return what a document holds; refuses another kind of it, a newer version, a damaged one."""
     if not isinstance(content, dict) or content.get("format") != form:
         raise InputError(f'no {what}; valid: a JSON document with "format": "{form}"')
     if content.get("version") not in versions:

@@ -52,17 +52,10 @@ class ProcedureLog:
         plan: Plan | None = None,
         revisions: Sequence[RevisionRecord] = (),
     ) -> tuple[int, ...]:
-        """Append an entry, together with what it is about, or none of it.
+        """Append an entry, with a further plan and revisions that it is about, or none of it.
 
-        Args:
-            plan: a further plan of the campaign, with names that it does not have yet.
-
-        Returns:
-            The numbers of the revisions; they are in the entry as "revisions".
-
-        Raises:
-            InputError: the file cannot be written.
-            DeviceError: the disk is full or failed.
+        The plan has names that the campaign does not have yet. Returns the numbers of the
+        revisions, which are in the entry as "revisions".
         """
         log = None if plan is None else RunLog(self._campaign)
         with self._campaign.transaction() as connection:

@@ -91,12 +91,7 @@ def change(added: str | None, removed: str | None, scatter: bool = False) -> str
 
 
 def to_text(record: RevisionRecord) -> str:
-    """JSON text of a record without its number; floats keep their exact value.
-
-    Raises:
-        ValueError: a number is NaN or infinite, which JSON cannot hold (use null).
-        TypeError: a value is not of JSON.
-    """
+    """JSON text of a record without its number; floats keep their exact value, and are finite."""
     content = {f.name: getattr(record, f.name) for f in fields(record) if f.name != "number"}
     if record.parent is None:
         del content["parent"]
@@ -147,11 +142,7 @@ def split(record: RevisionRecord) -> tuple[RevisionRecord, str | None, str]:
 
 
 def join(record: RevisionRecord, stored: Mapping[str, str]) -> RevisionRecord:
-    """Return a record with the posterior that it names.
-
-    Raises:
-        ValueError: the posterior is not among them.
-    """
+    """Return a record with the posterior that it names; a ValueError where that is not there."""
     carried: Any = record.parameters_json.get(CARRIED)
     if carried is None:
         return record

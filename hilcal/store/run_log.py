@@ -41,12 +41,7 @@ def create_run(
     source: str = "measured by hilcal run",
     more: Mapping[str, str] | None = None,
 ) -> CampaignFile:
-    """Make the empty campaign of a run, its plan inside.
-
-    Args:
-        more: further texts about it; that of the key `COVERS` where readings are stored with
-            another covariance than the instrument's.
-    """
+    """Make the empty campaign of a run, its plan inside; `more` are further texts about it."""
     texts = {PLAN: plan.to_json(), COVERS: INSTRUMENT, **(more or {})}
     return CampaignFile.create(
         path, config.to_json(), str(base_dir), source, overwrite=overwrite, more=texts
@@ -122,11 +117,7 @@ class RunLog:
         return Plan(whole.pose_names, whole.q, tuple(s for s in whole.steps if s in done))
 
     def append(self, plan: Plan) -> None:
-        """Append a further plan, see `with_new_names`; what is missing of those before is given up.
-
-        Raises:
-            DeviceError: the disk is full or failed.
-        """
+        """Append a further plan, see `with_new_names`; what is missing of others is given up."""
         with self._campaign.transaction() as connection:
             rows.insert_meta(connection, f"{PLAN} {len(self.plans) + 1}", plan.to_json())
         self.plans = (*self.plans, plan)
@@ -136,12 +127,8 @@ class RunLog:
     ) -> None:
         """Append the reading of a step, with everything raw that belongs to it.
 
-        Of several targets all readings of the arrival, one detail for each, or none of them: a
-        step that is measured again is another arrival.
-
-        Raises:
-            InputError: the step is there already, or other quantities than before.
-            DeviceError: the disk is full or failed; the file is as before.
+        Of several targets all readings of the arrival, one detail for each, or none of them: a step
+        that is measured again is another arrival. Where the disk fails, the file is as before.
         """
         details = (detail, *more)
         if len(reading) != len(details):
@@ -160,11 +147,7 @@ class RunLog:
                     ) from None
 
     def event(self, kind: str, content: dict[str, Any]) -> None:
-        """Append what happened, with the time (UTC).
-
-        Raises:
-            DeviceError: the disk is full or failed.
-        """
+        """Append what happened, with the time (UTC)."""
         text = json.dumps({"kind": kind, "utc": utc_now(), **content}, allow_nan=False)
         with self._campaign.transaction() as connection:
             number = rows.last_id(connection, "events") + 1

@@ -125,11 +125,7 @@ ENTRIES: Mapping[str, Schema] = {
 
 
 def check(schema: Schema, content: object) -> None:
-    """Refuse a document that is not as it should be.
-
-    Raises:
-        ValueError: says where, in a line.
-    """
+    """Refuse, by a ValueError of a line, a document that is not as it should be."""
     try:
         schema.model_validate(content)
     except ValidationError as error:

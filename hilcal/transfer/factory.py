@@ -56,15 +56,10 @@ def check_factory(
     readings: Readings,
     catalogue: Catalogue | None = None,
 ) -> FactoryCheck:
-    """Judge readings by the kinematics that the factory measured.
+    """Judge readings of a few poses by the kinematics that the factory measured.
 
-    Args:
-        nominal: the arm as its maker designed it, its joints not yet counted as the cell says.
-        catalogue: the effects; the installed ones where None.
-
-    Raises:
-        InputError: kinematics of an arm of another kind.
-        CannotAnswerError: too few readings, or they do not determine the frames.
+    `nominal` is the arm as its maker designed it, its joints not yet counted as the cell says.
+    Raises a CannotAnswerError for too few readings, or where they do not determine the frames.
     """
     if len(readings) < LEAST:
         raise CannotAnswerError(f"{len(readings)} readings; {LEAST} or more can answer")

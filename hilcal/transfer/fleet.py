@@ -49,16 +49,9 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
     """Fit and diagnose the campaigns in a directory and below it, and pool them by type of arm.
 
     Nothing is stored in them. A campaign that fails is listed with its reason; so is one whose arm
-    is described otherwise than the first of its type.
-
-    Args:
-        directory: with campaign files.
-        counting: shows how far it is, as `present.progress.counting` does.
-
-    Raises:
-        InputError: no directory, no campaigns, or two of the same readings, which would count
-            twice: copies, or one and its extension.
-        CannotAnswerError: no type of which anything can be said.
+    is described otherwise than the first of its type. Two of the same readings, copies, or one and
+    its extension, are refused: they would count twice. Raises a CannotAnswerError where nothing can
+    be said of any type. `counting` shows how far it is, as `present.progress.counting` does.
     """
     listed = entries(directory)
     if same := shared(engine.map(prints_of, listed)):

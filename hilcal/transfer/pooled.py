@@ -127,11 +127,7 @@ def effects_seen(members: Sequence[Member]) -> tuple[DiagnosedEffect, ...]:
 
 
 def pooled(members: Sequence[Member], seen: Sequence[DiagnosedEffect]) -> Pooled:
-    """Pool the campaigns of arms of one type.
-
-    Raises:
-        CannotAnswerError: fewer than three arms, or no parameter that two arms determine.
-    """
+    """Pool the campaigns of arms of one type; two arms have no spread: a CannotAnswerError."""
     first = members[0].posterior
     arms = tuple(dict.fromkeys(m.arm for m in members))
     if len(arms) < FEWEST_ARMS:

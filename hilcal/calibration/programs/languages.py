@@ -85,9 +85,8 @@ def understood(
 ) -> UnderstoodProgram:
     """Read a program.
 
-    Args:
-        tool: (4, 4) T_flange_tool of tools that neither has.
-        near: (6,) joint values that the first pose is near to, rad.
+    `tool` (4, 4) T_flange_tool is that of tools that neither it nor `frames` has; `near` (6,) are
+    joint values that the first pose is near to, rad.
     """
     try:
         program = READERS[path.suffix.lower()](path, frames, tool)
@@ -177,13 +176,10 @@ def flags_of(arm: Arm, language: Language, q: Floats) -> Ints:
 def resolve(
     program: Program, arm: Arm, near: Floats | None
 ) -> tuple[Floats, list[str], tuple[str, ...]]:
-    """Return the joint values (N, 6) at which the nominal arm is at the points.
+    """Return joint values (N, 6) at which the nominal arm is at the points, doubts, and remarks.
 
-    Args:
-        near: (6,) joint values that the first pose is near to, rad; None where none are given.
-
-    Returns:
-        joint values; why those of a point are not certain, "" where they are; what is to be said.
+    A doubt says why the values of a point are not certain, "" where they are. `near` (6,) are joint
+    values that the first pose is near to, rad; None where none are given.
     """
     language = program.language
     if arm.n != JOINTS or arm.mimic is not None:
@@ -270,10 +266,7 @@ def _one(
 def kept_flags(arm: Arm, language: Language, given: Floats, q: Floats, stated: Ints) -> Ints:
     """(N, F) configuration to be stated after a correction: others where those were left alone.
 
-    Args:
-        given: (N, 6) joint values before, rad.
-        q: (N, 6) joint values after.
-        stated: (N, F) as stated.
+    `given` and `q` are joint values (N, 6) before and after, rad; `stated` (N, F) is as it was.
     """
     left = _agree(arm, language, given, stated) & ~_agree(arm, language, q, stated)
     if unlike(arm, language):

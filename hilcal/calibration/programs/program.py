@@ -140,12 +140,9 @@ class Program:
     def corrected(
         self, arm: Arm, found: Sequence[ProgramPoint], given: Floats, q: Floats, flags: Ints
     ) -> dict[str, bytes]:
-        """Return the files, by suffix, with other points.
+        """Return the files, by suffix, with N other points.
 
-        Args:
-            given: (N, 6) joint values of them as they were, rad.
-            q: (N, 6) joint values that they get.
-            flags: (N, F) configuration that they get.
+        They had joint values `given` (N, 6), rad, and get q and the configuration `flags` (N, F).
         """
         edits: list[tuple[Span, str]] = []
         poses = evaluate(arm, q)
@@ -282,7 +279,10 @@ class ControllerFrames:
         return next(named, None)
 
     def pose(self, what: str, name: str, words: str, none: str = "0") -> Floats | str:
-        """Pose (4, 4) of a tool or base, or why it is not known."""
+        """Pose (4, 4) of a tool or base, or why it is not known; `words` is what it is called.
+
+        `none` is the name of that which is no tool, or the base itself.
+        """
         given = self.given(what, name)
         if given is not None or name.upper() == none:
             return np.eye(4) if given is None else given
@@ -295,11 +295,7 @@ class ControllerFrames:
 def controller_frames(
     path: Path | None, language: Language, tool: Floats | None
 ) -> ControllerFrames:
-    """Read `--frames F.toml`, where there is one.
-
-    Args:
-        tool: (4, 4) T_flange_tool of tools that no file has; None without it.
-    """
+    """Read `--frames F.toml`, where there is one; `tool` (4, 4) is of tools that no file has."""
     if path is None:
         return ControllerFrames(language, {"tools": {}, "bases": {}}, tool=tool)
     if path.suffix.lower() != ".toml":
@@ -351,7 +347,7 @@ class ProgramReader:
         return InputError(f"{self.path.name}: line {line}: {what}; valid: {valid}")
 
     def take(self, key: str, new: ProgramPoint, line: int, obeyed: bool = False) -> None:
-        """Take the point of a motion; one that is there is left where its frames differ."""
+        """Take the point of a motion; one that is there already is left where its frames differ."""
         old = self.found.get(key)
         if old is None or (new.left and not old.left):
             self.found[key] = new
