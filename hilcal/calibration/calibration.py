@@ -356,8 +356,8 @@ class Calibration(Brief):
     ) -> ToolPoses:
         """Return where a tool is at N points.
 
-        `nominal` (N, 3, 3) and (N, 3) are orientations and positions that errors are counted from, `untold`
-        columns of the states that are means of `conditions`.
+        `nominal` (N, 3, 3) and (N, 3) are orientations and positions that errors are counted from,
+        `untold` columns of the states that are means of `conditions`.
         """
         prediction = of.model.predict(states, of.theta)
         rotation, position = tool_poses(of, prediction)

@@ -78,8 +78,8 @@ class Measured:
     def outside(self, states: States, std_m: Floats | None, turns: Bools) -> list[Outside]:
         """Return what points leave, by variable.
 
-        `std_m` (N,) are the standard deviations of the predictions, None where they are not known; `turns`
-        (n,) joints that are the same whole turns on.
+        `std_m` (N,) are the standard deviations of the predictions, None where they are not known;
+        `turns` (n,) joints that are the same whole turns on.
         """
         known, turning = {r.variable: r for r in self.ranges}, turning_variables(turns)
         units = ["m" if travel_name(j) in known else "rad" for j in range(states.q.shape[1])]
@@ -164,8 +164,8 @@ class SensorMount:
     def load_wrench(self, cell: Cell, q: Floats, reading: Floats) -> Floats:
         """Return force and moment (N, 6) of the load at the load point, base axes, N and N·m.
 
-        At q (N, n), rad, it adds `reading` (N, 6) to the sensor's reading, sensor axes; the arm is the
-        nominal one.
+        At q (N, n), rad, it adds `reading` (N, 6) to the sensor's reading, sensor axes; the arm is
+        the nominal one.
         """
         chain = evaluate(cell.arm, q)
         axes = se3.product(chain.rotation[-1], se3.rotation(self.rotvec_rad))
