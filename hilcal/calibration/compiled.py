@@ -79,10 +79,9 @@ class CompiledForm:
         for j, values in enumerate(self.by_torque):
             grid = np.linspace(-self.torque[j], self.torque[j], TORQUE_NODES)
             torque_slopes[j] = _spline(grid, values)(grid, 1)
-        return (
-            self.by_angle, packed(slopes), -TURN, float(angle[1] - angle[0]),
-            self.by_torque, torque_slopes, -self.torque, steps, self.soft, packed(soft_slopes),
-        )  # fmt: skip
+        grids = -TURN, float(angle[1] - angle[0]), -self.torque, steps
+        angles, soft = (self.by_angle, packed(slopes)), (self.soft, packed(soft_slopes))
+        return grids, (*angles, self.by_torque, torque_slopes, *soft)
 
     def take(self, e: Effect, theta: Floats, s: Situation) -> bool:
         """Add an effect; False where it has another form."""

@@ -20,22 +20,13 @@ from hilcal import limits
 from hilcal.errors import DeviceError, HilcalError, InputError
 
 APPLICATION_ID = 0x68696C63  # "hilc"
-VERSION = 7
-MORE_COLUMNS = 7
-"""Version of a file whose readings have joint torques, or are of several observers (stations,
-distances, gauges): programs that do not know these would take the file for damaged."""
-CHANGED_CELL = 6
-"""Version of a file with a revision that was fitted in a cell that was changed since its readings
-were taken: programs that do not know it would take the cell as it was."""
-CARRIED_PRIOR = 5
-"""Version of a file with a revision that was fitted with a prior of another campaign: programs that
-do not know it would fit without."""
-CHOSEN_REVISION = 4
-"""Version of a file with an accepted revision, or one made from another than the one before:
-programs that know neither would go on from the latest one."""
-SEVERAL_TARGETS = 3
-"""Version of a file whose readings are of several targets; all others stay at `ONE_TARGET`."""
-ONE_TARGET = 2
+ONE_TARGET, SEVERAL_TARGETS, CHOSEN_REVISION = 2, 3, 4
+CARRIED_PRIOR, CHANGED_CELL, MORE_COLUMNS = 5, 6, 7
+"""Versions of a file: readings of one target, or of several; an accepted revision, or one made from
+another than the one before; a revision fitted with a prior of another campaign, or in a cell that
+was changed since its readings were taken; readings with joint torques, or of several observers.
+Programs that do not know one would take the file for damaged, or for another."""
+VERSION = MORE_COLUMNS
 HEADER = b"SQLite format 3\x00"
 _JOURNAL = bytes.fromhex("d9d505f920a163d7")  # begins a journal, and ends one that ends in a name
 
