@@ -38,8 +38,10 @@ AGREES = 5e-3
 """Share by which a standard deviation may change where the small form is written; a choice."""
 TRIED = 40
 """Fitted states at which that is tried."""
-_CELL = ("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets")
-_CELL += ("target_names", "known_targets", "registration_known", "measured_torques")
+_CELL = (
+    *("target", "load_point", "tool_mass", "tool_com", "gravity", "registration", "targets"),
+    *("target_names", "known_targets", "registration_known", "measured_torques"),
+)
 
 
 def write(c: Calibration, path: Path) -> None:

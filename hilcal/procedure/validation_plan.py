@@ -319,7 +319,7 @@ def paired(validation: Readings, corrected: Readings, mode: str) -> tuple[Readin
     corrected readings take the pose and the cycle of the uncorrected ones. They share no error: of
     several targets only the first one is compared.
     """
-    alone = {"common": None, "stated": None, "arm_scatter": None, "serial": None}
+    alone: dict[str, Any] = {"common": None, "stated": None, "arm_scatter": None, "serial": None}
     validation, corrected = (replace(x, **alone) for x in (validation, corrected))
     of = points_of(validation, mode)
     first = np.flatnonzero(corrected.target == 0)

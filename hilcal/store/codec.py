@@ -55,7 +55,7 @@ def decode(kind: Any, content: Any) -> Any:
         return tuple(decode(k, v) for k, v in zip(kinds, content, strict=True))
     if origin is not None and issubclass(origin, Mapping):
         return {str(k): decode(of[1], v) for k, v in content.items()}
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         hints = _hints(kind)
         given = [f for f in fields(kind) if f.init and (f.name in content or _required(f))]
         return kind(**{f.name: decode(hints[f.name], content[f.name]) for f in given})

@@ -32,8 +32,14 @@ class _Strict(_Document):
 
 def _of(base: Schema = _Document, /, **keys: Any) -> Any:
     """Return a document with keys of types, or of pairs of a type and a default."""
-    given = {k: of if isinstance(of, tuple) else (of, ...) for k, of in keys.items()}
+    given: dict[str, Any] = {
+        k: of if isinstance(of, tuple) else (of, ...) for k, of in keys.items()
+    }
     return create_model("document", __base__=base, **given)
+
+
+def _list(of: Any) -> Any:
+    return list.__class_getitem__(of)
 
 
 _ERRORS = _of(mean_m=Number, rms_m=Number, max_m=Number, rms_sigma=Number)
@@ -42,7 +48,7 @@ _IDENTIFIED = _of(
     n_readings=Count,
     variance_factor=Number,
     error=_of(fit=_ERRORS, holdout=_ERRORS),
-    parameters=list[_PARAMETER],
+    parameters=_list(_PARAMETER),
 )
 _DIAGNOSED = _of(verdict=Text, rejected=(list[Text], []))
 _OPTIONS = _of(
@@ -77,7 +83,7 @@ _HAPPENED: Schema = _of(kind=Text, utc=Text)
 _happened = partial(_of, _HAPPENED)
 EVENTS: Mapping[str, Schema] = {
     "devices": _happened(
-        answers=list[_of(device=Text, driver=Text, name=Text, facts=dict[str, Text])]
+        answers=_list(_of(device=Text, driver=Text, name=Text, facts=dict[str, Text]))
     ),
     "tare": _happened(force=_of(wrench=Wrench)),
     "drift": _happened(shift_m=Axes, sigma=Number, over=bool),

@@ -68,8 +68,8 @@ def fleet(directory: Path, engine: Engine, counting: Counting = _unseen) -> Flee
         if isinstance(result, Failure):
             continue
         of = kinds.setdefault(result.type, [])
-        links, first = result.posterior.links, (of[0][1] if of else result).posterior.links
-        if links.shape == first.shape and np.abs(links - first).max() <= SAME_M:
+        links, others = result.posterior.links, (of[0][1] if of else result).posterior.links
+        if links.shape == others.shape and np.abs(links - others).max() <= SAME_M:
             of.append((entry, result))
         else:
             why = f"its {result.type} has other nominal links than that of {of[0][1].name}"
