@@ -131,22 +131,18 @@ class CompiledForm:
         solved = np.linalg.lstsq(rows, y, rcond=None)[0]
         if np.abs(rows @ solved - y).max() > 1e3 * EXACT * max(np.abs(y).max(), 1.0):
             return False
-        self.gain = packed(solved[:-1].T + (self.gain if len(self.gain) else 0.0))
+        self.gain = _added(self.gain, solved[:-1].T)
         self.bias = self.bias + solved[-1]
         return True
 
     def _soft(self, e: Effect, theta: Floats, s: Situation, dq: Floats) -> bool:
         """Take compliances of joints that depend on the joint's own angle."""
-        angle, n = np.linspace(-TURN, TURN, NODES), s.angle.shape[1]
-        unit = np.zeros_like(s.wrench)
+        n, unit = s.angle.shape[1], np.zeros_like(s.wrench)
         unit[:, :n, 5] = 1.0
-        parts = np.array_split(angle, 16)
-        own = np.concatenate([_at(e, theta, replace(s, wrench=unit), part) for part in parts])
-        waves = _spline(angle, own)
-        here = np.stack([waves(s.angle[:, j])[:, j] for j in range(n)], axis=1)
+        values, here = _waves(e, theta, replace(s, wrench=unit))
         if not _same(Deviation(dq=dq), here * s.wrench[:, :n, 5], None):
             return False
-        self.soft = packed(own.T + (self.soft if len(self.soft) else 0.0))
+        self.soft = _added(self.soft, values.T)
         return True
 
     def _by_torque(self, e: Effect, theta: Floats, s: Situation, found: Deviation) -> bool:
@@ -165,8 +161,7 @@ class CompiledForm:
         if not _same(found, dq, None):
             return False
         self.torque = torque
-        self.by_torque = values.T + (self.by_torque if len(self.by_torque) else 0.0)
-        self.by_torque = packed(self.by_torque)
+        self.by_torque = _added(self.by_torque, values.T)
         return True
 
     def _rigid(self, e: Effect, theta: Floats, s: Situation) -> bool:
@@ -186,14 +181,9 @@ class CompiledForm:
             self.b += solved[-1].reshape(twist.shape)
             if solved[:-1].any():
                 by_values = np.moveaxis(solved[:-1].reshape(n, *twist.shape), 0, -1)
-                self.by_values = packed(
-                    by_values + (self.by_values if len(self.by_values) else 0.0)
-                )
+                self.by_values = _added(self.by_values, by_values)
             return True
-        angle = np.linspace(-TURN, TURN, NODES)
-        own = np.concatenate([_at(e, theta, s, part) for part in np.array_split(angle, 16)])
-        waves = _spline(angle, own)
-        each = np.stack([waves(s.angle[:, j])[:, j] for j in range(n)], axis=1)
+        values, each = _waves(e, theta, s)
         # What is left may follow other joints in proportion.
         left = found.dq - each
         rows = np.hstack([s.angle, np.ones((TRIALS, 1))])
@@ -206,7 +196,7 @@ class CompiledForm:
         self.b += twist
         self.a += solved[-1]
         self.linear += solved[:-1].T
-        self.by_angle = packed(own.T + (self.by_angle if len(self.by_angle) else 0.0))
+        self.by_angle = _added(self.by_angle, values.T)
         return True
 
 
@@ -234,13 +224,20 @@ def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
     return CubicSpline(x, y, axis=axis)
 
 
-def _at(e: Effect, theta: Floats, s: Situation, angle: Floats) -> Floats:
-    """(K, n) displacements with all joints at the same angles (K,)."""
-    grid = repeated(s, len(angle))
-    q = np.repeat(angle[:, None], s.angle.shape[1], axis=1)
-    moved = replace(grid, states=replace(grid.states, q=q), angle=q)
-    found = e.deviation(theta, moved).dq
-    return np.zeros_like(q) if found is None else found
+def _added(to: Floats, more: Floats) -> Floats:
+    return packed(more + to if len(to) else more)
+
+
+def _waves(e: Effect, theta: Floats, s: Situation) -> tuple[Floats, Floats]:
+    """Displacements with all joints at the angle of each of the NODES (NODES, n), and at s."""
+    angle, parts = np.linspace(-TURN, TURN, NODES), []
+    for part in np.array_split(angle, 16):
+        grid, q = repeated(s, len(part)), np.repeat(part[:, None], s.angle.shape[1], axis=1)
+        found = e.deviation(theta, replace(grid, states=replace(grid.states, q=q), angle=q)).dq
+        parts.append(np.zeros_like(q) if found is None else found)
+    values = np.concatenate(parts)
+    waves = _spline(angle, values)
+    return values, np.stack([waves(a)[:, j] for j, a in enumerate(s.angle.T)], axis=1)
 
 
 def repeated(s: Situation, count: int) -> Situation:
