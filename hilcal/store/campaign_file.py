@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Self, get_args
+from typing import Any, Self
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.names import quoted
 from hilcal.readings.readings import ObserverKind, ObserverName, Readings
 from hilcal.store import rows, schema
+from hilcal.store.codec import decode
 from hilcal.store.kept_texts import robot_file_of, typed_now
 from hilcal.store.revision import (
     RevisionRecord,
@@ -200,7 +201,7 @@ class CampaignFile:
         if layout is None:
             raise InputError(f"{self.path}: the campaign holds no readings yet")
         with schema.sqlite_errors(self.path):
-            names, by = self._names_in(self._read_meta().get(_TARGETS, "[]")), self._observers()
+            names, by = self._stored(_TARGETS, tuple[str, ...]), self._observers()
             return rows.fetch_readings(self.connection, self.path, layout, names, by)
 
     def data_hash(self, count: int | None = None) -> str:
@@ -233,8 +234,7 @@ class CampaignFile:
 
     def accepted(self) -> int | None:
         """Number of the accepted revision; None where the latest one is used."""
-        found = self.acceptances()
-        return found[-1] if found else None
+        return next(reversed(self.acceptances()), None)
 
     def accept(self, number: int | None) -> None:
         """Make a revision the one that is used; None lets the latest one be used again."""
@@ -299,11 +299,11 @@ class CampaignFile:
         they are as they were.
         """
         records, damaged = self._sound_revisions()
-        fitted = [(r.number, *told) for r in records if (told := fitted_to(r)) is not None]
-        readings = self.readings() if fitted else None
-        hashes: dict[int, str] = {}
+        fitted = [(r.number, *of) for r in records if (of := fitted_to(r)) is not None]
+        if not fitted:
+            return damaged
+        readings, hashes = self.readings(), dict[int, str]()
         for number, count, stored in fitted:
-            assert readings is not None  # noqa: S101
             for n in range(count, min(len(readings), count + _MEANWHILE) + 1):
                 if n > count and sum(hashes) > _HASHED:
                     return number, _OTHER_READINGS.format(number)
@@ -332,11 +332,13 @@ class CampaignFile:
         except ValueError as e:
             raise self._damaged(e) from e
 
-    def _names_in(self, text: str) -> list[str]:
-        names = rows.stored_json(self.path, text)
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise self._damaged("its targets")
-        return names
+    def _stored(self, key: str, kind: Any) -> Any:
+        """A list about the campaign, of some type; empty where there is none."""
+        content = rows.stored_json(self.path, self._read_meta().get(key, "[]"))
+        try:
+            return decode(kind, content)
+        except (TypeError, ValueError):
+            raise self._damaged(f"its {key}") from None
 
     def _claim_layout(self, layout: Layout) -> None:
         """Fix the quantities of a reading with the first ones; refuse others later."""
@@ -350,15 +352,11 @@ class CampaignFile:
                 f"a campaign holds one kind of reading, start another for these"
             )
 
-    def _observers(self) -> list[ObserverName]:
-        found = rows.stored_json(self.path, self._read_meta().get(_OBSERVERS, "[]"))
-        try:
-            by = [ObserverName(kind, str(name)) for kind, name in found]
-        except (TypeError, ValueError):
-            raise self._damaged("its observers") from None
-        if not all(o.kind in get_args(ObserverKind) and o.name for o in by):
+    def _observers(self) -> tuple[ObserverName, ...]:
+        stored = self._stored(_OBSERVERS, tuple[tuple[ObserverKind, str], ...])
+        if not all(name for _, name in stored):
             raise self._damaged("its observers")
-        return by
+        return tuple(ObserverName(kind, name) for kind, name in stored)
 
     def _claim_observers(self, readings: Readings) -> None:
         """Name the observers with the first readings; refuse others later."""
@@ -369,19 +367,17 @@ class CampaignFile:
         if self._read_meta().get(_OBSERVERS) is None:
             text = json.dumps([[o.kind, o.name] for o in readings.observers])
             rows.insert_meta(self.connection, _OBSERVERS, text)
-        if tuple(self._observers()) != readings.observers:
+        if self._observers() != readings.observers:
             raise InputError(f"{self.path}: the readings are by other observers than those before")
 
     def _numbered_targets(self, readings: Readings) -> Readings:
         """Return the readings with targets numbered as in the file; the first ones name them."""
         if readings.states.target is None:
             return readings
-        text = self._read_meta().get(_TARGETS)
-        if text is None:
-            text = json.dumps(readings.target_names)
-            rows.insert_meta(self.connection, _TARGETS, text)
+        if self._read_meta().get(_TARGETS) is None:
+            rows.insert_meta(self.connection, _TARGETS, json.dumps(readings.target_names))
             schema.require(self.connection, schema.SEVERAL_TARGETS)
-        names = self._names_in(text)
+        names: tuple[str, ...] = self._stored(_TARGETS, tuple[str, ...])
         new = [name for name in readings.target_names if name not in names]
         if new:
             raise InputError(
@@ -389,7 +385,7 @@ class CampaignFile:
             )
         number = np.array([names.index(name) for name in readings.target_names])
         states = replace(readings.states, target=number[readings.target])
-        return replace(readings, states=states, target_names=tuple(names))
+        return replace(readings, states=states, target_names=names)
 
 
 def _mend(path: Path) -> str:

@@ -102,11 +102,10 @@ def from_text(text: str, number: int) -> RevisionRecord:
     """Record from its JSON text."""
     try:
         content = parse_json(text)
-        check(REVISION, content)
-        content["effects"] = tuple(content["effects"])
-        r = RevisionRecord(**content, number=number)
+        r = RevisionRecord(**{**content, "effects": tuple(content["effects"])}, number=number)
         names = [*r.effects, r.data_hash, r.program_version, r.created, r.added, r.removed]
         check_names([name for name in names if name is not None], f"revision {number}, name")
+        check(REVISION, content)
         return r
     except (LookupError, TypeError, AttributeError) as e:
         raise ValueError(str(e)) from e
