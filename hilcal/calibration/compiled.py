@@ -185,7 +185,7 @@ class CompiledForm:
             return True
         values, each = _waves(e, theta, s)
         # What is left may follow other joints in proportion.
-        left = found.dq - each
+        left = np.asarray(found.dq) - each
         rows = np.hstack([s.angle, np.ones((TRIALS, 1))])
         solved = np.linalg.lstsq(rows, left, rcond=None)[0]
         if np.abs(left).max() < EXACT:
@@ -224,7 +224,7 @@ def _spline(x: Floats, y: Floats, axis: int = 0) -> Any:
     return CubicSpline(x, y, axis=axis)
 
 
-def _added(to: Floats, more: Floats) -> Floats:
+def _added(to: Floats, more: Any) -> Floats:
     return packed(more + to if len(to) else more)
 
 
