@@ -27,7 +27,7 @@ from hilcal.cli.commands import (
 from hilcal.cli.failing import Failures, Watched
 from hilcal.errors import DeviceError, HilcalError, StoppedError
 from hilcal.optional import lacking
-from hilcal.store.command_line import typed
+from hilcal.store.kept_texts import typed
 
 DEBUG = "HILCAL_DEBUG"
 _COMPLETE = "_HILCAL_COMPLETE"

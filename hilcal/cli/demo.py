@@ -78,7 +78,7 @@ from hilcal.refinement import refine as refine_model
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import may_write
 from hilcal.store.plan import REFERENCE, Plan
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 
 STRENGTH = 4.0  # Of what is hidden, in units of the noise: clearly there in so few readings
 FIRST = 6  # Poses of the first campaign

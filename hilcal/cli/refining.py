@@ -66,7 +66,7 @@ from hilcal.present.story import Chapter
 from hilcal.present.verdict import message
 from hilcal.refinement import RefinementStep as RefinementStep
 from hilcal.refinement import refine as refine_model
-from hilcal.store.purpose import refuse_fitting
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import change
 from hilcal.whole_file import replace_file
 

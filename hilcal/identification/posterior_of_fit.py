@@ -15,8 +15,8 @@ from hilcal.readings.ranges import ranges_of
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import whitening
 from hilcal.regression.schur import schur_complement
-from hilcal.store.records import content_hash
 from hilcal.store.revision import utc_now
+from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, Compensation
+from hilcal.calibration.compensation import BAND, Compensation
 from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
@@ -22,7 +22,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
-    from hilcal.procedure.decision import Decision
+    from hilcal.procedure.next_plan import Decision
     from hilcal.procedure.state import ProcedureStep
 
 TITLES: Mapping[str, str] = {

@@ -8,8 +8,8 @@ from hilcal.present.document import Block, heading, note, table
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.members import TypeSize
     from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
-    from hilcal.transfer.type_sizes import TypeSize
 
 FAR = 3.0
 """Standard deviations between which most arms lie; a choice."""

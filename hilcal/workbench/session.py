@@ -28,7 +28,7 @@ from hilcal.names import quoted
 from hilcal.present.registration import covariance_words
 from hilcal.present.story import Chapter, DependenceCurve, build_story, regressor
 from hilcal.procedure.next_plan import NextPlan, doubt_to_settle, next_plan
-from hilcal.store.purpose import refuse_fitting
+from hilcal.store.procedure_log import refuse_fitting
 from hilcal.store.revision import RevisionRecord
 from hilcal.types import Ints
 from hilcal.workbench.snapshot import Snapshot, Stamp, figures_of, require_judged

@@ -322,8 +322,10 @@ TAKEN: dict[str, dict[str, str]] = {
     },
     "store/campaign_file": {"hilcal repair": f"{RARE}a_bad_revision_is_set_aside_and_fitted_again"},
     "store/plan": {"hilcal plan": f"{HERE}files_that_are_not_there_yet"},
-    "store/purpose": {"--fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"},
-    "store/robot_file": {
+    "store/procedure_log": {
+        "--fit-validation": f"{CALIBRATE}what_fits_refuses_a_validation_campaign"
+    },
+    "store/kept_texts": {
         "hilcal repair {} --robot": "tests/unit/security/test_received_campaign.py"
         "::test_the_user_gives_the_robot_of_an_old_campaign"
     },

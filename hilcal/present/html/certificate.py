@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from hilcal import numbers
-from hilcal.calibration.budget import COVERAGE, budget
+from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.fit import Fit

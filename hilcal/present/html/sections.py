@@ -32,7 +32,7 @@ from hilcal.present.registration import covariance_words
 from hilcal.present.story import curve, laws, regressor
 from hilcal.present.validation import worst_table
 from hilcal.present.verdict import message
-from hilcal.store.command_line import COMMAND
+from hilcal.store.kept_texts import COMMAND
 
 MOST_CURVES = 2
 MOST_LISTED = 6

@@ -28,7 +28,7 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.types import Floats
 from tests.support.campaigns import cell_of, configuration, noiseless, plan, with_noise, world_of
 from tests.support.reflector_cases import reflectors

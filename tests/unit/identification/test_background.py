@@ -22,8 +22,8 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, Refinement, refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.calibration.budget import budget
+from hilcal.calibration.scatter import budget
 from hilcal.config import load_config
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.identification.background import with_pooled_lines

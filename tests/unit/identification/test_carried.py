@@ -16,8 +16,8 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.posterior import Posterior
 from hilcal.robot.catalogue import load_arm
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
 from tests.support.campaigns import Campaign, campaign, measured, noiseless, plan, with_noise
 
 NAMES = ("joint_compliance", "encoder_offset", "joint_tilt_compliance")

@@ -25,7 +25,7 @@ from hilcal.readings.readings import ObserverName, Readings
 from hilcal.readings.whitening import Mode
 from hilcal.robot import se3
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import campaign, cell_of, configuration, true_parameters
 from tests.support.cli_cases import CELL, Capsys, ok

@@ -16,7 +16,7 @@ from hilcal.identification.torques import check_torques
 from hilcal.readings.covariance import WHOLE
 from hilcal.readings.readings import Readings
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.campaigns import cell_of, measured, plan, true_parameters, world_of
 from tests.support.cli_cases import CELL, Capsys, ok

@@ -16,7 +16,7 @@ import pytest
 from playwright.sync_api import Browser
 
 from hilcal import numbers
-from hilcal.calibration.budget import budget
+from hilcal.calibration.scatter import budget
 from hilcal.campaign.campaign import Campaign
 from hilcal.present.document import Chart, Table
 from hilcal.present.html.certificate import (
