@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from hilcal.identification.extrapolation import FAR
 from hilcal.identification.predictive import Predictive
+from hilcal.identification.validation import FAR
 from hilcal.model.model import Model
 from hilcal.readings.ranges import (
     Range,

@@ -49,11 +49,10 @@ from hilcal.effects.options import Options
 from hilcal.effects.written import read_effects_text, write_effect
 from hilcal.errors import InputError
 from hilcal.identification.background import background_of
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import baseline, masses_note, with_effects
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import frames_to_json, prior_to_json
 from hilcal.identification.misdescription import other_arm_of
-from hilcal.identification.missing_masses import masses_note
 from hilcal.identification.torques import check_torques
 from hilcal.present.diagnosis import (
     addition_lines,

@@ -39,41 +39,25 @@ from hilcal.readings.whitening import Mode, Scaling, whitening
 from hilcal.shown import Shown
 from hilcal.types import Bools, Floats, Ints
 
-LEVEL = 0.95
-"""Of the percentile interval, unless another is asked for."""
-DRAWS = 200
-"""Usual number of draws: the standard deviation is known to 5 %; Efron and Tibshirani, 6.4."""
-LEAST_DRAWS = 20
-"""Fewest draws; a choice: the standard deviation is known to 16 %."""
-LEAST_POSES = 10
-"""Fewest distinct poses; a choice: of fewer, draws are too often the same few."""
-TOGETHER = 5
-"""Draws that a worker makes at a time; a choice. It does not depend on the number of workers."""
+LEVEL = 0.95  # of the percentile interval, unless another is asked for
+DRAWS = 200  # usual: the standard deviation is known to 5 % (Efron and Tibshirani, 6.4)
+LEAST_DRAWS = 20  # a choice: the standard deviation is known to 16 %
+LEAST_POSES = 10  # distinct ones; a choice: of fewer, draws are too often the same few
+TOGETHER = 5  # draws that a worker makes at a time, on any number of workers; a choice
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Campaign:
-    """What is drawn from; all that a worker needs.
+    """What is drawn from; all that a worker needs."""
 
-    Attributes:
-        model: the model, without readings of its own.
-        readings: those that were fitted.
-        group: (N,) distinct pose of each.
-        mode: what is fitted.
-        scaling: its scaling.
-        start: (P,) parameters that each fit starts from.
-        null: directions of the parameters that all poses together leave open.
-        seed: of the draws.
-    """
-
-    model: Model
-    readings: Readings
-    group: Ints
+    model: Model  # without readings of its own
+    readings: Readings  # those that were fitted
+    group: Ints  # (N,) distinct pose of each
     mode: Mode
     scaling: Scaling
-    start: Floats
-    null: int
-    seed: int
+    start: Floats  # (P,) parameters that each fit starts from
+    null: int  # directions of the parameters that all poses together leave open
+    seed: int  # of the draws
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,15 +84,9 @@ class Bootstrap(Shown):
     @cached_property
     def compared(self) -> Bools:
         """(P,) parameters with a stated standard uncertainty that are not shrunk."""
-        u = self.fit.uncertainty
-        shrunk = prior_of(self.fit.model)[1] >= 0
-        return np.asarray(
-            u.identifiable
-            & np.isfinite(u.std)
-            & (u.std > 0)
-            & self.fit.solution.estimated
-            & ~shrunk
-        )
+        u, shrunk = self.fit.uncertainty, prior_of(self.fit.model)[1] >= 0
+        stated = u.identifiable & np.isfinite(u.std) & (u.std > 0)
+        return np.asarray(stated & self.fit.solution.estimated & ~shrunk)
 
     @cached_property
     def ratio(self) -> Floats:
@@ -208,11 +186,7 @@ def bootstrap(
 
 
 def check_draws(draws: int, seed: int) -> None:
-    """Refuse numbers that cannot be.
-
-    Raises:
-        InputError: too few draws, or a negative seed.
-    """
+    """Refuse too few draws, or a negative seed."""
     if draws < LEAST_DRAWS or seed < 0:
         raise InputError(
             f"draws {draws}, seed {seed}; valid: at least {LEAST_DRAWS} draws, a seed from 0"
@@ -239,11 +213,6 @@ def again(readings: Readings, group: Ints, rng: np.random.Generator) -> Readings
 
     A group that is drawn twice gives two poses, so that each loaded reading keeps its own unloaded
     one, and each arrival its own common error.
-
-    Args:
-        readings: N readings.
-        group: (N,) number of the group of each, from 0.
-        rng: source of the draw.
     """
     count = int(group.max()) + 1
     order = np.argsort(group, kind="stable")

@@ -14,34 +14,21 @@ from hilcal.identification.fit import Fit
 from hilcal.readings.whitening import Whitening
 from hilcal.types import Bools, Floats
 
-TOGETHER = 8_000_000
-"""Numbers of the columns of effects that are computed together, 64 MB; a choice by memory."""
-WHITENED = 2_000_000
-"""Numbers of the columns that are whitened together, 16 MB, and kept while one of their effects is;
-a choice by memory."""
+TOGETHER = 8_000_000  # numbers of columns that are computed together, 64 MB; a choice by memory
+WHITENED = 2_000_000  # numbers that are whitened together, 16 MB, and kept while one effect is
 
 
 @dataclass(frozen=True, eq=False)
 class EffectColumns:
-    """The columns of an effect in ordinary magnitudes of its parameters.
-
-    Attributes:
-        effect: the effect.
-        scale: (P,) ordinary magnitudes, SI.
-        together: (R, Q) whitened columns of all effects that were whitened together.
-        within: which of them are this effect's, P.
-        of_readings: (N, m, P) motion of the fitted readings, sensor axes, m and rad.
-        whitening: of the readings.
-        bare: (N,) which readings are unloaded.
-    """
+    """The columns of an effect in ordinary magnitudes of its parameters."""
 
     effect: Effect
-    scale: Floats
-    together: Floats
-    within: slice
-    of_readings: Floats
-    whitening: Whitening
-    bare: Bools
+    scale: Floats  # (P,) ordinary magnitudes, SI
+    together: Floats  # (R, Q) whitened columns of all effects that were whitened together
+    within: slice  # which of them are this effect's, P
+    of_readings: Floats  # (N, m, P) motion of the fitted readings, sensor axes, m and rad
+    whitening: Whitening  # of the readings
+    bare: Bools  # (N,) which readings are unloaded
 
     @property
     def white(self) -> Floats:

@@ -54,52 +54,32 @@ from hilcal.readings.whitening import usual_mode
 from hilcal.tables.table import FROM_TRACKER, ImportResult
 from hilcal.types import Floats
 
-SPREAD = 3.0
-"""Of the log of a factor: 20 either way; a choice. The default is a laser tracker's, and cameras
-see by a hundred times less."""
-HARMONICS = 6
-"""Waves of a gear that take part; finer ones act as the arm's scatter. A choice, for speed."""
-MOST_ROWS = 900
-"""Elements of readings that are used, of poses chosen at random; a choice: of so many, a standard
-deviation is known to some per cent."""
-FEWEST_POSES = 10
-"""Poses below which frames and effects leave nothing to estimate a noise from; a choice."""
-ROUNDS = 3
-"""Most estimates, each after a new test for gross errors; a choice."""
-SEVERAL = 0.05
-"""Chance of finding several effects where there is one at most; a choice."""
-SEED = 20251125
-"""Of the poses that are chosen, and of simulated likelihood ratios."""
-NOISE = "noise"
-"""Key among the texts about an imported campaign, and kind of event of a measured one: the
-estimate; absent where the noise is stated, or as the samples show it."""
-CONTRADICTED = 3.0
-"""Standard errors of a factor's log from which on readings contradict their covariances."""
-LEAST_FACTOR = 1.3
-"""Smallest factor by which the noise of readings differs from that of their samples; a choice."""
+# Most of these are choices.
+SPREAD = 3.0  # of the log of a factor: 20 either way; cameras see by a hundred times less
+HARMONICS = 6  # waves of a gear that take part, for speed; finer ones act as the arm's scatter
+MOST_ROWS = 900  # elements of readings, of poses chosen at random: a σ is known to some per cent
+FEWEST_POSES = 10  # below which frames and effects leave nothing to estimate a noise from
+ROUNDS = 3  # most estimates, each after a new test for gross errors
+SEVERAL = 0.05  # chance of finding several effects where there is one at most
+SEED = 20251125  # of the poses that are chosen, and of simulated likelihood ratios
+NOISE = "noise"  # key among the texts about an imported campaign, and kind of event of a measured
+# one: the estimate; absent where the noise is stated, or as the samples show it
+CONTRADICTED = 3.0  # standard errors of a factor's log by which readings contradict covariances
+LEAST_FACTOR = 1.3  # by which the noise of readings differs from that of their samples
 ALONG, ACROSS, ORIENTATION, STATED = "along", "across", "orientation", "arm as stated"
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseEstimate:
-    """The noise of readings, as they tell it.
+    """The noise of readings, as they tell it; standard deviations of the median reading."""
 
-    Attributes:
-        along_m: standard deviation along the beam, m; as the next two the median of the readings.
-        across_m: along each axis across it, m.
-        orientation_rad: of a rotation about any axis; None where positions were read.
-        distance_m: length of the beam.
-        joint_std_rad: the arm's scatter, of each joint; None where the cell states it.
-        factors: f of measured readings by component; None for an import, the covariances of which
-            are stored as estimated.
-    """
-
-    along_m: float
-    across_m: float
-    orientation_rad: float | None
-    distance_m: float
-    joint_std_rad: float | None
-    factors: Mapping[str, float] | None = None
+    along_m: float  # along the beam
+    across_m: float  # along each axis across it
+    orientation_rad: float | None  # of a rotation about any axis; None where positions were read
+    distance_m: float  # length of the beam
+    joint_std_rad: float | None  # the arm's scatter, of each joint; None where the cell states it
+    factors: Mapping[str, float] | None = None  # f of measured readings by component; None for an
+    # import, the covariances of which are stored as estimated
 
     def to_json(self) -> str:
         """Return it as a text of a campaign."""
@@ -125,11 +105,6 @@ def with_estimated_noise(
     The covariance of readings of one target includes the arm's scatter then. Several targets share
     it in one arrival, so that `diagnose` estimates it.
 
-    Args:
-        found: what was imported.
-        cell: the cell.
-        config: its configuration.
-
     Returns:
         The import, and the estimate: None where the noise is stated, where the readings are fewer
         than `FEWEST_POSES` or show several effects, or where nothing can be fitted to them as they
@@ -150,11 +125,6 @@ def with_estimated_noise(
 
 def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
     """Return the noise of measured readings that contradict their samples.
-
-    Args:
-        readings: with the covariances of their means.
-        cell: the cell.
-        config: its configuration.
 
     Returns:
         The estimate with its factors; None where the cell states the noise, where the samples show
@@ -202,18 +172,11 @@ def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, flo
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Components:
-    """Components of the noise of readings, as these tell them.
+    """Components of the noise of readings, as these tell them."""
 
-    Attributes:
-        model: frames, at which the arm's scatter is evaluated.
-        factors: standard deviations of the components, in those of the default and of
-            `SCATTER_RAD`.
-        log_errors: standard errors of their logs.
-    """
-
-    model: Model
-    factors: Mapping[str, float]
-    log_errors: Mapping[str, float]
+    model: Model  # frames, at which the arm's scatter is evaluated
+    factors: Mapping[str, float]  # standard deviations, in those of the default and `SCATTER_RAD`
+    log_errors: Mapping[str, float]  # standard errors of their logs
 
     def estimate(self, readings: Readings, station: Sequence[float] | None) -> NoiseEstimate:
         """Return it in figures."""

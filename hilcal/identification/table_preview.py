@@ -23,8 +23,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.misdescription import examine
-from hilcal.identification.registration import register
-from hilcal.identification.rigid_frames import nearest_rotation, rotation_of_attitudes
+from hilcal.identification.registration import nearest_rotation, register, rotation_of_attitudes
 from hilcal.readings.readings import Readings
 from hilcal.robot.arm import Arm
 from hilcal.robot.chain import evaluate

@@ -15,7 +15,7 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.posterior import Posterior, Source
-from hilcal.identification.posterior_of_fit import of_arm
+from hilcal.identification.predictive import of_arm
 from hilcal.model.model import Model
 from hilcal.names import check_names
 from hilcal.readings.same_readings import prints

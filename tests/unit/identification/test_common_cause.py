@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 
 from hilcal.identification.baseline import baseline
-from hilcal.identification.common_cause import CHANCE, along_one_site, site_columns
+from hilcal.identification.data_snooping import CHANCE, along_one_site, site_columns
 from hilcal.identification.fit import fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

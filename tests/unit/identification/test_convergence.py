@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.gauss_newton_steps import Acceleration
+from hilcal.identification.gauss_newton import Acceleration
 from hilcal.identification.priors import scales_of
 from hilcal.identification.residual import residual
 from hilcal.model.model import Model

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.identification.excess import Excess, excess
+from hilcal.identification.predictive import Excess, excess
 from hilcal.readings.readings import Readings, States
 from hilcal.readings.whitening import whitening
 from hilcal.types import Floats

@@ -5,10 +5,9 @@ import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.extrapolation import Extrapolation, extrapolation
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import predictive
-from hilcal.identification.validation import Validation, validate
+from hilcal.identification.validation import Extrapolation, Validation, extrapolation, validate
 from tests.support.campaigns import campaign
 
 

@@ -9,9 +9,16 @@ from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, predicts_better
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
-from hilcal.identification.folds import block_folds, distinct_poses, random_folds, region_folds
+from hilcal.identification.folds import (
+    block_folds,
+    changes,
+    distinct_poses,
+    leave_out,
+    ordinary,
+    random_folds,
+    region_folds,
+)
 from hilcal.identification.gauss_newton import solve
-from hilcal.identification.holdout import changes, leave_out, ordinary
 from hilcal.identification.residual import residual
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import Mode, whitening

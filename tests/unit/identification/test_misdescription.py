@@ -8,8 +8,7 @@ import pytest
 from hilcal.cell import cell_from_config
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
-from hilcal.identification.hypotheses import Described, Hypothesis
-from hilcal.identification.misdescription import examine
+from hilcal.identification.misdescription import Described, Hypothesis, examine
 from hilcal.identification.registration import register
 from hilcal.robot.catalogue import load_arm
 from hilcal.robot.conventions import as_counted

@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import baseline, loads_differ, masses_note, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.missing_masses import loads_differ, masses_note
 from hilcal.readings.readings import Readings
 from tests.support.campaigns import campaign
 

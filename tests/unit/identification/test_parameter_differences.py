@@ -8,8 +8,7 @@ import pytest
 import hilcal as hc
 from hilcal.config import load_config
 from hilcal.drivers.simulated.world import stand
-from hilcal.identification.parameter_differences import Differences, parameter_differences
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.posterior import Differences, Posterior, parameter_differences
 from hilcal.robot.catalogue import configs_dir
 from studies.change import StudiedArm, measured, studied_arm
 

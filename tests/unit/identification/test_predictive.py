@@ -7,9 +7,9 @@ import pytest
 
 from hilcal.effects.catalogue import installed
 from hilcal.identification.baseline import with_effects
-from hilcal.identification.excess import Excess
 from hilcal.identification.fit import fit
 from hilcal.identification.predictive import (
+    Excess,
     Predictive,
     _left_out,
     parameter_factor,

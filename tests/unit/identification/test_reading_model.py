@@ -6,7 +6,7 @@ import pytest
 from hilcal.identification.baseline import baseline
 from hilcal.identification.data_snooping import Snooping, linearised
 from hilcal.identification.fit import fit
-from hilcal.identification.reading_model import ReadingModel
+from hilcal.identification.least_trimmed_squares import ReadingModel
 from hilcal.readings.whitening import MODES, Mode, inverse_root, whitening
 from tests.support.campaigns import campaign
 

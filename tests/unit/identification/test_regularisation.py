@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilcal.identification.gauss_newton_steps import NewtonPoint, linear_problem
-from hilcal.identification.regularisation import LinearProblem
+from hilcal.identification.gauss_newton import LinearProblem, NewtonPoint, linear_problem
 from hilcal.regression.normal_equations import find_basis, normal_equations
 
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg as sl
 
-from hilcal.identification.gauss_newton_steps import NewtonPoint, linear_problem
-from hilcal.identification.regularisation import regularise
+from hilcal.identification.gauss_newton import NewtonPoint, linear_problem, regularise
 from hilcal.regression.normal_equations import TALL
 from hilcal.types import Floats
 

@@ -8,7 +8,7 @@ import pytest
 from hilcal.diagnosis.misfit_breakdown import misfit_breakdown
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
-from hilcal.identification.gross_errors import gross_errors
+from hilcal.identification.full_prediction import gross_errors
 from hilcal.identification.linearisation import linearise
 from hilcal.identification.registration import register
 from hilcal.readings.whitening import MODES, Mode

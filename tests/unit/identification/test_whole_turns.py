@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 from hilcal.identification.baseline import baseline, with_effects
-from hilcal.identification.extrapolation import extrapolation
 from hilcal.identification.fit import fit
 from hilcal.identification.predictive import predictive
 from hilcal.identification.robot_frames import whole_turns
-from hilcal.identification.validation import validate
+from hilcal.identification.validation import extrapolation, validate
 from tests.support.campaigns import campaign
 
 
