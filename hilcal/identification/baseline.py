@@ -43,14 +43,7 @@ def baseline(
 
     They are found by the `role` of the catalogue's effects. In absolute readings of an arm without
     masses, what its weight does is estimated as well where poses were read under several loads.
-
-    Args:
-        cell: the cell.
-        readings: what is to be fitted.
-        mode: "deflection" or "absolute".
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught; its effects are in the model, too, but for those that
-            need what the readings do not have.
+    The effects of a prior are in the model, too, but for those that need what the readings lack.
 
     Raises:
         InputError: a prior of another arm, or of these very readings.
@@ -81,16 +74,8 @@ def with_effects(
 
     In deflections the frames act only by turning them, so the registration to the positions
     enters as a prior, with its rms error as standard deviation. In absolute readings the target
-    gets a prior of an ordinary size where the poses do not tell all of its offset.
-
-    Args:
-        cell: the cell.
-        readings: what is to be fitted.
-        mode: "deflection" or "absolute".
-        names: of the effects.
-        options: by name, where they are not the usual ones.
-        catalogue: the effects that a model can have; the installed ones unless given.
-        prior: what another campaign taught; effects have its options unless others are given.
+    gets a prior of an ordinary size where the poses do not tell all of its offset. Effects have
+    the options of a prior unless others are given by name.
 
     Raises:
         InputError: an unknown effect or option, a bad value, readings that lack what an

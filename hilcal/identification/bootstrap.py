@@ -96,11 +96,7 @@ class Bootstrap(Shown):
         return out
 
     def interval(self, level: float = LEVEL) -> Floats:
-        """(2, P) ends of the percentile interval.
-
-        Raises:
-            InputError: a level outside of (0, 1).
-        """
+        """(2, P) ends of the percentile interval; a level outside of (0, 1) is refused."""
         if not 0 < level < 1:
             raise InputError(f"level {level:g}; valid: between 0 and 1")
         tail = (1 - level) / 2

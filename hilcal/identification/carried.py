@@ -96,11 +96,7 @@ class CarriedPrior:
         return np.where(precision > 0, strength, self.posterior.scale)
 
     def index_in(self, names: tuple[str, ...]) -> tuple[Ints, Ints]:
-        """Return the parameters of a model that it is of, and their places in the posterior.
-
-        Args:
-            names: of the model's parameters, "effect.parameter".
-        """
+        """Parameters (K,) of a model, by their names, and their places in the posterior."""
         place = {name: k for k, name in enumerate(self.posterior.names)}
         index = [k for k, name in enumerate(names) if name in place]
         both = np.array([index, [place[names[k]] for k in index]], dtype=np.int64)
@@ -185,11 +181,7 @@ def carried_prior(
 
 
 def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
-    """Refuse a prior that is not one of these readings.
-
-    Raises:
-        InputError: of another arm, or learnt from readings that are to be fitted.
-    """
+    """Refuse a prior of another arm, or learnt from readings that are to be fitted."""
     check_arm(prior, arm)
     both = int(among(readings, prior.posterior.prints).sum())
     if both:
@@ -200,11 +192,7 @@ def check_prior(prior: CarriedPrior, arm: Arm, readings: Readings) -> None:
 
 
 def check_arm(prior: CarriedPrior, arm: Arm) -> None:
-    """Refuse a prior of another arm.
-
-    Raises:
-        InputError: of an arm with other joints or other links.
-    """
+    """Refuse a prior of an arm with other joints or other links."""
     p, of = prior.posterior, _called(prior.posterior)
     if p.links.shape != arm.links.shape:
         raise InputError(
@@ -274,10 +262,9 @@ class Coordinates:
         return np.isin(np.arange(size), self.index)
 
     def felt(self, a: Floats) -> "Coordinates":
-        """Return coordinates of which only those are kept that rows A (R, P) by θ depend on.
+        """Return those of which only what rows A (R, P) by θ depend on is kept.
 
-        Readings say nothing of the others, so that these stay where the prior has them. The same
-        where there are more rows than coordinates.
+        The others stay where the prior has them. The same with more rows than coordinates.
         """
         held = np.flatnonzero(self.std == 1.0)
         if len(a) >= len(held):

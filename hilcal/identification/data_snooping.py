@@ -168,10 +168,7 @@ class Snooping:
     def _snooped(self, of: ReadingModel, used: Bools, kept: Bools) -> tuple[Bools, Floats, float]:
         """Readings (N,) that are not off, t² (N,) from the fit to them, and the scale of its bulk.
 
-        Args:
-            of: the linear model.
-            used: (N,) those to begin with.
-            kept: (N,) of these, those that stay.
+        It begins with the `used` ones (N,), of which those that are `kept` (N,) stay.
         """
         count = int(np.count_nonzero(of.tested))
         for _ in range(ROUNDS):
@@ -350,14 +347,10 @@ def smooth_nuisance_columns(
 
 
 def off_alike(readings: Readings, tested: Bools, off: Ints, shift: Floats, axes: Floats) -> Ints:
-    """Return the rows that are off alike, more than `ACCIDENTAL` of the tested ones, or none.
+    """Return the rows that are off alike, more than `ACCIDENTAL` of the tested ones (N,), or none.
 
-    Args:
-        readings: N readings, in their order.
-        tested: (N,) which take part.
-        off: (F,) rows that are far off, ascending.
-        shift: (F, 3) by how much, sensor axes.
-        axes: (F, 3, 3) orientation of the target, sensor axes.
+    Of rows `off` (F,), ascending, with their shifts (F, 3) and the target's axes (F, 3, 3), both in
+    axes of the sensor.
     """
     order = np.zeros(len(readings), dtype=np.int64)
     found = np.zeros(len(off), dtype=np.bool_)
@@ -409,11 +402,8 @@ def _by_wrench(model: Model, theta: Floats, p: Prediction, readings: Readings) -
 def along_one_site(shift: Floats, columns: Floats, pose: Ints) -> Bools:
     """(F,) which readings that are off a law moves.
 
-    Args:
-        shift: (F, m) by how much, in units of the noise, the same for all directions: random ones
-            are not drawn to those of little noise.
-        columns: (F, m, P) changes by each site, in the same units.
-        pose: (F,) where the readings are.
+    Shifts (F, m) and the changes by each site (F, m, P) are in units of the noise, the same for all
+    directions: random ones are not drawn to those of little noise. `pose` (F,) is where they are.
     """
     count, m, sites = columns.shape
     if not count:

@@ -113,13 +113,7 @@ class _Columns:
 
 
 def chosen_drift(model: Model, solution: Solution, w: Whitening) -> Floats:
-    """Return δ (1 + G,): the doubt of the model's carried prior, and the drift of its groups.
-
-    Args:
-        model: with a carried prior.
-        solution: its fit.
-        w: the gc-scaling of the fit.
-    """
+    """Return δ (1 + G,) at a fit: the doubt of its carried prior, and the drift of its groups."""
     prior, lowest, rows = _linear(model, solution, w)
     scale2 = np.array([1.0, *(prior.expected.get(g.effect, 1.0) ** 2 for g in prior.groups)])
     forms = [g @ g.T for g in rows.drift]
@@ -159,11 +153,6 @@ def conflicts(model: Model, solution: Solution, w: Whitening) -> tuple[Conflict,
 
     Each is tested beside the drift that the others were given, since a joint that has moved makes
     its neighbours look as if they had. Groups that the readings do not see are left out.
-
-    Args:
-        model: fitted; without a carried prior there are none.
-        solution: its fit.
-        w: the gc-scaling of the fit.
     """
     if model.prior is None:
         return ()
@@ -228,14 +217,7 @@ def carried_effects(model: Model) -> tuple[str, ...]:
 def evidence_of_carried(
     model: Model, solution: Solution, w: Whitening, effects: Sequence[str]
 ) -> dict[str, float]:
-    """Return the log evidence of the readings for each effect, the others of the model beside it.
-
-    Args:
-        model: fitted, with a carried prior.
-        solution: its fit.
-        w: the gc-scaling of the fit.
-        effects: of the model, that the prior has.
-    """
+    """Return the log evidence of the readings for each effect, beside the others of the model."""
     c = _Columns.of(model, solution, w)
     y, a, flat, known = c.y, c.a, c.flat, c.known
     whole = coordinates_of(model)

@@ -115,11 +115,7 @@ class Estimates(Sequence[Estimate]):
     @overload
     def __getitem__(self, key: slice) -> Sequence[Estimate]: ...
     def __getitem__(self, key: int | str | slice) -> Estimate | Sequence[Estimate]:
-        """Return a parameter by place or by name.
-
-        Raises:
-            InputError: no parameter has that name.
-        """
+        """Return a parameter by place or by name, which is refused where there is none."""
         if isinstance(key, int | slice):
             return self.rows[key]
         for row in self.rows:
@@ -290,14 +286,7 @@ class Fit(WithVarianceFactor, Tabular):
         return robot_frames(self.model, self.theta)
 
     def predict(self, states: States) -> Observation:
-        """Predict what the sensor reads in N states.
-
-        Args:
-            states: joints, wrenches and what else the model's effects need.
-
-        Raises:
-            CannotAnswerError: no static equilibrium.
-        """
+        """Predict what the sensor reads in N states, if there is a static equilibrium."""
         return self.model.predict(states, self.theta).observation
 
 

@@ -55,8 +55,7 @@ def full_readings(
 def with_noise_of(tracker: Tracker, readings: Readings) -> Readings:
     """Return readings with the instrument's covariance that [tracker] states, as imports make it.
 
-    Raises:
-        InputError: a reading lies at the tracker's station.
+    A reading at the tracker's station is refused.
     """
     whole, station = ~readings.scalar, tracker.station_m or (0.0, 0.0, 0.0)
     if not whole.any():

@@ -103,12 +103,8 @@ def regularise(
 ) -> Regularisation:
     """Choose priors, noise factor and rank for a linear problem.
 
-    Args:
-        p: the problem.
-        scale: (P,) ordinary magnitudes of the parameters.
-        prior: (P,) prior standard deviations so far.
-        groups: (P,) shrinkage group of each parameter, or −1.
-        choose: whether the evidence chooses the priors of the shrunk families.
+    From ordinary magnitudes, priors so far and shrinkage groups or −1 (P,); the evidence chooses
+    the priors of shrunk families where asked to.
     """
     # Rms of the residual at the solution: it does not depend on where the linearisation started.
     basis = p.basis(scale, prior, 1.0)
@@ -161,10 +157,7 @@ def noise_factor(p: LinearProblem, equations: NormalEquations, beta: float = 1.0
 def effective_parameters(equations: NormalEquations, beta: float, root: Floats) -> float:
     """Effective number of parameters: flat directions + Σ (1 − β Λ_kk H⁻¹_kk) over the others.
 
-    Args:
-        equations: normal equations.
-        beta: noise variance factor that the priors are weighed against.
-        root: (K, K) T with Tᵀ T = H⁻¹.
+    With (K, K) T, Tᵀ T = H⁻¹.
     """
     return len(equations.basis.singular) + float(np.sum(_determined(equations, beta, root)))
 
@@ -172,10 +165,7 @@ def effective_parameters(equations: NormalEquations, beta: float, root: Floats) 
 def spent_parameters(equations: NormalEquations, beta: float, groups: Ints) -> float:
     """Degrees of freedom that a fit spends: `effective_parameters`, and the choice of strengths.
 
-    Args:
-        equations: normal equations over all parameters.
-        beta: noise variance factor that the priors are weighed against.
-        groups: (P,) shrinkage group of each parameter, or −1.
+    Of normal equations over all parameters, with their shrinkage groups or −1 (P,).
     """
     group = groups[equations.basis.held]
     determined = _determined(equations, beta, equations.inverse_root(beta))
@@ -326,9 +316,7 @@ class Acceleration:
     def accelerated(self, aim: Floats, moved: Floats) -> Floats | None:
         """Return where the steps so far lead to; None after the first.
 
-        Args:
-            aim: (P,) where the step leads to by itself.
-            moved: (R,) its motion of the whitened readings.
+        A step leads to `aim` (P,) by itself, and moves the whitened readings by `moved` (R,).
         """
         self._steps = [*self._steps[-DEPTH:], (aim, moved)]
         if len(self._steps) == 1:

@@ -69,11 +69,7 @@ class EarlierFit:
 
 
 def earlier_fit(fit: Fit) -> EarlierFit:
-    """Return what a gc-scaled fit states of readings that it has not seen.
-
-    Raises:
-        InputError: another scaling.
-    """
+    """Return what a fit, which must be gc-scaled, states of readings that it has not seen."""
     if fit.scaling != "gc":
         raise InputError(
             f"the earlier fit has scaling {fit.scaling}; a comparison needs gc: run hilcal "
@@ -182,11 +178,7 @@ class Remeasured:
 
     @cached_property
     def theta(self) -> Floats:
-        """(P,) parameters.
-
-        Raises:
-            CannotAnswerError: they are beyond what has a static equilibrium.
-        """
+        """(P,) parameters; CannotAnswerError beyond what has a static equilibrium."""
         step = self.lift @ self.coordinates[: self.lift.shape[1]]
         if np.any(np.abs(step) > ABSURD * scales_of(self.model)):
             raise CannotAnswerError("a change of such a size has no static equilibrium")
@@ -272,11 +264,8 @@ def setting(
 ) -> Setting:
     """Prepare the comparison of later readings with an earlier fit.
 
-    Args:
-        earlier: the earlier fit.
-        readings: later readings.
-        anew: whether the tracker was set up anew, so that its place is estimated.
-        cell: the later campaign's; its tool is used, and its target where that is another one.
+    The tracker was set up `anew` where its place is estimated; of the later campaign's cell the
+    tool is used, and its target where that is another one.
 
     Raises:
         InputError: an effect needs a column that the readings lack; or, for deflections, a loaded
@@ -390,15 +379,10 @@ def _pose_rows(earlier: EarlierFit, w: Whitening) -> Floats:
 def remeasure(
     at: Setting, changes: Sequence[Moving] = (), start: Remeasured | None = None
 ) -> Remeasured:
-    """Find the minimum by Gauss-Newton on the exact chain.
+    """Find the minimum by Gauss-Newton on the exact chain, beside flat changes of the arm.
 
-    Args:
-        at: the later readings.
-        changes: of the arm, with flat parameters.
-        start: a minimum with the first of these changes.
-
-    Raises:
-        CannotAnswerError: no static equilibrium.
+    It may start from a minimum with the first of the changes. Without a static equilibrium it
+    raises CannotAnswerError.
     """
     k, sizes = at.lift.shape[1], [c.directions.shape[1] for c in changes]
     effects = tuple({id(c.effect): c.effect for c in changes}.values())

@@ -157,11 +157,7 @@ class Linearisation:
         return score_family(s, g, self.rss, self.fit.dof, most=most)
 
     def families(self, columns: Sequence[EffectColumns]) -> list[tuple[Floats, Floats]]:
-        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were computed together.
-
-        The model's columns and the residual are multiplied by all that were whitened together at
-        once.
-        """
+        """Return S (P, P) and g = Xᵀ r (P,) of effects whose columns were whitened together."""
         if not columns:
             return []
         own = np.column_stack([self.rows, self.residual])
@@ -215,18 +211,12 @@ class ModelColumns:
     Parameters that are held at zero have no column, unless a test of their effect needs it
     (`Effect.for_scoring`). With a carried prior, columns are derivatives by the coordinates in
     which that prior is independent.
-
-    Attributes:
-        parameter: (L,) indices of the parameters, or coordinates, ascending.
-        scale: (L,) ordinary magnitudes, SI.
-        white: (R, L) whitened columns.
-        gram: (L, L) their products.
     """
 
-    parameter: Ints
-    scale: Floats
-    white: Floats
-    gram: Floats
+    parameter: Ints  # (L,) indices of the parameters, or coordinates, ascending
+    scale: Floats  # (L,) ordinary magnitudes, SI
+    white: Floats  # (R, L) whitened columns
+    gram: Floats  # (L, L) their products
 
 
 def model_columns(fit: Fit) -> ModelColumns:
@@ -284,8 +274,7 @@ def eliminate_columns(
         gram: (P, P) AᵀA.
         white: (R,) whitened residual of the fit.
         theta: (P,) parameters of the fit.
-        prior: (P,) their prior standard deviations: infinite for flat ones, zero for those held
-            at zero.
+        prior: (P,) their prior standard deviations: infinite for flat ones, zero for held ones.
         out: (P,) which to take out.
         beta: noise variance factor that the priors are weighed against.
         rank: number of rows that carry information.

@@ -454,23 +454,14 @@ class DescriptionFinding:
 
 
 def refuse_misdescribed(registered: Registration, readings: Readings) -> None:
-    """Refuse readings that do not fit the description of the arm, before anything is fitted.
-
-    Raises:
-        InputError: says what is wrong with the description, where that was found.
-    """
+    """Refuse readings that do not fit the description of the arm, and say what is wrong with it."""
     finding = examine(registered, readings)
     if finding is not None and finding.refused:
         raise InputError(finding.words(registered.cell, readings))
 
 
 def examine(registered: Registration, readings: Readings) -> DescriptionFinding | None:
-    """Return what is wrong with the description; None where the readings fit it.
-
-    Args:
-        registered: the registration of the nominal arm.
-        readings: the readings.
-    """
+    """Return what is wrong with the description, by the nominal arm's registration, if anything."""
     cell, gate = registered.cell, max(GATE_M, GATE_REACH * registered.cell.arm.reach)
     # A base that is told shows the whole geometric error, however close the positions lie.
     extent = np.inf if cell.registration_known else _extent(readings.value[:, :3])
@@ -618,12 +609,7 @@ class _DescriptionSearch:
         return float(np.arctan2(np.sin(found.x), np.cos(found.x))), rms
 
     def _score(self, way: Way, rough: bool = False) -> float:
-        """Misfit of the nominal arm under some hypotheses, m; in units of the positions as given.
-
-        Args:
-            way: the hypotheses.
-            rough: in few steps from few starts.
-        """
+        """Misfit of the nominal arm under hypotheses, m; in units of the positions as given."""
         self.tried += 1
         at = self._best(*self._problem(way, self._few), rough)
         size = float(np.sqrt(at.square / len(at.data)))
@@ -659,8 +645,7 @@ class _DescriptionSearch:
     def _robust(self, way: Way) -> tuple[float, Bools, Placement]:
         """Registration by most of the rows: reweighted until the others do not matter.
 
-        Returns:
-            Rms of the rows that fit, m; (N,) those that do not; and the frames.
+        Rms of the rows that fit, m; (N,) those that do not; and the frames.
         """
         data, given, free = self._problem(way, np.arange(len(self._readings)))
         at, scale = self._best(data, given, free), np.inf
@@ -730,12 +715,7 @@ class OtherArm:
 
 
 def other_arm(registered: Registration, readings: Readings) -> OtherArm | None:
-    """Return the arm of the catalogue that these readings are of; None where none fits better.
-
-    Args:
-        registered: the registration of the described arm.
-        readings: the readings.
-    """
+    """Return the arm of the catalogue that readings are of rather than of the registered one."""
     cell = registered.cell
     if cell.observers or registered.rms <= BEYOND_NOISE * noise_floor(readings.covariance):
         return None

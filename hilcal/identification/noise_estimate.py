@@ -100,15 +100,12 @@ class NoiseEstimate:
 def with_estimated_noise(
     found: ImportResult, cell: Cell, config: CellConfig
 ) -> tuple[ImportResult, NoiseEstimate | None]:
-    """Return an import with the noise that its readings tell, where nobody states it.
+    """Return an import with the noise that its readings tell, where nobody states it; the estimate.
 
     The covariance of readings of one target includes the arm's scatter then. Several targets share
-    it in one arrival, so that `diagnose` estimates it.
-
-    Returns:
-        The import, and the estimate: None where the noise is stated, where the readings are fewer
-        than `FEWEST_POSES` or show several effects, or where nothing can be fitted to them as they
-        are described.
+    it in one arrival, so that `diagnose` estimates it. None where the noise is stated, where the
+    readings are fewer than `FEWEST_POSES` or show several effects, or where nothing can be fitted
+    to them as they are described.
     """
     readings, station = found.readings, config.tracker.station_m
     told = None if found.noise_stated else _components(readings, cell, config)
@@ -124,11 +121,9 @@ def with_estimated_noise(
 
 
 def measured_noise(readings: Readings, cell: Cell, config: CellConfig) -> NoiseEstimate | None:
-    """Return the noise of measured readings that contradict their samples.
+    """Return the noise of measured readings that contradict their samples, with its factors.
 
-    Returns:
-        The estimate with its factors; None where the cell states the noise, where the samples show
-        it, or see `with_estimated_noise`.
+    None where the cell states it, where samples show it, or see `with_estimated_noise`.
     """
     if config.tracker.states_noise:
         return None

@@ -340,12 +340,8 @@ def _left_out(
 ) -> list[float]:
     """Mean variance of rows of each fold, predicted without it.
 
-    Args:
-        a: (R, P) fitted rows in units of W.
-        fold: (R,) of each.
-        asked: (R', P) rows in the units in which the variance is asked for, and their folds.
-        root: (P, K) root of C.
-        noise: σ².
+    Of fitted rows (R, P) in units of W, with their folds (R,); rows (R', P) and folds are asked for
+    in other units. (P, K) root of C, and σ².
     """
     total = np.zeros(len(asked))
     for f in range(int(fold.max(initial=-1)) + 1):
@@ -394,10 +390,6 @@ def position_factor(p: Predictive, left_out_m: float) -> float:
     With it the mean square error of the positions left out, m², is what was found there: in metres,
     as a band about a position is stated. In units of V the directions that an instrument measures
     best would decide, in which misfits count most.
-
-    Args:
-        p: what a fit knows.
-        left_out_m: rms of the 3-D position errors on poses left out.
     """
     return max(p.least, (left_out_m**2 - p.scatter_m2) / max(p.left_out_m2, 1e-300))
 

@@ -421,11 +421,7 @@ class Placement:
         return replace(self, frames=Frames(base, targets))
 
     def determined(self, spread: float) -> tuple[Floats, Floats]:
-        """Undetermined directions (6 + 6 T, U), and the Gauss-Newton step (K,) along the others.
-
-        Args:
-            spread: rms of the whitened misfit, at least 1.
-        """
+        """Undetermined directions (6 + 6 T, U) at an rms misfit ≥ 1; the step (K,) along the others."""
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)
@@ -691,9 +687,8 @@ class Sightings:
 def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
     """Place base, targets and the observers of the readings as far as they are unknown.
 
-    Returns:
-        The cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit
-        length, in ordinary sizes, that the readings do not determine.
+    The cell with all in place; (N, m) measured minus predicted; directions (K, U) of unit length,
+    in ordinary sizes, that the readings do not determine.
     """
     data, part = Sightings.of(cell, readings), np.zeros(len(readings), dtype=bool)
     for k in range(len(cell.observers)):

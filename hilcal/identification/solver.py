@@ -76,12 +76,7 @@ def shortened(
 ) -> T | None:
     """Return what the whole step, half of it, a quarter … first leads to; None for nothing good.
 
-    Args:
-        moved: where a step leads to; may raise CannotAnswerError, as `cost` may.
-        step: (K,) the whole one.
-        most: number of trials.
-        cost: what is not to grow beyond the limit.
-        limit: the most that it may be.
+    `moved` and `cost`, which must not exceed the limit, may raise CannotAnswerError.
     """
     for halving in range(most):
         try:
@@ -96,10 +91,7 @@ def shortened(
 def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
     """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
 
-    Args:
-        rows: the directions.
-        blocks: columns to pivot on, those of a block before those of the next.
-        least: elements below this are no pivots.
+    Columns of a block are pivoted on before those of the next; elements up to `least` are no pivots.
     """
     rows, done = rows.copy(), 0
     for block in blocks:

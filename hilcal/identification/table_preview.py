@@ -313,17 +313,10 @@ def _kinds(readings: Readings) -> str:
 def rank_conventions(
     arm: Arm, q: Floats, position: Floats, numbers: Floats, unit: float
 ) -> tuple[Agreement, ...]:
-    """Rank the conventions of orientations (N, k) by their agreement with the nominal arm.
+    """Rank the conventions of orientations by their agreement with the nominal arm, best first.
 
-    Args:
-        arm: the arm.
-        q: (N, n) joint angles, rad.
-        position: (N, 3) m, sensor axes.
-        numbers: (N, 3) angles or rotation vectors, or (N, 4) quaternions.
-        unit: radians in the unit of angles.
-
-    Returns:
-        Every convention of as many numbers, best first; none where the readings are too few.
+    At joint angles (N, n) and positions (N, 3), sensor axes, of as many numbers (N, k) in a unit of
+    angles; none where the readings are too few.
     """
     step = max(1, len(q) // MOST)
     q, position, numbers = q[::step], position[::step], numbers[::step]

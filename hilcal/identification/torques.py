@@ -71,11 +71,7 @@ def modelled_torques(cell: Cell, states: States, wrench: Floats, arm: bool, tool
 
 
 def require_torques(cell: Cell, readings: Readings) -> None:
-    """Refuse a cell that asks for measured torques of readings that have none.
-
-    Raises:
-        InputError: says so.
-    """
+    """Refuse a cell that asks for measured torques of readings that have none."""
     torque = readings.states.torque
     lost = 0 if torque is None else int(np.isnan(torque).any(axis=1).sum())
     if not cell.measured_torques or (torque is not None and not lost):
@@ -90,12 +86,7 @@ def require_torques(cell: Cell, readings: Readings) -> None:
 
 
 def check_torques(cell: Cell, readings: Readings) -> TorqueCheck | None:
-    """Compare measured with modelled torques, of the readings that have some; None without.
-
-    Args:
-        cell: arm, tool and gravity as described.
-        readings: N readings.
-    """
+    """Compare measured with modelled torques, of the readings that have some; None without."""
     if readings.states.torque is None:
         return None
     readings = readings[np.flatnonzero(~np.isnan(readings.states.torque).any(axis=1))]
@@ -151,11 +142,8 @@ def _fitted(
 ) -> tuple[dict[str, _Factor], Floats]:
     """Factors of causes (N, n), as far as they are told apart, and the drives' noise (n,).
 
-    Args:
-        y: (N, n) measured torques.
-        causes: torques of each at a factor of 1.
-        side: sides of the approach (N, n), where they are known.
-        lost: degrees of freedom that centring took from each drive; zero where it has an offset.
+    Sides of the approach (N, n) are causes of no factor; centring took `lost` degrees of freedom
+    from each drive, which has an offset where that is zero.
     """
     count, n = y.shape
     largest = max([float(np.abs(x).max()) for x in causes.values()], default=0.0)

@@ -162,12 +162,8 @@ def hyperparameter_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which standard uncertainties grow.
 
-    Args:
-        covariance: (P, P) of the parameters at the chosen priors, in true units of noise.
-        theta: (P,) estimates.
-        prior: (P,) prior standard deviations, the same within a group; infinite or zero for
-            parameters that are not shrunk or held at zero.
-        groups: (P,) group of each parameter, −1 for those that are not shrunk.
+    Of the covariance at the chosen priors, in true units of noise; of priors, the same within a
+    group, infinite or zero for parameters that are not shrunk or held at zero; groups −1 for these.
     """
     out = np.ones(len(theta))
     shrunk = (groups >= 0) & np.isfinite(prior) & (prior > 0)
@@ -204,12 +200,8 @@ def dropped_group_factors(
 ) -> Floats:
     """Return the factors (P,), at least 1, by which groups that were dropped widen all others.
 
-    Args:
-        transform: (P, K) parameters per coordinate z.
-        p: the model by its coordinates z.
-        columns: (R, Q) whitened derivatives D by the dropped parameters.
-        groups: (Q,) their groups.
-        beta: noise factor that priors are weighed against.
+    Of parameters per coordinate z (P, K), the model by z, whitened derivatives D (R, Q) by the
+    dropped parameters, and their groups (Q,).
     """
     cross, own_gram = p.rows.T @ columns, columns.T @ columns
     norm2 = np.diag(own_gram)

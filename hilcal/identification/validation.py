@@ -95,11 +95,7 @@ def validate(
 
 
 def require_columns(model: Model, readings: Readings, which: str) -> None:
-    """Refuse readings ("other", "later") without a column that an effect of the model needs.
-
-    Raises:
-        InputError: names effect and columns.
-    """
+    """Refuse readings ("other", "later") without a column that an effect of the model needs."""
     for effect in model.effects:
         if effect.role not in FRAME_ROLES and not effect.computable(readings.states):
             raise InputError(
@@ -189,13 +185,7 @@ def _rms(x: Floats) -> float:
 
 
 def extrapolation(p: Predictive, fitted: Readings, found: Validation) -> Extrapolation:
-    """Compare readings with those that a model was fitted to.
-
-    Args:
-        p: what the fit knows.
-        fitted: the readings that it was fitted to.
-        found: the other readings, predicted.
-    """
+    """Compare other readings, predicted, with those that a model was fitted to."""
     w, other, raw, units = found.whitening, found.readings, found.raw, p.model.cell.arm.units
     prediction = p.model.predict(other.states, p.theta)
     spread, noise = p.of_prediction(prediction, w), p.of_noise(w)
@@ -343,13 +333,7 @@ class CampaignValidation(Shown):
 def acceptance(
     found: Validation, beyond: Extrapolation, limit_m: float | None = None
 ) -> Acceptance:
-    """Divide prediction errors by load and by pose.
-
-    Args:
-        found: the predicted readings.
-        beyond: what the fit states of them.
-        limit_m: the largest 3-D position error that is allowed, m.
-    """
+    """Divide prediction errors by load and by pose, against a largest one that is allowed, m."""
     r, rows = found.readings, found.whitening.reading
     error = np.linalg.norm(found.raw[:, :3], axis=1)
     variance = np.diagonal(found.whitening.covariance, axis1=1, axis2=2)
