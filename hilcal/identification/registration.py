@@ -421,7 +421,7 @@ class Placement:
         return replace(self, frames=Frames(base, targets))
 
     def determined(self, spread: float) -> tuple[Floats, Floats]:
-        """Undetermined directions (6 + 6 T, U) at an rms misfit ≥ 1; the step (K,) along the others."""
+        """Undetermined directions (6 + 6 T, U) at some rms misfit; the step (K,) along the others."""
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)

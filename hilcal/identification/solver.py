@@ -91,7 +91,7 @@ def shortened(
 def echelon(rows: Floats, blocks: Sequence[Sequence[int]], least: float = 0.0) -> Floats:
     """Bring directions (U, P) to reduced echelon form, so that each involves few parameters.
 
-    Columns of a block are pivoted on before those of the next; elements up to `least` are no pivots.
+    Columns of a block are pivots before those of the next; elements up to `least` are none.
     """
     rows, done = rows.copy(), 0
     for block in blocks:

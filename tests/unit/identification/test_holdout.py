@@ -7,7 +7,7 @@ import pytest
 
 from hilcal.config import load_config
 from hilcal.diagnosis.stepwise import add, predicts_better
-from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.baseline import with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import (
     block_folds,
@@ -25,6 +25,7 @@ from hilcal.readings.whitening import Mode, whitening
 from hilcal.robot.catalogue import configs_dir
 from studies.study_cases import study_case
 from tests.support.campaigns import campaign
+from tests.support.fit_cases import based
 
 MODES = ("absolute", "deflection")
 
@@ -185,7 +186,7 @@ def test_what_one_pose_alone_shows_of_an_effect_does_not_spoil_the_others() -> N
     """Without pose 19 nothing tells a combination of the backlashes; flat, it erred by 42 σ."""
     config = load_config(configs_dir() / "cells" / "demo_ur10e.toml")
     c = study_case(config, "ur5e", "deflection", ("backlash",), 2.0, 901)
-    before = fit(baseline(c.cell, c.readings, "deflection"), c.readings, "deflection")
+    before = based(c.cell, c.readings, "deflection")
     found = add(before, "backlash")
     assert found.variance_factor == pytest.approx(1.0, abs=0.15)
     assert found.holdout.rms_sigma < 1.1 < 1.5 < before.holdout.rms_sigma
