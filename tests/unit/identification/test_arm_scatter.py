@@ -144,7 +144,6 @@ def test_a_hidden_reflector_is_a_missing_reading() -> None:
     assert len(f.whitening) == np.count_nonzero(~kept.unloaded) - orphans
 
 
-MODES: tuple[Mode, ...] = ("absolute", "deflection")
 POSES = 16
 
 

@@ -267,7 +267,7 @@ def test_a_cell_says_how_large_an_effect_is_expected_to_be() -> None:
         config = CONFIG.model_copy(update={"ordinary": {"tracker_scale": factor}})
         case = study_case(config, "ur10e", "absolute", (TILT,), 3.0, 1, n_poses=8)
         cell = replace(case.cell, config=config)
-        found = mixed_based(cell, case.readings, "absolute")
+        found = mixed_fit(baseline(cell, case.readings, "absolute"), case.readings, "absolute")
         (f,) = (f for f in found.problem.families.random if f.effect == "tracker_scale")
         assert f.prior.mean == pytest.approx(np.log(0.5 * factor), abs=0.01)
         sizes[factor] = found.std("tracker_scale")
