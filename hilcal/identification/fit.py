@@ -14,12 +14,7 @@ from hilcal.identification.drift import Conflict, chosen_drift, conflicts
 from hilcal.identification.folds import distinct_poses, leave_out, random_folds
 from hilcal.identification.gauss_newton import Solution, solve
 from hilcal.identification.least_trimmed_squares import limit
-from hilcal.identification.residual import (
-    ErrorBlock,
-    WithVarianceFactor,
-    error_block,
-    residual,
-)
+from hilcal.identification.residual import ErrorBlock, WithVarianceFactor, error_block, residual
 from hilcal.identification.robot_frames import RobotFrames, robot_frames
 from hilcal.identification.uncertainty import Uncertainty, uncertainty
 from hilcal.model.model import Model

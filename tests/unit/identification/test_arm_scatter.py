@@ -88,10 +88,7 @@ def test_p_values_and_standard_errors(mode: Mode) -> None:
     for seed in range(12):
         c = reflectors(seed=seed, poses=8, joint_std=STD, known=(False, False, True))
         true = c.world.physics.joint_compliance
-        for readings, found in (
-            (c.readings, z),
-            (replace(c.readings, common=None), apart),
-        ):
+        for readings, found in ((c.readings, z), (replace(c.readings, common=None), apart)):
             f = based(c.cell, readings, mode)
             found.append((f.theta[-6:] - true) / f.uncertainty.formal[-6:])
             if found is z:

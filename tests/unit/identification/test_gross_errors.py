@@ -508,8 +508,7 @@ def test_a_step_of_the_linear_model_is_that_of_the_fit(mode: Mode, m: int) -> No
     c = campaign("none", mode, poses=12, m=m)
     found = based(c.cell, c.readings, mode)
     of = linearised(
-        Snooping(found.model, c.readings, mode, found.solution, found.solution.y),
-        found.solution.y,
+        Snooping(found.model, c.readings, mode, found.solution, found.solution.y), found.solution.y
     ).linear
     delta, covariance = of.fitted(of.tested)
     assert np.abs(delta / np.sqrt(np.diagonal(covariance))).max() < 1e-2

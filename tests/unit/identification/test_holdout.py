@@ -136,11 +136,7 @@ def test_repetitions_of_a_pose_stay_together_whatever_their_names():
     pose = distinct_poses(twice)
     np.testing.assert_array_equal(pose[:n], pose[n:])
     assert pose.max() + 1 == len(c.readings.pose_names)
-    for fold in (
-        random_folds(pose),
-        block_folds(pose),
-        region_folds(twice.states.q, pose),
-    ):
+    for fold in (random_folds(pose), block_folds(pose), region_folds(twice.states.q, pose)):
         np.testing.assert_array_equal(fold[:n], fold[n:])
 
 

@@ -120,9 +120,7 @@ def drawn(extra_m: float, factor: float, parameters: int = 0) -> tuple[Excess, R
     w = whitening(r, "absolute", "gc")
     true = Excess(extra_m**2, factor)
     raw = np.einsum(
-        "dij,dj->di",
-        np.linalg.cholesky(true.widened(r.covariance)),
-        rng.normal(size=(COUNT, M)),
+        "dij,dj->di", np.linalg.cholesky(true.widened(r.covariance)), rng.normal(size=(COUNT, M))
     )
     wide = whitening(true.of_readings(r, "absolute"), "absolute", "gc")
     jacobian = rng.normal(size=(COUNT, M, parameters)) * NOISE[:, None]
