@@ -1,25 +1,21 @@
-"""Which readings are gross errors: data snooping (Baarda) from a robust start.
+"""Which readings are gross errors: data snooping from a robust start.
 
 Least trimmed squares finds the readings, more than half, that agree best on the model. What a model
 without some effect leaves of them sizes smooth nuisance functions that stand in for it, as random
 effects: joint displacements by functions of the joint's angle, torque and side of approach, link
 twists, constant and by the moments that the link carries, a drift of the target with time. Then
 readings join or leave by their distance t² from the fit to the others, which is χ²_m of a good
-reading (`ReadingModel`), until none does.
+reading, until none does (Baarda, *A testing procedure for use in geodetic networks*, 1968).
 
-Readings that are off for one cause are no gross errors. In a row, by the same shift: another
-reflector, a target that was moved on the tool, a tracker that was bumped. From one reading to
-another one all are off alike, in the axes of the sensor or of the target (`off_alike`).
-
-Or along what one site of the arm can do: what a law of a joint, of a link that bends or of the
-force sensor does to a reading goes along one direction there, whatever the law depends on; a gross
-error goes anywhere. Of a random error in m dimensions the share beside a direction is
-sin² ~ Beta((m − 1)/2, 1/2), with p its distribution function uniform. So n of F gross errors are as
-near to a site's direction as p_(n), ascending, with the binomial probability P(B(F, p_(n)) ≥ n),
-times F and the number of sites for the least of all. Where that is too small, what is along the
-site, at two poses at least, is a law's (`along_one_site`).
-
-Source: Baarda, *A testing procedure for use in geodetic networks* (1968).
+Readings that are off for one cause are no gross errors: those off by the same shift in a row, in
+the axes of the sensor or of the target, as by another reflector, a target that was moved on the
+tool, a tracker that was bumped (`off_alike`); and those off along what one site of the arm can do.
+What a law of a joint, of a link that bends or of the force sensor does to a reading goes along one
+direction there, whatever the law depends on; a gross error goes anywhere. Of a random error in m
+dimensions the share beside a direction is sin² ~ Beta((m − 1)/2, 1/2), with p its distribution
+function uniform. So n of F gross errors are as near to a site's direction as p_(n), ascending, with
+the probability P(B(F, p_(n)) ≥ n), times F and the number of sites for the least of all. Where that
+is too small, what is along the site, at two poses at least, is a law's (`along_one_site`).
 """
 
 from collections.abc import Iterator

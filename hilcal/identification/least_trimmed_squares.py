@@ -7,18 +7,16 @@ V_k, B_k (m, K) whitened columns, d precisions, zero without a prior. Readings o
 of deflections from the same unloaded readings, have an offset o_g in common, without a prior:
 eliminated, it leaves the least squares of their deflections. Absolute readings have none.
 
-Least trimmed squares finds the readings that agree best on one model:
+Least trimmed squares (Rousseeuw and Van Driessen, Data Mining and Knowledge Discovery 12 (2006)
+29-45) finds the readings that agree best on one model:
 
     minimise Σ_{k ≤ h} d²_(k)(δ)
 
 d²_(k) ascending squared distances of the readings from the linear model with δ, h a little more
-than half of them, so that nearly half may be wrong, by any amount, and neither mask each other nor
-make good ones look wrong. A fit to the h readings that are nearest to a model has a lower sum
-(concentration); it is begun from many random subsets that just determine the model, and the lowest
-sum of all is taken. From the bulk of the distances follows the limit of a gross error (`limit`).
-
-Source: Rousseeuw and Van Driessen, *Computing LTS regression for large data sets*, Data Mining and
-Knowledge Discovery 12 (2006) 29-45.
+than half of them, so that nearly half may be wrong, by any amount. A fit to the h readings that are
+nearest to a model has a lower sum (concentration); it is begun from many random subsets that just
+determine the model, and the lowest sum of all is taken. From the bulk of the distances follows the
+limit of a gross error (`limit`).
 """
 
 from dataclasses import dataclass, field

@@ -114,7 +114,7 @@ def with_estimated_noise(
     factors, estimate = told.factors, told.estimate(readings, station)
     together = SCATTER in factors and readings.states.target is None
     used = factors if together else {k: f for k, f in factors.items() if k != SCATTER}
-    whole = _with(readings, station, told.model, used)
+    whole = _with(readings, station, used, told.model)
     covers = WHOLE if together else INSTRUMENT
     notes = tuple(n for n in found.notes if not n.startswith(FROM_TRACKER))
     return replace(found, readings=whole, covers=covers, notes=notes), estimate
@@ -151,10 +151,7 @@ def with_noise_factors(
     readings: Readings, tracker: Tracker, factors: Mapping[str, float]
 ) -> Readings:
     """Return readings with the default noise of [tracker], its components times their factors."""
-    default = with_noise_of(tracker, readings)
-    parts = _instrument(default, tracker.station_m)
-    total = sum((factors[p.name] ** 2 * p.covariance for p in parts), np.zeros(()))
-    return replace(readings, covariance=total)
+    return _with(with_noise_of(tracker, readings), tracker.station_m, factors)
 
 
 def _sizes(readings: Readings, station: Sequence[float] | None) -> dict[str, float]:
@@ -191,13 +188,11 @@ def _components(readings: Readings, cell: Cell, config: CellConfig) -> _Componen
     """Return the components of the noise, estimated; None as of `with_estimated_noise`."""
     if len(np.unique(readings.pose)) < FEWEST_POSES or readings.scalar.any():
         return None
-    stated = config.repeatability.per_joint(cell.arm.n)
+    readings, mode = _some(readings), usual_mode(readings)
     try:
-        model = baseline(cell, _some(readings), usual_mode(readings))
-        found = _factors(model, _some(readings), config.tracker.station_m, stated)
+        return _estimated(baseline(cell, readings, mode), readings, config)
     except (HilcalError, np.linalg.LinAlgError):  # said where it is fitted
         return None
-    return None if found is None else _Components(model, *found)
 
 
 def _some(readings: Readings) -> Readings:
@@ -210,45 +205,40 @@ def _some(readings: Readings) -> Readings:
     return readings[np.isin(readings.pose, chosen)]
 
 
-def _factors(
-    model: Model, readings: Readings, station: Sequence[float] | None, joint_std: Floats
-) -> tuple[dict[str, float], dict[str, float]] | None:
-    """Factors and their logs' errors, see `_Components`.
-
-    None where the readings show effects beside the largest.
-    """
-    mode = usual_mode(readings)
+def _estimated(model: Model, readings: Readings, config: CellConfig) -> _Components | None:
+    """Return the components; None where the readings show effects beside the largest."""
+    mode, station = usual_mode(readings), config.tracker.station_m
+    joint_std = config.repeatability.per_joint(model.cell.arm.n)
     whole = with_all_effects(model, readings.states, HARMONICS)
     used = ~fit(model, readings, mode).outlier
     for _ in range(ROUNDS):
         kept = readings[used]
-        instrument = [*_instrument(kept, station)]
         if joint_std.any():
             known = with_joint_scatter(model.cell, kept, joint_std)
             more = known.covariance - kept.covariance
             arm = NoisePart(STATED, more, LogStdPrior(0.0, KNOWN), known.common)
         else:
             arm = scatter_part(model, kept)
-        found, theta = variances_with_noise(whole, kept, mode, instrument, arm)
+        parts = [*_instrument(kept, station), arm]
+        found, theta = variances_with_noise(whole, kept, mode, parts[:-1], arm)
         if _shows_several(found):
             return None
-        own = slice(-len(instrument) - 1, None)
-        names = (*(p.name for p in instrument), arm.name)
-        factors = dict(zip(names, np.exp(found.log_std[own]).tolist(), strict=True))
-        errors = np.sqrt(np.diagonal(found.covariance)[own])
-        scale = np.exp(found.log_std)
+        std, names = np.exp(found.log_std), [p.name for p in parts]
+        errors = np.sqrt(np.diagonal(found.covariance)[-len(parts) :])
+        factors = dict(zip(names, std[-len(parts) :].tolist(), strict=True))
         random = np.full(whole.size, np.inf)
-        for f, s in zip(found.equations.problem.families.random, scale, strict=False):
+        for f, s in zip(found.equations.problem.families.random, std, strict=False):
             random[f.parameters] = s * f.magnitude
-        of = replace(whole, random=_by_effect(whole, random))
-        noisy = _with(readings, station, model, factors)
+        effects = zip(whole.effects, whole.slices(), strict=True)
+        by_effect = {e.name: random[rows] for e, rows in effects if e.role not in FRAME_ROLES}
+        noisy = _with(readings, station, factors, model)
         if joint_std.any():
             noisy = with_joint_scatter(model.cell, noisy, joint_std)
-        now = ~fit(of, noisy, mode, start=theta).outlier
+        now = ~fit(replace(whole, random=by_effect), noisy, mode, start=theta).outlier
         if np.array_equal(now, used):
             break
         used = now
-    return factors, dict(zip(names, errors.tolist(), strict=True))
+    return _Components(model, factors, dict(zip(names, errors.tolist(), strict=True)))
 
 
 def _shows_several(found: Variances) -> bool:
@@ -266,18 +256,15 @@ def _shows_several(found: Variances) -> bool:
     return evidence(problem, others, rng, found.log_std).p_value < SEVERAL
 
 
-def _by_effect(model: Model, std: Floats) -> dict[str, Floats]:
-    """Standard deviations (P,) of the parameters by effect, without the frames."""
-    pairs = zip(model.effects, model.slices(), strict=True)
-    return {e.name: std[mine] for e, mine in pairs if e.role not in FRAME_ROLES}
-
-
 def _with(
-    readings: Readings, station: Sequence[float] | None, model: Model, factors: Mapping[str, float]
+    readings: Readings,
+    station: Sequence[float] | None,
+    factors: Mapping[str, float],
+    model: Model | None = None,
 ) -> Readings:
     """Return readings with the covariance that factors make of the default's."""
     parts = [*_instrument(readings, station)]
-    if SCATTER in factors:
+    if model is not None and SCATTER in factors:
         parts.append(scatter_part(model, readings))
     total = sum((factors[p.name] ** 2 * p.covariance for p in parts), np.zeros(()))
     return replace(readings, covariance=total)

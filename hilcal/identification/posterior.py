@@ -8,25 +8,22 @@ included,
 is the information: Λ the precision of the effects' own priors, σ² the noise factor, κ ≥ 1 by how
 much poses left out were farther off than the parameters explain. The strengths of shrunk families
 are those of `predictive.family_prior`: a harmonic that the readings did not need is not known to be
-zero where nobody measured. Parameters of the setup (frames, tool, instruments; `Effect.of_setup`),
-which another campaign does not have, are marginalised out, by the Schur complement of M.
+zero where nobody measured. Parameters of the setup (frames, tool, instruments; `Effect.of_setup`)
+are marginalised out, by the Schur complement of M. What the readings did not determine has no
+information: not a large variance, and not a zero one.
 
-What the readings did not determine has no information: not a large variance, and not a zero one.
-
-Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Of the parameters
-that both models have, the likelihoods have the means θ_A and θ_B, and the information I_A and I_B,
-all other parameters marginalised out, without the effects' own priors. The information on
-d = θ_B − θ_A is the parallel sum
+Two campaigns of one arm are compared in the same gauge (`parameter_differences`). Their likelihoods
+of the parameters that both have, without the effects' own priors and all others marginalised out,
+have the information I_A and I_B; that on d = θ_B − θ_A is the parallel sum (Anderson and Duffin,
+J. Math. Anal. Appl. 26 (1969) 576-594)
 
     P = I_A (I_A + I_B)⁻ I_B
 
-which is singular along every direction that one of the campaigns did not determine: what a frame
-absorbs, or a joint that one of them did not turn. There the two fits may stand anywhere. So each
-parameter, and each effect as a whole, is compared with all others free within f = `FREE` of their
-ordinary magnitudes: in these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference.
-What is known less well than to one magnitude is not compared: either the gauge moves it, or a
-campaign tells nothing of it. Source: Anderson and Duffin, *Series and parallel addition of
-matrices*, J. Math. Anal. Appl. 26 (1969) 576-594.
+singular along every direction that one of the campaigns did not determine: what a frame absorbs, or
+a joint that did not turn. There the two fits may stand anywhere. So each parameter, and each effect
+as a whole, is compared with all others free within f = `FREE` of their ordinary magnitudes: in
+these, S = ((P + 1/f²)⁻¹_mm)⁻¹ − 1/f² is the information on its difference. What is known less well
+than to one magnitude is not compared.
 """
 
 from collections.abc import Mapping

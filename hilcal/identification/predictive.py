@@ -1,55 +1,43 @@
-"""Covariance of predictions, also where nothing was measured.
+"""Covariance of predictions, also where nothing was measured, and what a fit taught of its arm.
 
 The posterior of a fit holds the strengths of shrunk families at what the evidence chose, zero for
 the groups that the readings do not need. That says nothing of joint angles that were never
-visited: there the dropped harmonics of a transmission error, too, add up to its size. So
-
-- a group of a shrunk family has at least the mean variance of its pool (of the whole family, or of
-  an octave of harmonics, see `Effect.pools`) as its prior;
-- a parameter without a prior has one about zero of its ordinary magnitude, or the rms of its
-  effect's parameters if more, as where poses are left out (see `holdout`);
-
-and with the Jacobian A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the
-prior precision,
+visited. So a group of a shrunk family has at least the mean variance of its pool as its prior
+(`Effect.pools`), and a parameter without a prior one about zero of its ordinary magnitude, or the
+rms of its effect's parameters if more, as where poses are left out (`folds`). With the Jacobian
+A (R, P) of the fitted readings, whitened by W, σ² their noise factor, Λ the prior precision,
 
     C = (AᵀA/σ² + Λ)⁻¹,    Cov(measured − predicted) = κ (σ² W + J C Jᵀ)
 
-W is the stated covariance V, with more for positions or attitudes where their residual asks for it
-(`excess`): a misfit has not the shape of an instrument's noise, which is small along the beam. W, C
-and the residual that parameters with this W and Λ leave belong together; they are found by turns.
-Where the model has a background its standard deviations are in units of the instrument's noise,
-and σ is the factor of that as the mixed model estimates it, also where the arm's scatter is stated.
-The uncertainty of the variances makes C larger by how far it moves the parameters (see
-`mixed.prediction`), and κ is at least what it makes of predictions on the whole (see
-`variance_spread`). Both hold that motion, once where it acts and once as a mean: with 20, 30 and 60
-poses of 30 simulated arms that have all effects, 95, 92 and 95 % of other poses are then in their
-95 % band, and 93, 89 and 93 % with κ alone. Without a background σ² is from the residual, at
-least 1.
+W is the stated covariance V, with more for positions or attitudes where their residual asks for it:
+a misfit has not the shape of an instrument's noise, which is small along the beam. W, C and the
+residual that parameters with this W and Λ leave belong together; they are found by turns. Where the
+model has a background its standard deviations are in units of the instrument's noise, and σ is the
+factor of that as the mixed model estimates it; otherwise σ² is from the residual, at least 1.
 
 κ, at least 1, makes the mean variance on poses left out, in units of V, equal to the mean square
-that was found there: what repeats itself in new poses. The variance is that of the folds as they
-are left out, F of rows Y, with X the same whitened by W and multiplied by the root of C: the mean
-of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few poses a fold may be all that tells of a direction; its variance is
-that of the prior then.
+that was found there. The variance is that of the folds as they are left out, F of rows Y, with X
+the same whitened by W and multiplied by the root of C: the mean of Y (1 − XᵀX/σ²)⁻¹ Yᵀ. With few
+poses a fold may be all that tells of a direction; its variance is that of the prior then.
 
-How much wider predictions are since the variances of a background are estimated themselves.
+The uncertainty of the variances of a background makes C larger by how far it moves the parameters
+(`mixed.prediction`), and κ is at least what it makes of predictions on the whole (Kackar and
+Harville, JASA 79 (1984) 853). At given variances rows that are predicted without their fold are off
+by e with the variance v (`mixed.prediction.left_out`). With x = (log s, η) drawn from its
+posterior, by weights from the normal approximation at its maximum x̂, the mean square is
+E[Σ v] + E|e − E e|²; its ratio to Σ v at x̂ is that least κ. Both hold that motion, once where it
+acts and once as a mean: with 20, 30 and 60 poses of 30 simulated arms that have all effects, 95, 92
+and 95 % of other poses are then in their 95 % band, and 93, 89 and 93 % with κ alone.
 
-At given variances rows that are predicted without their fold are off by e with the variance v (see
-`mixed.prediction.left_out`). With x = (log s, η) drawn from its posterior, by weights from the
-normal approximation at its maximum x̂, the mean square is E[Σ v] + E|e − E e|². The factor is its
-ratio to Σ v at x̂. Source: Kackar and Harville, *Approximations for standard errors of estimators of
-fixed and random effects in mixed linear models*, JASA 79 (1984) 853.
-
-What a residual has beyond the stated noise, of positions and of attitudes apart (`excess`): with
-r (3,) the residuals of the D positions, V their covariance, W = V + s² 1, and J C Jᵀ the covariance
-of their predictions, C that of parameters estimated with σ² W, s² solves (Mandel and Paule, for the
+What a residual has beyond the stated noise (`excess`): with r (3,) the residuals of the D
+positions, V their covariance, W = V + s² 1, and J C Jᵀ the covariance of their predictions, C that
+of parameters estimated with σ² W, s² solves (Mandel and Paule, Anal. Chem. 42 (1970) 1194, for the
 scatter between laboratories beyond what each states)
 
     Σ rᵀ W⁻¹ r = 3 D − Σ tr (σ² W)⁻¹ J C Jᵀ
 
-and the attitudes' part of V is multiplied by their χ² over its degrees of freedom. Either only
-where its own χ² is larger than chance allows. Source: Mandel and Paule, Analytical Chemistry 42
-(1970) 1194-1197.
+and the attitudes' part of V is multiplied by their χ² over its degrees of freedom; either only
+where its own χ² is larger than chance allows.
 """
 
 from collections.abc import Sequence

@@ -421,7 +421,7 @@ class Placement:
         return replace(self, frames=Frames(base, targets))
 
     def determined(self, spread: float) -> tuple[Floats, Floats]:
-        """Undetermined directions (6 + 6 T, U) at some rms misfit; the step (K,) along the others."""
+        """Undetermined directions (6 + 6 T, U) by the misfit; the step (K,) along the others."""
         a = self.jacobian()
         # Squared singular values up to 1e12 leave rounding of 1e-2 in those that decide, about 10.
         squares, vectors = np.linalg.eigh(a.T @ a)
@@ -600,17 +600,18 @@ class Sightings:
 
     cell: Cell  # with the observers of the readings
     readings: Readings
-    rotation: Floats  # (N, 3, 3) nominal orientation of the flange
-    position: Floats  # (N, 3) its nominal position, m
-    root: Floats  # (N, m, m) as of `FrameData`; zero in the rows of what is not read
-    targets: Bools  # (T,) which of the targets are unknown
+    data: FrameData  # whose root is zero in the rows of what is not read
 
     @classmethod
     def of(cls, cell: Cell, readings: Readings) -> "Sightings":
         """Return readings beside the nominal arm."""
-        chain, root = evaluate(cell.arm, angles(readings)), inverse_roots(readings.covariance, True)
-        unknown = ~np.array(cell.known_targets)
-        return cls(cell, readings, chain.rotation[-1], chain.position[-1], root, unknown)
+        root = inverse_roots(readings.covariance, True)
+        return cls(cell, readings, replace(FrameData.of(cell.arm, readings), root=root))
+
+    @property
+    def targets(self) -> Bools:
+        """(T,) which of the targets are unknown."""
+        return ~np.array(self.cell.known_targets)
 
     @property
     def sizes(self) -> Floats:
@@ -621,30 +622,29 @@ class Sightings:
 
     def points(self, cell: Cell) -> Floats:
         """(N, 3) predicted positions of the targets, sensor axes, m."""
-        offset = cell.all_targets[self.readings.target, :3, 3]
-        base = self.position + se3.apply(self.rotation, offset)
+        base = self.data.points(Frames(cell.registration, cell.all_targets))
         return np.asarray(base @ cell.registration[:3, :3].T + cell.registration[:3, 3])
 
     def off(self, cell: Cell) -> Floats:
         """(N, m) measured minus predicted, m and rad; zero in elements that are not read."""
-        r, targets = self.readings, cell.all_targets[self.readings.target]
-        turn = cell.registration[:3, :3] @ self.rotation @ targets[:, :3, :3]
+        r, attitude = self.readings, self.data.attitude
+        turn = cell.registration[:3, :3] @ self.data.rotation @ cell.all_targets[r.target, :3, :3]
         position, turned = read_by(cell.observers, r.observer, self.points(cell), turn)
         off = r.value[:, :3] - position
-        if r.m == 3:
+        if attitude is None:
             return np.asarray(off)
-        apart = se3.rotation(r.value[:, 3:]) @ np.swapaxes(turned, 1, 2)
-        return np.concatenate([off, se3.rotation_vector(apart)], axis=1)
+        apart = se3.rotation_vector(attitude @ np.swapaxes(turned, 1, 2))
+        return np.concatenate([off, apart], axis=1)
 
     def white(self, cell: Cell) -> Floats:
         """(N·m,) whitened misfit."""
-        return se3.apply(self.root, self.off(cell)).reshape(-1)
+        return se3.apply(self.data.root, self.off(cell)).reshape(-1)
 
     def moved(self, cell: Cell, step: Floats) -> Cell:
         """Return a cell moved by (K,), in ordinary sizes."""
         x, at = step * self.sizes, 0
         if not cell.registration_known:
-            by = _moved_about(self.position.mean(axis=0), x[:6])
+            by = _moved_about(self.data.position.mean(axis=0), x[:6])
             cell, at = replace(cell, registration=cell.registration @ by), 6
         poses = cell.all_targets.copy()
         for k in np.flatnonzero(self.targets):
@@ -664,7 +664,7 @@ class Sightings:
         """Return the minimum near a start, its sum of squares, and the Jacobian (R, K) there."""
         count = len(self.sizes)
         if not count:
-            return begun, float(np.sum(self.white(begun) ** 2)), np.zeros((self.root[0].size, 0))
+            return begun, float(np.sum(self.white(begun) ** 2)), np.zeros((0, 0))
 
         def residual(x: Floats) -> Floats:
             return np.concatenate([self.white(self.moved(begun, x)), HOLD_SEVERAL * x])
@@ -700,7 +700,7 @@ def _placed(cell: Cell, readings: Readings) -> tuple[Cell, Floats, Floats]:
     begun.sort(key=lambda c: float(np.sum(few.white(c) ** 2)))
     tried = [few.settled(c, 50) for c in begun[:FOLLOWED]]
     found, square, jacobian = data.settled(min(tried, key=lambda t: t[1])[0])
-    rank = int(np.count_nonzero(np.any(data.root != 0, axis=2)))
+    rank = int(np.count_nonzero(np.any(data.data.root != 0, axis=2)))
     spread = max(np.sqrt(square / max(rank - jacobian.shape[1], 1)), 1.0)
     squares, vectors = np.linalg.eigh(jacobian.T @ jacobian)
     return found, data.off(found), vectors[:, squares <= (spread / TELL) ** 2]

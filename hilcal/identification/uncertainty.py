@@ -3,33 +3,25 @@
 While the residual is within the noise, Cov(θ) = T H⁻¹ Tᵀ. With a misfit, errors of neighbouring
 readings are correlated and that formula is far too optimistic. Then the standard uncertainty is
 the largest of three: the formal one times the root of the variance factor, and two delete-a-group
-jackknives, with groups of consecutive readings and with groups close in joint space:
+jackknives, with groups of consecutive readings and with groups close in joint space (Efron and
+Tibshirani, *An Introduction to the Bootstrap*, chapter 11):
 
     Var(θ_p) = (G − 1)/G Σ_g (θ_p without g − mean)²
 
-Source: Efron and Tibshirani, *An Introduction to the Bootstrap*, chapter 11.
-
-Uncertainty of the parameters of a shrunk family due to that of its prior variance.
-
-A group's prior N(0, τ²) is estimated from the data (`empirical_bayes`), from few parameters and
-therefore badly: intervals for that τ alone would be too short for weak groups. The uncertainty is
-that of the mixture over τ, around the estimate that is used:
+A shrunk group's prior N(0, τ²) is estimated from few parameters, and therefore badly. The
+uncertainty is that of the mixture over τ, around the estimate that is used (Kass and Steffey,
+J. Am. Stat. Assoc. 84 (1989) 717-726):
 
     E[(θ − θ̂)²] = Σ_τ w_τ [ V_τ + (m_τ − θ̂)² ],   w_τ ∝ p(τ) |I + τ² L|^(−1/2) exp(½ bᵀ V_τ b)
 
 with L and b the precision and the right-hand side of the group alone, V_τ = (L + I/τ²)⁻¹ and
-m_τ = V_τ b. p(τ) is half-Cauchy; its scale is the spread at which noise alone is as large as the
-group, so that a zero and a nonzero group are equally probable. Other groups keep their τ.
+m_τ = V_τ b. p(τ) is half-Cauchy (Polson and Scott, Bayesian Analysis 7 (2012) 887-902); its scale
+is the spread at which noise alone is as large as the group, so that a zero and a nonzero group are
+equally probable. Other groups keep their τ.
 
 Parameters of dropped groups may differ from zero by as much as the noise allows. They are
 integrated out with a prior of that size: with M the projection off their columns D with its ridge
-β Λ (`projection`), A the columns of the others and Λ_z the ridge of these,
-
-    Cov(z) = (Aᵀ M A + Λ_z)⁻¹
-
-Sources: Kass and Steffey, *Approximate Bayesian inference in conditionally independent
-hierarchical models*, J. Am. Stat. Assoc. 84 (1989) 717-726; Polson and Scott, *On the half-Cauchy
-prior for a global scale parameter*, Bayesian Analysis 7 (2012) 887-902.
+β Λ (`projection`), A the columns of the others and Λ_z their ridge, Cov(z) = (Aᵀ M A + Λ_z)⁻¹.
 """
 
 from dataclasses import dataclass

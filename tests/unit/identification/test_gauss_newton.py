@@ -122,29 +122,25 @@ def test_steps_that_shrink_by_constant_factors_lead_to_their_limit() -> None:
 
 @dataclass(frozen=True)
 class Valley:
-    """Rosenbrock's function, and a third row so that a residual is left; forbidden for x > most."""
+    """Rosenbrock's function, and a third row so that a residual is left."""
 
     x: float
     y: float
-    most: float = np.inf
 
     @property
     def residual(self) -> Floats:
-        if self.x > self.most:
-            raise CannotAnswerError("forbidden")
         return np.array([1 - self.x, 10 * (self.y - self.x**2), 0.3 + self.y])
 
     def jacobian(self) -> Floats:
         return np.array([[1.0, 0.0], [20 * self.x, -10.0], [0.0, -1.0]])
 
     def moved(self, step: Floats) -> "Valley":
-        return replace(self, x=self.x + step[0], y=self.y + step[1])
+        return Valley(self.x + step[0], self.y + step[1])
 
 
-@pytest.mark.parametrize("most", [np.inf, 0.9])
 @pytest.mark.parametrize("start", [(-1.2, 1.0), (0.5, -3.0)])
-def test_the_minimum_is_that_of_scipy(start: tuple[float, float], most: float) -> None:
-    found = minimise(Valley(*start, most), steps=100)
+def test_the_minimum_is_that_of_scipy(start: tuple[float, float]) -> None:
+    found = minimise(Valley(*start), steps=100)
     expected = least_squares(lambda x: Valley(*x).residual, start, xtol=1e-14, ftol=1e-14).x
     np.testing.assert_allclose([found.x, found.y], expected, atol=1e-5)
 
