@@ -28,7 +28,7 @@ from hilcal.identification.background import (
     with_background,
     with_pooled_lines,
 )
-from hilcal.identification.carried_evidence import carried_effects
+from hilcal.identification.drift import carried_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.model import Model
 from hilcal.readings.readings import Readings

@@ -11,8 +11,7 @@ from hilcal.effects.options import Options
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.effects.written import read_effects_text
 from hilcal.errors import InputError
-from hilcal.identification.carried import CarriedPrior, check_arm
-from hilcal.identification.coordinates import coordinates_of
+from hilcal.identification.carried import CarriedPrior, check_arm, coordinates_of
 from hilcal.identification.drift import least
 from hilcal.identification.fit import Fit
 from hilcal.identification.priors import prior_of, scales_of

@@ -6,10 +6,14 @@ from dataclasses import asdict
 import numpy as np
 
 from hilcal.identification.background import background_of
+from hilcal.identification.baseline import masses_note
 from hilcal.identification.fit import Fit
-from hilcal.identification.full_prediction import error_before, full_prediction
-from hilcal.identification.gross_errors import disagreement_words, gross_errors
-from hilcal.identification.missing_masses import masses_note
+from hilcal.identification.full_prediction import (
+    disagreement_words,
+    error_before,
+    full_prediction,
+    gross_errors,
+)
 from hilcal.identification.registration import register
 
 

@@ -13,7 +13,7 @@ from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
-from hilcal.identification.acceptance import Acceptance
+from hilcal.identification.validation import Acceptance
 from hilcal.present.document import Block, heading, load_name, note, table
 from hilcal.present.registration import base_line
 from hilcal.present.running import spoken

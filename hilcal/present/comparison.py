@@ -7,7 +7,7 @@ from hilcal.diagnosis.change import LEVEL, POWER
 from hilcal.diagnosis.change_candidates import Candidate
 from hilcal.diagnosis.change_found import Change, Limit
 from hilcal.diagnosis.comparison import Comparison
-from hilcal.identification.parameter_differences import Differences
+from hilcal.identification.posterior import Differences
 from hilcal.names import quoted
 from hilcal.present.document import Block, Table, heading, table
 from hilcal.present.fit import error_words, measurements

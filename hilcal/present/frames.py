@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from hilcal.design.checked_plan import CheckedPlan
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.identification.fit import Fit
-from hilcal.identification.residual_table import residual_table
+from hilcal.identification.full_prediction import residual_table
 from hilcal.optional import needed_by
 from hilcal.readings.readings import Readings
 from hilcal.tables.table import exchange_columns

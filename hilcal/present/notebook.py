@@ -7,9 +7,9 @@ from hilcal.design.checked_plan import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery
-from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.fit import Fit
+from hilcal.identification.validation import CampaignValidation
 from hilcal.present.comparison import comparison_report
 from hilcal.present.diagnosis import diagnosis_report, key, revisions_table, verdict_line
 from hilcal.present.discovery import discovery_report

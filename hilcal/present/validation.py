@@ -5,11 +5,17 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from hilcal import numbers
-from hilcal.identification.acceptance import BAND, Acceptance, Judged, Share
 from hilcal.identification.bootstrap import Bootstrap
-from hilcal.identification.extrapolation import Beyond, Extrapolation
 from hilcal.identification.priors import names_of
-from hilcal.identification.validation import Validation
+from hilcal.identification.validation import (
+    BAND,
+    Acceptance,
+    Beyond,
+    Extrapolation,
+    Judged,
+    Share,
+    Validation,
+)
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
 from hilcal.types import Floats

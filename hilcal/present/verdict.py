@@ -14,7 +14,7 @@ from hilcal.diagnosis.pose_alone import PoseAlone
 from hilcal.diagnosis.separability import Separability
 from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
-from hilcal.identification.gross_errors import disagreement_words
+from hilcal.identification.full_prediction import disagreement_words
 from hilcal.numbers import few, length, p_equals, sizes
 from hilcal.readings.arm_scatter import ArmScatter
 from hilcal.readings.serial_noise import SerialNoise

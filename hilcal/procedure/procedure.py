@@ -32,12 +32,11 @@ from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue, installed
 from hilcal.errors import InputError
 from hilcal.identification import validation
-from hilcal.identification.acceptance import Acceptance, acceptance
 from hilcal.identification.arm_scatter import with_arm_scatter
 from hilcal.identification.baseline import baseline
 from hilcal.identification.carried import CarriedPrior
-from hilcal.identification.extrapolation import extrapolation
 from hilcal.identification.full_covariance import full_readings
+from hilcal.identification.validation import Acceptance, acceptance, extrapolation
 from hilcal.present.progress import Say
 from hilcal.procedure.next_plan import Decision, PredictedError, decide, predicted_error
 from hilcal.procedure.state import (

@@ -58,7 +58,7 @@ def validation_plan(
 
     The poses are drawn evenly over the joint angles that were measured; those that the cell does
     not allow, that are not reached, or that lie far from all measured ones (see
-    `identification.extrapolation`) are left out, so that they may be fewer than `count`. Each is
+    `identification.validation`) are left out, so that they may be fewer than `count`. Each is
     measured under one load, for deflections unloaded as well; of a fit to positions the unloaded
     arm is one of the loads, unless `under_load` leaves it out. `reference` (n,) are the joints of
     the pose where loads are changed, rad; that of the first reading where None.

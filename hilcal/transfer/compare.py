@@ -12,12 +12,10 @@ from hilcal.diagnosis.change_candidates import changing
 from hilcal.diagnosis.comparison import Comparison, error_today
 from hilcal.diagnosis.completed import completed
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.identification.earlier_fit import earlier_fit
 from hilcal.identification.fit import Fit
-from hilcal.identification.later_readings import setting
+from hilcal.identification.later_readings import earlier_fit, setting
 from hilcal.identification.misdescription import refuse_misdescribed
-from hilcal.identification.parameter_differences import Differences, parameter_differences
-from hilcal.identification.posterior import Posterior
+from hilcal.identification.posterior import Differences, Posterior, parameter_differences
 from hilcal.identification.registration import register
 from hilcal.names import quoted
 from hilcal.readings.readings import Readings

@@ -277,11 +277,11 @@ TAKEN: dict[str, dict[str, str]] = {
     "config/cell": {"check CELL.toml --save-calibration": KINEMATICS},
     "config/reference": {"hilcal config SECTION": f"{RARE}sections_of_a_cell"},
     "effects/from_file": {"hilcal effects new NAME": f"{HERE}an_effect_of_ones_own"},
-    "identification/earlier_fit": {
+    "identification/later_readings": {
         "hilcal identify again": f"{HERE}another_scaling_or_parameters_of_another_version"
     },
-    "identification/posterior_of_fit": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
-    "identification/missing_masses": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
+    "identification/predictive": {"run hilcal refine first": f"{HERE}nothing_to_carry_over"},
+    "identification/baseline": {"hilcal add RUN": f"{RARE}masses_that_a_description_lacks"},
     "measuring/kinematics": {"check CELL.toml --save-calibration": KINEMATICS},
     "measuring/dry_run": {"hilcal check --plan": f"{HERE}files_that_are_not_there_yet"},
     "present/campaign": {"hilcal accept RUN N": f"{HERE}what_a_report_names",

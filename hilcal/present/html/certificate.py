@@ -10,11 +10,11 @@ from scipy.stats import chi2
 from hilcal import numbers
 from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
-from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.full_prediction import error_before, names
-from hilcal.identification.variance_factor import CONFIDENCE
+from hilcal.identification.residual import CONFIDENCE
+from hilcal.identification.validation import CampaignValidation
 from hilcal.present.document import (
     Block,
     Items,
