@@ -12,7 +12,7 @@ from hilcal.campaign.campaign import Campaign
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.fit import Fit, fit
 from hilcal.names import quoted
-from hilcal.present.html.certificate import ReportContent, Tested
+from hilcal.present.html.report import ReportContent, Tested
 from hilcal.present.story import build_story, of_left_out
 from hilcal.procedure.state import IMPROVED, Files
 from hilcal.readings.whitening import SCALINGS, Scaling
@@ -121,8 +121,7 @@ def write_report(
         html = comparison_page(found, names, asked.operator, utc_now(), hilcal.__version__)
         first, verdict = comparison_screen(found, run.path.name), None
     else:
-        from hilcal.present.html.certificate import first_screen
-        from hilcal.present.html.sections import page
+        from hilcal.present.html.report import first_screen, page
 
         with ExitStack() as stack:
             beside = Files(run.path).validation

@@ -27,7 +27,7 @@ from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import fit
 from hilcal.names import quoted
-from hilcal.present.discovery import discovery_report, silence
+from hilcal.present.diagnosis import discovery_report, silence
 from hilcal.present.fit import model_name
 from hilcal.present.progress import working
 from hilcal.whole_file import replace_file

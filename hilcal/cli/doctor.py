@@ -13,7 +13,7 @@ from hilcal.doctor.computer import Finding, computer, program
 from hilcal.doctor.ports import adapters, reachable, serial_ports
 from hilcal.drivers.ur_link.services import services
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.present.preparing import doctor_report, doctor_summary
+from hilcal.present.campaign import doctor_report, doctor_summary
 from hilcal.present.progress import working
 
 SIMULATED = "simulated"

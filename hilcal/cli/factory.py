@@ -14,8 +14,8 @@ from hilcal.effects.catalogue import Catalogue
 from hilcal.errors import InputError, StoppedError
 from hilcal.measuring.connect import ConnectionResult
 from hilcal.measuring.kinematics import nominal_arm, told_by
+from hilcal.present.campaign import factory_words
 from hilcal.present.progress import working
-from hilcal.present.running import factory_words
 from hilcal.store.run_log import create_run
 from hilcal.transfer.factory import check_factory
 

@@ -52,10 +52,10 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.fit_document import to_json
 from hilcal.identification.misdescription import other_arm_of
 from hilcal.identification.torques import check_torques
+from hilcal.present.calibration import bootstrap_remarks, bootstrap_report
 from hilcal.present.fit import fit_report, model_name, prior_lines, scalings_table, stream_report
 from hilcal.present.progress import counting, working
 from hilcal.present.registration import covariance_words, other_arm_line, torque_lines
-from hilcal.present.validation import bootstrap_remarks, bootstrap_report
 from hilcal.readings.covariance import tracker_noise
 from hilcal.readings.whitening import Scaling
 from hilcal.store.purpose import purpose_of, refuse_fitting, release

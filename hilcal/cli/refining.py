@@ -61,11 +61,11 @@ from hilcal.present.diagnosis import (
     diagnosis_report,
     fell,
     key,
+    refined_laws,
     revisions_table,
     rose,
     verdict_line,
 )
-from hilcal.present.discovery import refined_laws
 from hilcal.present.fit import follows, prior_lines, set_aside
 from hilcal.present.progress import working
 from hilcal.present.registration import covariance_words, fitted_lines, other_arm_line, torque_lines

@@ -46,8 +46,7 @@ from hilcal.measuring.run import run as run_plan
 from hilcal.names import quoted
 from hilcal.present.live_viewer import LiveViewer, Several
 from hilcal.present.plan import plan_facts
-from hilcal.present.progress import Say, working
-from hilcal.present.running import full_words, missed_words, watching
+from hilcal.present.progress import Say, full_words, missed_words, watching, working
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, load_plan
 from hilcal.store.run_log import RunLog, check_same_cell, create_run

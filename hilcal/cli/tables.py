@@ -15,9 +15,9 @@ from hilcal.identification.registration import Registration, register
 from hilcal.identification.table_preview import preview_table
 from hilcal.identification.torques import check_torques
 from hilcal.import_campaign import import_campaign
+from hilcal.present.campaign import import_preview
 from hilcal.present.document import Words, heading
 from hilcal.present.fit import target_words
-from hilcal.present.preparing import import_preview
 from hilcal.present.progress import working
 from hilcal.present.registration import (
     covariance_words,

@@ -13,10 +13,12 @@ from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 from hilcal import numbers
 from hilcal.diagnosis.distinguish import Difference
 from hilcal.present.campaign import left_out_m, model_words, two_revisions, verdict_of
-from hilcal.present.charts.comparisons import error_per_revision
-from hilcal.present.charts.evidence import added_variable, curve_chart, misfit_shares
-from hilcal.present.charts.readings import (
+from hilcal.present.charts import (
+    added_variable,
+    curve_chart,
+    error_per_revision,
     measured_predicted,
+    misfit_shares,
     residual_by_load,
     residual_by_pose,
     residual_over,

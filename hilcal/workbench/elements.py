@@ -11,8 +11,8 @@ from nicegui import ui
 from nicegui.events import GenericEventArguments
 
 from hilcal.names import escaped
-from hilcal.present.charts import style
-from hilcal.present.document import Table
+from hilcal.present import chart_style as style
+from hilcal.present.document import Table, says
 from hilcal.workbench.work import Work
 
 if TYPE_CHECKING:
@@ -93,7 +93,7 @@ def chart(view: View, figure: go.Figure) -> ui.plotly:
     """Draw a chart in the page's scheme, with its sentence for those who do not see it."""
     dressed = style.in_scheme(figure, view.tab.dark).to_plotly_json()
     shown = ui.plotly({**dressed, "config": style.CONFIG}).classes("chart")
-    shown.props["role"], shown.props["aria-label"] = "img", style.says(figure)
+    shown.props["role"], shown.props["aria-label"] = "img", says(figure)
     return shown
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from hilcal.campaign.campaign import Campaign
-from hilcal.present.html.sections import page
+from hilcal.present.html.report import page
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.command_line import COMMAND, typed, typed_now

@@ -311,6 +311,8 @@ TAKEN: dict[str, dict[str, str]] = {
     "present/campaign": {
         "hilcal accept RUN N": f"{HERE}what_a_report_names",
         "None yet: hilcal identify": f"{HERE}without_a_revision",
+        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
+        "hilcal init writes a file.": f"{RARE}sections_of_a_cell",
     },
     "present/comparison": {
         "hilcal refine {}": f"{HERE}another_arm_is_calibrated_by_itself",
@@ -322,21 +324,15 @@ TAKEN: dict[str, dict[str, str]] = {
         "to remove {}: hilcal remove": f"{HERE}what_a_diagnosis_says",
         "hilcal effects new NAME": f"{HERE}an_effect_of_ones_own",
         "its own: hilcal add RUN": f"{RARE}joints_that_differ",
+        "hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well",
     },
-    "present/discovery": {"hilcal refine adds": f"{RARE}a_law_that_effects_explain_as_well"},
     "present/fit": {"hilcal compare EARLIER LATER": f"{HERE}what_a_comparison_says"},
-    "present/html/certificate": {
+    "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
+    "present/html/report": {
         "report --limit": f"{RARE}the_page_says_how_to_be_judged",
         "--scaling gc": f"{RARE}the_page_says_how_to_be_judged",
-    },
-    "present/html/other_pages": {"hilcal compare {} {}": f"{HERE}what_a_report_names"},
-    "present/html/sections": {
         "hilcal report --appendix": f"{HERE}what_a_report_names",
         "hilcal refine finds": f"{HERE}what_a_report_names",
-    },
-    "present/preparing": {
-        "(`hilcal config SECTION`": f"{RARE}sections_of_a_cell",
-        "hilcal init writes a file.": f"{RARE}sections_of_a_cell",
     },
     "present/story": {
         "run hilcal diagnose for a verdict": f"{RARE}what_a_recording_names",
@@ -346,7 +342,7 @@ TAKEN: dict[str, dict[str, str]] = {
         "hilcal next plans": "tests/cli/test_next_cli.py::test_next_in_json_and_in_words",
         "hilcal refine --readings absolute": f"{HERE}deflections_lack_the_unloaded_arm",
     },
-    "present/viewer/live_scene": {
+    "present/viewer/live": {
         "`hilcal refine` does": f"{RARE}what_a_recording_names",
         "hilcal refine says what": f"{RARE}what_a_recording_names",
     },

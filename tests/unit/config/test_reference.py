@@ -11,7 +11,7 @@ from pydantic.fields import FieldInfo
 from hilcal.cli.looking_up import DRIVERS_OWN
 from hilcal.config import CellConfig
 from hilcal.config.reference import NOT_SET, REQUIRED, Key, tables
-from hilcal.present.preparing import reference_page
+from hilcal.present.campaign import reference_page
 from hilcal.toml import Section, section_of
 from tests.support.cli_cases import Capsys, ok, refused
 from tests.support.paths import ROOT

@@ -11,7 +11,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.bootstrap import Bootstrap, again, bootstrap
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import distinct_poses
-from hilcal.present.validation import bootstrap_remarks
+from hilcal.present.calibration import bootstrap_remarks
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise

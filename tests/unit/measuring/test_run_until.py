@@ -12,7 +12,7 @@ from hilcal.measuring.dry_run import route_problems
 from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored, Remark
 from hilcal.measuring.route import Stop
 from hilcal.measuring.stopping_rule import way_home
-from hilcal.present.running import met_words
+from hilcal.present.progress import met_words
 from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step

@@ -1,17 +1,16 @@
 """What a live viewer draws of a campaign while it is measured, and of revisions as they come."""
 
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import rerun as rr
 
-from hilcal.measuring.progress import ArmAt, LiveResidual, ReadingStored, Remark
-from hilcal.present.live_viewer import Measuring, Revised
-from hilcal.present.viewer import live, live_scene, style
-from hilcal.present.viewer.live_scene import (
+from hilcal.measuring.progress import LiveResidual, ReadingStored, Remark
+from hilcal.present.live_viewer import Revised
+from hilcal.present.viewer import live, style
+from hilcal.present.viewer.live import (
     BALL,
     FLUENT,
     GROUPS,
@@ -133,16 +132,15 @@ def test_every_target_of_an_arrival_is_drawn_where_it_is(tmp_path):
             d.add(e)
     assert d.judged == 2 * (len(told.plan.steps) - BLIND)
     assert {j.target for j in d.worst} == {"right"}
-    assert " right |" in live_scene.status(d)
+    assert " right |" in style.markdown(d.words())
 
 
 def test_a_long_campaign_is_a_small_file(tmp_path):
     path = tmp_path / "long.rrd"
-    outlet = live._Outlet("long", print, "file", lambda: rr.FileSink(str(path)), path)
+    outlet = live._Outlet("long", print, "file", file=path)
     told = measuring(plan(250))
     for wall, what in events(told):
-        tell = partial(LiveScene.tell, wall=wall, what=what)
-        outlet.tell(tell, not isinstance(what, ArmAt), now=isinstance(what, Measuring))
+        outlet.tell(wall, what)
     outlet.end()
     assert path.stat().st_size < 2.5e6  # 5.5 MB, when each reading was handed on by itself
     levels = [values(path, f"/live/1/{name}", "Scalars:scalars") for name in style.LEVEL_NAMES]
@@ -164,7 +162,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
                 d.add(e)
             elif isinstance(e, Remark):
                 d.remarks.append(e.text)
-        return live_scene.status(d)
+        return style.markdown(d.words())
 
     bad, good = status(6.0), status(0.0)
     assert "✗ The simple model fails" in bad
@@ -177,7 +175,7 @@ def test_words_say_whether_the_model_fails_and_under_which_load():
 
 
 def test_without_a_model_there_is_no_judgement():
-    assert "no judgement yet" in live_scene.status(LiveTally.of(measuring()))
+    assert "no judgement yet" in style.markdown(LiveTally.of(measuring()).words())
 
 
 def test_what_earlier_sessions_stored_is_there_at_its_own_time(tmp_path):

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from hilcal.present.document import Table, table
-from hilcal.present.terminal import shared
+from hilcal.present.document import Table, shared, table
 
 WORD = st.text("abcdefghij_", min_size=1, max_size=26)
 WORDS = st.lists(WORD, min_size=1, max_size=6).map(" ".join)

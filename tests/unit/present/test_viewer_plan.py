@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hilcal.present.viewer import arm_shapes, plan, style
+from hilcal.present.viewer import plan, style
 from hilcal.present.viewer.plan import HIDDEN, SEEN, TURNED, UNKNOWN, PlanView, record_plan
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import REFERENCE, UNLOADED
@@ -29,7 +29,7 @@ def test_capsules_end_where_they_should_in_any_direction():
     way = np.random.default_rng(1).normal(size=(20, 3))
     way[:3] = [[0.0, 0.0, 0.4], [0.0, 0.0, -0.4], [0.0, 0.0, 0.0]]
     start = np.ones((20, 3))
-    made = arm_shapes.capsules(start, start + way, np.full(20, 0.1), [(1, 2, 3)])
+    made = style.drawn_capsules(start, start + way, np.full(20, 0.1), [(1, 2, 3)])
     quaternion = np.array(made.quaternions.as_arrow_array().to_pylist())
     length = np.array(made.lengths.as_arrow_array().to_pylist())
     np.testing.assert_allclose(length[:, None] * turned(quaternion), way, atol=1e-6)
@@ -144,7 +144,7 @@ def test_one_bead_per_pose_and_load_in_the_loads_colour(shadowed, recording):
     colors = [rgb(c) for c in rows(recording, "/world/target/beads", "Points3D:colors")[0]]
     pairs = list(dict.fromkeys((s.pose, s.load) for s in PLAN.steps))
     assert len(places) == len(pairs) == 8
-    by_load = dict(zip(PLAN.loads, plan.load_colors(PLAN.loads).tolist(), strict=True))
+    by_load = dict(zip(PLAN.loads, PlanView(*shadowed, PLAN, SUMMARY).colors.tolist(), strict=True))
     assert len({tuple(c) for c in by_load.values()}) == 3
     for place, color, (pose, load) in zip(places, colors, pairs, strict=True):
         assert list(color) == by_load[load]

@@ -29,8 +29,8 @@ __all__ = ["recording", "shadowed", "strict"]  # fixtures
 
 
 def test_the_schedule_has_every_reading_at_its_minute_in_its_loads_series(shadowed, recording):
-    minutes = PlanView(*shadowed, PLAN, SUMMARY).time / 60.0
-    colors = plan.load_colors(PLAN.loads)
+    d = PlanView(*shadowed, PLAN, SUMMARY)
+    minutes, colors = d.time / 60.0, d.colors
     drawn = {}
     for k, load in enumerate(PLAN.loads):
         at = rows(recording, f"/schedule/load{k}", "Scalars:scalars")
