@@ -80,9 +80,9 @@ class ChartReadings:
 
     def marks(self, x: Floats, y: Floats, level: int, mine: Bools, **more: Any) -> go.Scatter:
         """Return some (K,) as points of a level at x, y (K,)."""
-        look = style.LEVELS[level], style.SYMBOLS[level]
+        at = x[mine], y[mine], style.LEVELS[level], style.SYMBOLS[level]
         told: dict[str, Any] = {"text": self.named(mine), "hovertemplate": "%{text}<extra></extra>"}
-        return style.marks(x[mine], y[mine], *look, name=LEVEL_NAMES[level], **told, **more)
+        return style.marks(*at, name=LEVEL_NAMES[level], **told, **more)
 
 
 def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:

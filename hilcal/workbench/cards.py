@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from nicegui import background_tasks, run, ui
-from nicegui.events import GenericEventArguments
+from nicegui.events import GenericEventArguments, TableSelectionEventArguments
 
 from hilcal import numbers
 from hilcal.diagnosis.distinguish import Difference
@@ -193,8 +193,12 @@ def _suspects(view: View, d: Snapshot) -> None:
         table.selected = [e.args[1]]
         view.choose(e.args[1]["0"])
 
+    def ticked(e: TableSelectionEventArguments) -> None:
+        for row in e.selection:
+            view.choose(row["0"])
+
     table.on("row-click", clicked)
-    table.on_select(lambda e: [view.choose(row["0"]) for row in e.selection])
+    table.on_select(ticked)
 
 
 def evidence(view: View, d: Snapshot) -> None:
