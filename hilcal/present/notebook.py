@@ -1,7 +1,6 @@
 """Results for the library: in a notebook what the terminal says, as HTML; as pandas data frames."""
 
 import io
-from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import singledispatch
 from typing import TYPE_CHECKING
@@ -88,9 +87,8 @@ def frame_of(value: object) -> "pd.DataFrame":
         import pandas as pd
 
     if isinstance(value, CheckedPlan):
-        kinds = defaultdict(lambda: "float64", pose="str", load="str")
-        text = io.StringIO(plan_csv(value.plan))
-        return pd.read_csv(text, dtype=kinds, na_filter=False, float_precision="round_trip")
+        frame = pd.read_csv(io.StringIO(plan_csv(value.plan)), dtype=str, na_filter=False)
+        return frame.astype({name: float for name in frame if name not in ("pose", "load")})
     if isinstance(value, Readings):
         return pd.DataFrame(exchange_columns(value))
     if isinstance(value, Fit):
