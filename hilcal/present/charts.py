@@ -81,8 +81,8 @@ class ChartReadings:
     def marks(self, x: Floats, y: Floats, level: int, mine: Bools, **more: Any) -> go.Scatter:
         """Return some (K,) as points of a level at x, y (K,)."""
         at = x[mine], y[mine], style.LEVELS[level], style.SYMBOLS[level]
-        told: dict[str, Any] = {"text": self.named(mine), "hovertemplate": "%{text}<extra></extra>"}
-        return style.marks(*at, name=LEVEL_NAMES[level], **told, **more)
+        more |= {"name": LEVEL_NAMES[level], "text": self.named(mine)}
+        return style.marks(*at, **more, hovertemplate="%{text}<extra></extra>")
 
 
 def drawn(story: Story, revision: StoryRevision, most: int = MOST) -> ChartReadings:
