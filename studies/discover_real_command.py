@@ -20,7 +20,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
 from hilcal.library import read_table
 from hilcal.numbers import length, percent
-from hilcal.present.discovery import coefficient
+from hilcal.present.diagnosis import coefficient
 from hilcal.present.progress import counting
 from hilcal.refinement import refine
 from hilcal.robot.catalogue import configs_dir

@@ -104,7 +104,7 @@ class Campaign(Brief):
 
     def _repr_html_(self) -> str:
         from hilcal.present.campaign import info_report  # notebooks alone need them
-        from hilcal.present.html.page import fragment
+        from hilcal.present.html import fragment
         from hilcal.present.registration import covariance_words
 
         covariance = covariance_words(self.covariance_parts, self.noise)

@@ -299,7 +299,7 @@ def fleet(
     from hilcal.cli.showing import opening
     from hilcal.engine.engine import open_engine
     from hilcal.identification.posterior_document import write
-    from hilcal.present.fleet import fleet_report
+    from hilcal.present.comparison import fleet_report
     from hilcal.transfer.fleet import fleet as pool_fleet
     from hilcal.transfer.fleet import to_json
     from hilcal.transfer.members import entries

@@ -59,12 +59,12 @@ from hilcal.present.calibration import improvement_report
 from hilcal.present.diagnosis import (
     compared,
     key,
+    refined_laws,
     revisions_table,
     step_report,
     truth_table,
     verdict_line,
 )
-from hilcal.present.discovery import refined_laws
 from hilcal.present.document import heading
 from hilcal.present.fit import model_name
 from hilcal.present.plan import next_report

@@ -39,8 +39,8 @@ class Fleet:
     failures: tuple[Failure, ...]  # those that were not, and types that could not be pooled
 
     def _repr_html_(self) -> str:
-        from hilcal.present.fleet import fleet_report  # notebooks alone need them
-        from hilcal.present.html.page import fragment
+        from hilcal.present.comparison import fleet_report  # notebooks alone need them
+        from hilcal.present.html import fragment
 
         return fragment(fleet_report(self))
 

@@ -19,7 +19,7 @@ from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline
 from hilcal.identification.fit import fit
 from hilcal.measuring.connect import ConnectionResult
-from hilcal.present.running import full_words, status_words
+from hilcal.present.progress import full_words, status_words
 from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step

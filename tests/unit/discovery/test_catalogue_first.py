@@ -16,7 +16,7 @@ from hilcal.effects.spec import EffectSpec
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.discovery import silence
+from hilcal.present.diagnosis import silence
 from tests.unit.discovery.test_discover import campaign
 
 

@@ -6,7 +6,7 @@ tells anything by colour alone.
 """
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ SYMBOLS = ("circle", "diamond", "x")
 """Marks of the levels, so that they are told apart without colours."""
 CONFIG: dict[str, object] = {"displayModeBar": False, "responsive": True, "scrollZoom": False}
 """Options for plotly.js: no toolbar, and the wheel scrolls the page."""
+SIGMA_LIMITS = np.sqrt(stats.chi2.ppf(LIMITS, 3)).tolist()
+"""Mahalanobis distances from which a reading is doubtful, and outside."""
 _INK = {False: ("#24272e", "#d9dbe0"), True: ("#e4e5e9", "#3b3f48")}
 
 
@@ -37,9 +39,7 @@ def template(dark: bool) -> go.layout.Template:
     """Return the look of charts on a light or dark page: transparent paper, quiet grid."""
     ink, grid = _INK[dark]
     axis = {
-        "gridcolor": grid,
-        "linecolor": grid,
-        "zerolinecolor": grid,
+        **dict.fromkeys(("gridcolor", "linecolor", "zerolinecolor"), grid),
         "automargin": True,
         "autotickangles": [0, 90],
         "title": {"standoff": 8, "font": {"size": 12}},
@@ -67,15 +67,9 @@ def figure(
     traces: Sequence[object] = (),
     **layout: object,
 ) -> go.Figure:
-    """Return a figure in the light scheme.
+    """Return a figure in the light scheme, `height` CSS pixels high and as wide as the page.
 
-    Args:
-        says: the sentence that the chart shows.
-        x: title of the horizontal axis, with its unit; `y` of the vertical one.
-        y: see x.
-        height: CSS pixels; the width is that of the page.
-        traces: what is drawn.
-        layout: more of plotly's layout.
+    `says` is the sentence that it shows; `x` and `y` are the titles of the axes, with their units.
     """
     out = go.Figure(data=list(traces))
     out.update_layout(template=template(False), height=height, meta={"says": escaped(says)})
@@ -88,15 +82,9 @@ def line(
     x: Floats, y: Floats, name: str = "", color: str = NOISE, dash: str = "solid"
 ) -> go.Scatter:
     """Return a line that tells nothing when it is pointed at."""
-    return go.Scatter(
-        x=drawn(x),
-        y=drawn(y),
-        mode="lines",
-        line={"color": color, "width": 2, "dash": dash},
-        name=name,
-        showlegend=bool(name),
-        hoverinfo="skip",
-    )
+    look = {"color": color, "width": 2, "dash": dash}
+    more = {"name": name, "showlegend": bool(name), "hoverinfo": "skip"}
+    return go.Scatter(x=drawn(x), y=drawn(y), mode="lines", line=look, **more)
 
 
 def marks(
@@ -124,20 +112,14 @@ def bars(
     x: str,
     colors: Sequence[str] | str = MEASURED,
 ) -> go.Figure:
-    """Draw horizontal bars, the first on top."""
+    """Draw horizontal bars, the first on top, each with its value in two digits."""
     more = {"hovertext": [label(h) for h in hover], "hoverinfo": "text", "showlegend": False}
-    text = [_short(v) for v in values]
+    formats = ((v, ".0f" if abs(v) >= 10 else ".2g") for v in values)
+    text = ["0" if abs(v) < 0.005 else format(v, how) for v, how in formats]
     trace = bar(values, [label(n) for n in names], colors, text, **more)
     out = figure(says, x=x, traces=[trace], height=90 + 28 * len(names))
     out.update_yaxes(autorange="reversed")
     return out
-
-
-def _short(value: float) -> str:
-    """A value at the end of its bar, with two digits; what rounds to nothing is 0."""
-    if abs(value) < 0.005:
-        return "0"
-    return f"{value:.0f}" if abs(value) >= 10 else f"{value:.2g}"
 
 
 def label(words: str) -> str:
@@ -145,17 +127,9 @@ def label(words: str) -> str:
     return html.escape(escaped(words), quote=False)
 
 
-def says(chart: go.Figure) -> str:
-    """Return the sentence that a chart shows."""
-    meta: Mapping[str, str] = chart.layout.meta or {}
-    return meta.get("says", "")
-
-
 def in_scheme(chart: go.Figure, dark: bool) -> go.Figure:
     """Return a copy of a chart for a light or dark page."""
-    out = go.Figure(chart)
-    out.update_layout(template=template(dark))
-    return out
+    return go.Figure(chart).update_layout(template=template(dark))
 
 
 def empty(words: str) -> go.Figure:
@@ -163,12 +137,6 @@ def empty(words: str) -> go.Figure:
     note = {"text": words, "showarrow": False, "xref": "paper", "yref": "paper", "x": 0.5, "y": 0.5}
     hidden = {"visible": False}
     return figure(words, height=160, annotations=[note], xaxis=hidden, yaxis=hidden)
-
-
-def sigma_limits() -> tuple[float, float]:
-    """Mahalanobis distances from which a reading is doubtful, and outside."""
-    low, high = np.sqrt(stats.chi2.ppf(LIMITS, 3))
-    return float(low), float(high)
 
 
 def drawn(values: Floats) -> Floats:
