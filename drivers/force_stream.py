@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.config.rig import PORT
-from hilcal.config.rig import ForceSensor as Section
+from hilcal.config.sections import PORT
+from hilcal.config.sections import ForceSensor as Section
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.devices import Losses, Report, Row, WrenchSample, report_of

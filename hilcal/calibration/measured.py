@@ -21,9 +21,9 @@ from typing import Any, Self
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.identification.extrapolation import FAR
 from hilcal.identification.predictive import Predictive
-from hilcal.measuring.tool_load import shift
+from hilcal.identification.validation import FAR
+from hilcal.measuring.force import shift
 from hilcal.model.model import Model
 from hilcal.readings.ranges import (
     Range,

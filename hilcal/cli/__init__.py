@@ -225,7 +225,7 @@ def _explained(error: Exception, name: str) -> tuple[str, int]:
         return words, _USAGE
     if words := lacking(error):
         return words, _USAGE
-    from hilcal.effects.failure import failure_of  # loads numpy, which takes a while
+    from hilcal.effects.from_file import failure_of
 
     if failed := failure_of(error):
         return str(failed), failed.exit_code

@@ -25,8 +25,8 @@ from hilcal.errors import InputError
 from hilcal.identification.fit_document import plain
 from hilcal.mixed.families import expected_sizes
 from hilcal.names import quoted
+from hilcal.present.campaign import reference_page, section_report, sections_overview
 from hilcal.present.document import Table, note, table
-from hilcal.present.preparing import reference_page, section_report, sections_overview
 from hilcal.present.progress import counting
 from hilcal.toml import Section
 from hilcal.whole_file import replace_file

@@ -16,8 +16,7 @@ from hilcal.config import CellConfig
 from hilcal.design import tour
 from hilcal.design.tour import NEVER
 from hilcal.errors import CannotAnswerError, InputError
-from hilcal.measuring.route import seconds_at_rest
-from hilcal.measuring.route import duration, route
+from hilcal.measuring.route import duration, route, seconds_at_rest
 from hilcal.robot.arm import Arm
 from hilcal.store.plan import REFERENCE, UNLOADED, Plan, Step
 from hilcal.types import Bools, Floats, Ints

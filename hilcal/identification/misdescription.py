@@ -25,7 +25,7 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from hilcal.cell import Cell
-from hilcal.config.joints import Conventions
+from hilcal.config.sections import Conventions
 from hilcal.errors import CannotAnswerError, InputError
 from hilcal.identification.registration import (
     FrameData,

@@ -65,8 +65,8 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.same_readings import prints
 from hilcal.readings.whitening import Mode, Whitening, whitening
 from hilcal.regression.schur import schur_complement
-from hilcal.store.records import content_hash
 from hilcal.store.revision import utc_now
+from hilcal.store.rows import content_hash
 from hilcal.types import Floats, Ints
 
 ITERATIONS = 20  # of the noise factor; it converges within a few
@@ -77,9 +77,8 @@ CHUNK = 4096  # measurements that are taken at once, for memory
 MOST_ROWS = 600  # elements beyond which variances are taken for known: of 200 poses of a real UR10
 # the factor is 1.00 to 1.06, and a draw costs the cube of the rows; a choice
 DRAWS, SEED = 30, 0  # of the posterior; a choice: 20 poses of that UR10 give 1.19 to 1.43 by seed
-HEAVIEST = (
-    2.0  # log of the largest weight of a draw over the median: tails are not normal; a choice
-)
+# log of the largest weight of a draw over the median: tails are not normal; a choice
+HEAVIEST = 2.0
 CHANCE = 0.0005  # p-value of χ² below which there is an excess: that of `diagnosis.noise_verdict`
 SOME = 400  # measurements, evenly spaced, from which a mean leverage is taken, for speed; a choice
 SAME = 0.05  # relative change of s² and of the factor that makes no difference; a choice

@@ -30,10 +30,9 @@ from hilcal.types import Bools, Floats, Ints
 
 STEPS = 10  # most Gauss-Newton steps of a registration; a choice
 CONVERGED = 1e-6  # step of a registration that ends it, in σ per whitened element; a choice
-FAR = (
-    2.0  # leverage from which a reading is outside, in units of that which one in a hundred of the
-)
-# fitted measurements exceeds; a choice
+# leverage from which a reading is outside, in units of that which one in a hundred of the fitted
+# measurements exceeds; a choice
+FAR = 2.0
 BAND = 0.95  # probability of the band that is stated, as is usual (GUM)
 
 

@@ -261,7 +261,7 @@ class ReadingColumns:
                 self._add_joint(self._moves.drives[:, :, joint, None], c.values[:, mine], at[mine])
         elif c.field == "twist":
             for slot, mine in c.runs():
-                moved = self._motion(slot, lambda k=slot: self._moves.by_slot(k))
+                moved = self._motion(slot, partial(self._moves.by_slot, slot))
                 self._add(_times(moved, c.values[:, mine]), at[mine])
         else:
             moved = self._motion(c.field, getattr(self._moves, f"by_{c.field}"))

@@ -8,17 +8,22 @@ import numpy as np
 
 from hilcal import numbers
 from hilcal.calibration.calibration import Calibration
-from hilcal.calibration.compensated import BAND, Compensation
+from hilcal.calibration.compensation import BAND, Compensation
 from hilcal.calibration.improvement import Improved, Improvement
 from hilcal.calibration.measured import WORDS, Outside
 from hilcal.calibration.programs.program import ProgramPoint
 from hilcal.calibration.urscript import Waypoint
-from hilcal.identification.acceptance import BAND as REGION
-from hilcal.identification.acceptance import Acceptance, Judged, Share
 from hilcal.identification.bootstrap import Bootstrap
-from hilcal.identification.extrapolation import Beyond, Extrapolation
 from hilcal.identification.priors import names_of
-from hilcal.identification.validation import Validation
+from hilcal.identification.validation import BAND as REGION
+from hilcal.identification.validation import (
+    Acceptance,
+    Beyond,
+    Extrapolation,
+    Judged,
+    Share,
+    Validation,
+)
 from hilcal.numbers import length
 from hilcal.present.document import Block, Table, heading, load_name, note, table
 from hilcal.present.fit import error_words, kind, model_name
@@ -29,7 +34,7 @@ from hilcal.readings.whitening import Mode
 from hilcal.types import Floats
 
 if TYPE_CHECKING:
-    from hilcal.procedure.decision import Decision
+    from hilcal.procedure.next_plan import Decision
     from hilcal.procedure.state import ProcedureStep
 
 TITLES: Mapping[str, str] = {

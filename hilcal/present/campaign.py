@@ -11,18 +11,18 @@ from hilcal.config.changes import Changes, write_value
 from hilcal.config.reference import NOT_SET, REQUIRED, KeyTable
 from hilcal.doctor.computer import Finding
 from hilcal.identification.fit import Fit
-from hilcal.measuring.repeatability import RepeatabilityEstimate
+from hilcal.measuring.session_state import RepeatabilityEstimate
 from hilcal.present.document import Block, Table, Words, heading, note, pairs, table
 from hilcal.present.fit import error_words, model_name
 from hilcal.present.progress import spoken
 from hilcal.present.registration import observed_words
 from hilcal.store.overview import Overview
 from hilcal.store.revision import RevisionRecord, change
-from hilcal.tables.guessing.proposal import Proposal
+from hilcal.tables.proposal import Proposal
 
 if TYPE_CHECKING:
     from hilcal.measuring.connect import ConnectionResult
-    from hilcal.measuring.dry_run import DryRun
+    from hilcal.measuring.route import DryRun
     from hilcal.transfer.factory import FactoryCheck
 
 _HEAD = """\

@@ -15,8 +15,8 @@ from hilcal.present.fit import error_words, measurements
 
 if TYPE_CHECKING:
     from hilcal.transfer.fleet import Fleet
+    from hilcal.transfer.members import TypeSize
     from hilcal.transfer.pooled import DiagnosedEffect, Odd, Pooled
-    from hilcal.transfer.type_sizes import TypeSize
 
 MOST_PARAMETERS, MOST_ROWS = 6, 12
 """Parameters of a change, and of both fits, that are listed."""

@@ -14,9 +14,8 @@ from hilcal.diagnosis.noise import PureError
 from hilcal.diagnosis.residual_regression import Dependence
 from hilcal.diagnosis.stepwise import predicts_better
 from hilcal.discovery.curve import Curve
-from hilcal.discovery.discovery import Discovery
+from hilcal.discovery.discovery import Discovery, LawSearch
 from hilcal.discovery.law import Coefficient, Law
-from hilcal.discovery.proposal import LawSearch
 from hilcal.discovery.structures import Structure, pareto
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_prediction import full_prediction

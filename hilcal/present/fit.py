@@ -10,13 +10,17 @@ from hilcal.diagnosis.effect_ranking import FALSE_ALARM, LEAST_SHARE
 from hilcal.diagnosis.misfit_breakdown import Group, MisfitShare
 from hilcal.effects.protocol import FRAME_ROLES, Effect
 from hilcal.identification.background import background_of
+from hilcal.identification.baseline import masses_note
 from hilcal.identification.carried import DriftGroup
 from hilcal.identification.fit import Fit
 from hilcal.identification.fit_document import notes
-from hilcal.identification.full_prediction import FullPrediction, error_before, full_prediction
-from hilcal.identification.gross_errors import gross_errors
-from hilcal.identification.missing_masses import masses_note
-from hilcal.identification.posterior_of_fit import of_arm
+from hilcal.identification.full_prediction import (
+    FullPrediction,
+    error_before,
+    full_prediction,
+    gross_errors,
+)
+from hilcal.identification.predictive import of_arm
 from hilcal.identification.residual import ErrorBlock
 from hilcal.numbers import length, percent
 from hilcal.present.document import Block, Table, heading, note, table

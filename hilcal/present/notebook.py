@@ -9,10 +9,10 @@ from hilcal.design.checked_plan import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery
-from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.bootstrap import Bootstrap
 from hilcal.identification.fit import Fit
-from hilcal.identification.residual_table import residual_table
+from hilcal.identification.full_prediction import residual_table
+from hilcal.identification.validation import CampaignValidation
 from hilcal.optional import needed_by
 from hilcal.present.calibration import bootstrap_report, opening, shares_report, validation_report
 from hilcal.present.comparison import comparison_report

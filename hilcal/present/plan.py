@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 
 from hilcal import numbers
 from hilcal.design.next import SURE, Next, PairPower
+from hilcal.design.run_order import Confounding
 from hilcal.design.summary import CurvePoint, PlanSummary, PredictedParameter
-from hilcal.design.timing import Confounding
 from hilcal.numbers import digits, length
 from hilcal.present.document import Block, Table, heading, load_name, note, pairs, table
 from hilcal.present.progress import spoken

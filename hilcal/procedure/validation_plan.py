@@ -18,11 +18,9 @@ from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.checked_plan import refuse
 from hilcal.design.feasible import REASONS, Space, draw
-from hilcal.design.run_order import Chosen, Ordering, order_plan
-from hilcal.design.timing import pace, timeline
+from hilcal.design.run_order import Chosen, Ordering, order_plan, pace, timeline
 from hilcal.errors import CannotAnswerError
-from hilcal.measuring.dry_run import dry_run
-from hilcal.measuring.route import approach_sides, duration, route
+from hilcal.measuring.route import approach_sides, dry_run, duration, route
 from hilcal.present.calibration import refusals
 from hilcal.present.progress import Say
 from hilcal.readings.readings import Readings, States

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from hilcal.config.joints import Conventions
+from hilcal.config.sections import Conventions
 from hilcal.errors import InputError
 from hilcal.robot import se3
 from hilcal.robot.arm import Arm, missing

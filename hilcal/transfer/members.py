@@ -27,14 +27,14 @@ import numpy as np
 from hilcal import limits
 from hilcal.campaign.campaign import Campaign
 from hilcal.diagnosis.verdict import diagnose
-from hilcal.effects.failure import failure_of
+from hilcal.effects.from_file import failure_of
 from hilcal.errors import CannotAnswerError, HilcalError, InputError
 from hilcal.identification.background import MOST_ROWS
 from hilcal.identification.baseline import baseline, with_effects
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.mixed_fit import mixed_fit
 from hilcal.identification.posterior import Posterior, Source
-from hilcal.identification.posterior_of_fit import of_arm
+from hilcal.identification.predictive import of_arm
 from hilcal.mixed.families import ARM, EFFECT
 from hilcal.mixed.variances import Variances
 from hilcal.model.model import Model

@@ -12,8 +12,8 @@ import hilcal.cli.running as running
 from hilcal.cli.terminal import terminal
 from hilcal.config import Repeatability
 from hilcal.config.reference import to_toml
-from hilcal.design import goal_rule
-from hilcal.design.goal_rule import GoalRule
+from hilcal.design import goal as goal_rule
+from hilcal.design.goal import GoalRule
 from hilcal.design.nominal_model import nominal_states
 from hilcal.errors import InputError
 from hilcal.identification.baseline import baseline

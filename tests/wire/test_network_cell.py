@@ -14,7 +14,7 @@ import hilcal as hc
 from hilcal.campaign.campaign import estimated_noise
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated.arm import open_arm
 from hilcal.drivers.simulated.blackboard import Blackboard
 from hilcal.drivers.simulated.cell_processes import SimulatedCell

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from hilcal.cli.rehearsing import with_person
-from hilcal.config.template import to_toml
+from hilcal.cli.running import with_person
+from hilcal.config.reference import to_toml
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.simulated.operator import open_operator as open_simulated
 from hilcal.drivers.terminal_operator import open_operator as open_terminal

@@ -8,16 +8,16 @@ import numpy as np
 from scipy.stats import chi2
 
 from hilcal import numbers
-from hilcal.calibration.budget import COVERAGE, budget
+from hilcal.calibration.scatter import COVERAGE, budget
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.diagnosis.effect_ranking import LEAST_SHARE, Suspect
 from hilcal.diagnosis.repeats import classes
-from hilcal.identification.acceptance import CampaignValidation
 from hilcal.identification.family_sizes import family_sizes
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import CovarianceParts
 from hilcal.identification.full_prediction import error_before, names
-from hilcal.identification.variance_factor import CONFIDENCE
+from hilcal.identification.residual import CONFIDENCE
+from hilcal.identification.validation import CampaignValidation
 from hilcal.numbers import length, percent
 from hilcal.present import charts
 from hilcal.present.calibration import loads_report, opening, validation_report, worst_table
@@ -52,7 +52,7 @@ from hilcal.present.registration import base_line, covariance_words
 from hilcal.present.story import Chapter, Story, StoryRevision, curve, laws, regressor
 from hilcal.present.verdict import headline, message, repeatability_source
 from hilcal.readings.whitening import Scaling
-from hilcal.store.command_line import COMMAND
+from hilcal.store.kept_texts import COMMAND
 from hilcal.store.overview import Overview
 from hilcal.store.plan import Plan
 from hilcal.types import Floats

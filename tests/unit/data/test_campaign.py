@@ -23,9 +23,8 @@ from hilcal.cli import main
 from hilcal.errors import HilcalError, InputError, MovedFileError
 from hilcal.store import schema
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.records import content_hash
 from hilcal.store.revision import STORED, RevisionRecord
-from hilcal.store.rows import _reading_crc
+from hilcal.store.rows import _reading_crc, content_hash
 from hilcal.store.run_log import RunLog
 from hilcal.store.schema import sqlite_errors
 from tests.support import power_loss

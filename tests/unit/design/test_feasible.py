@@ -13,10 +13,9 @@ from hilcal.config import CellConfig
 from hilcal.design.feasible import REASONS, Space, draw
 from hilcal.errors import CannotAnswerError
 from hilcal.measuring.clearance import Clearance
-from hilcal.measuring.route import (dry_run, route_problems)
 from hilcal.measuring.feasibility import BETWEEN_M, STATE, Feasibility, Margins
-from hilcal.measuring.motion import (SLACK, SLACK_M, Guard)
-from hilcal.measuring.route import Stop
+from hilcal.measuring.motion import SLACK, SLACK_M, Guard
+from hilcal.measuring.route import Stop, dry_run, route_problems
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm
 from hilcal.store.plan import UNLOADED, Plan, Step

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hilcal.cell import cell_from_config
 from hilcal.config import load_config
 from hilcal.config.cell import Target
-from hilcal.config.observers import Gauge, Point
+from hilcal.config.sections import Gauge, Point
 from hilcal.design.discriminated_pairs import discriminated_pairs
 from hilcal.design.information import (
     MOST_ORDINARY,
@@ -33,8 +33,8 @@ from hilcal.identification.full_covariance import with_joint_scatter
 from hilcal.identification.posterior import Posterior
 from hilcal.measuring.clearance import LineOfSight, clearance_of
 from hilcal.measuring.devices import TrackerSample
-from hilcal.measuring.route import seconds_at_rest
 from hilcal.measuring.measure import average
+from hilcal.measuring.route import seconds_at_rest
 from hilcal.readings.whitening import MODES, Mode
 from hilcal.robot.chain import evaluate
 from tests.support.arm_cases import ARMS, arm_of

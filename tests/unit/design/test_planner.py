@@ -12,8 +12,8 @@ import pytest
 
 from hilcal.cell import cell_from_config
 from hilcal.config import CellConfig, load_config
-from hilcal.config.loads import CellLoad
-from hilcal.config.template import to_toml
+from hilcal.config.reference import to_toml
+from hilcal.config.sections import CellLoad
 from hilcal.design.choice import CRITERIA, costly_loads, objective_of
 from hilcal.design.feasible import Space
 from hilcal.design.information import DesignProblem, problem

@@ -25,7 +25,7 @@ from hilcal.identification.baseline import baseline
 from hilcal.identification.effect_columns import effect_columns
 from hilcal.identification.fit import Fit, fit
 from hilcal.identification.linearisation import linearise
-from hilcal.present.discovery import discovery_report, refined_laws, silence
+from hilcal.present.diagnosis import discovery_report, refined_laws, silence
 from hilcal.refinement import refine
 from studies.unmodelled_laws import law_named, shift
 from tests.support.rehearsed import rehearsed

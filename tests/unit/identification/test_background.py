@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from hilcal.calibration.budget import budget
+from hilcal.calibration.scatter import budget
 from hilcal.campaign.revisions import restore, to_record
 from hilcal.cell import Cell
 from hilcal.config import load_config
@@ -26,8 +26,8 @@ from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import whitening
 from hilcal.refinement import BACKGROUND, Refinement, refine
 from hilcal.robot.catalogue import configs_dir
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
 from studies.diagnosis import Asked
 from studies.diagnosis_command import simulate
 from studies.random_campaigns import rehearsal_states

@@ -25,8 +25,8 @@ from hilcal.identification.posterior_document import read, write
 from hilcal.identification.predictive import predictive
 from hilcal.readings.same_readings import among
 from hilcal.robot.catalogue import configs_dir, load_arm
-from hilcal.store.records import content_hash
 from hilcal.store.revision import from_text, to_text
+from hilcal.store.rows import content_hash
 from studies.change import StudiedArm, studied_arm
 from studies.change import measured as measured_again
 from tests.support.campaigns import Campaign, campaign, measured, noiseless, plan, with_noise

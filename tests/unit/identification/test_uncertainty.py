@@ -13,7 +13,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.folds import distinct_poses
 from hilcal.identification.priors import prior_of
 from hilcal.model.model import Model
-from hilcal.present.validation import bootstrap_remarks
+from hilcal.present.calibration import bootstrap_remarks
 from hilcal.readings.readings import Readings
 from hilcal.readings.whitening import MODES, Mode, whitening
 from tests.support.campaigns import campaign, noiseless, plan, with_noise

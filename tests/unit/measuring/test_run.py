@@ -18,7 +18,7 @@ from hilcal.readings.readings import Readings
 from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
-from hilcal.store.records import content_hash
+from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
 from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
 from tests.support.fake_devices import STD, TORQUE

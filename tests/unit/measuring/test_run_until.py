@@ -10,7 +10,7 @@ from hilcal.config import Limits, Obstacle
 from hilcal.errors import DeviceError
 from hilcal.measuring.progress import GoalMet, GoalStatus, ReadingStored, Remark
 from hilcal.measuring.route import Stop, route_problems, way_home
-from hilcal.present.running import met_words
+from hilcal.present.progress import met_words
 from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step

@@ -8,6 +8,7 @@ import pytest
 
 from hilcal.design.discriminated_pairs import not_ruled_out
 from hilcal.design.next import PairPower
+from hilcal.design.run_order import Confounding, Duration
 from hilcal.design.summary import (
     CriterionResult,
     CurvePoint,
@@ -15,7 +16,6 @@ from hilcal.design.summary import (
     PlanSummary,
     PredictedParameter,
 )
-from hilcal.design.timing import Confounding, Duration
 from hilcal.present.plan import (
     certified,
     enough,

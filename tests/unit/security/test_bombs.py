@@ -36,14 +36,14 @@ from hilcal.store.rows import text_crc
 from hilcal.tables import parquet_stream
 from hilcal.tables.files import open_grid
 from hilcal.tables.grid import Grid, unique
-from hilcal.tables.guessing.propose import propose
 from hilcal.tables.mapping import FileFormat, Mapping, load_mapping
+from hilcal.tables.propose import propose
 from hilcal.tables.table import write_table
 from hilcal.toml import parse_json, read_toml, suggest
 from hilcal.transfer.members import LIST, entries
 from tests.support.campaigns import campaign, configuration
 from tests.support.unguarded import unguarded
-from tests.unit.data.test_file_versions import HASHED, unpacked
+from tests.unit.data.test_campaign import HASHED, unpacked
 
 HEAD = (
     b'<?xml version="1.0"?><worksheet xmlns="http://schemas.openxmlformats.org/spreadsheetml/'

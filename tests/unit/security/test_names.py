@@ -46,7 +46,7 @@ from hilcal.cli.exporting import _write_parameters
 from hilcal.cli.failing import Failures, Watched
 from hilcal.cli.terminal import Terminal
 from hilcal.config import load_config
-from hilcal.config.template import cell_text
+from hilcal.config.reference import cell_text
 from hilcal.discovery.law import source_of_form
 from hilcal.drivers.terminal_operator import TerminalOperator
 from hilcal.errors import InputError
@@ -64,8 +64,8 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Plan, Step, read_plan
 from hilcal.store.rows import text_crc
 from hilcal.tables.files import open_grid, read_text
-from hilcal.tables.guessing.proposal import Proposal
 from hilcal.tables.mapping import FileFormat
+from hilcal.tables.proposal import Proposal
 from hilcal.tables.table import read_table, write_table
 from hilcal.tables.write import plan_csv, write_columns
 from hilcal.workbench.elements import plain
