@@ -2,10 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pinocchio as pin
 
 from hilcal.config import Obstacle
 from hilcal.robot import se3
@@ -13,16 +12,21 @@ from hilcal.robot.arm import Arm
 from hilcal.robot.body import Capsule, capsules, is_known
 from hilcal.types import Bools, Floats
 
+if TYPE_CHECKING:
+    import pinocchio as pin
+
 FLANGE = "flange"
 
 
-def pinocchio_model(arm: Arm) -> pin.Model:
+def pinocchio_model(arm: Arm) -> "pin.Model":
     """Build a Pinocchio model with the same chain, masses and limits.
 
     Joint i turns about z or slides along it, with the placement L_{i-1} in body i - 1; bodies are
     point masses at their centres of mass; the frame "flange" has the placement L_n in the last
     body.
     """
+    import pinocchio as pin
+
     model = pin.Model()
     model.name = arm.name
     joint = 0
@@ -125,6 +129,8 @@ class Scene:
         return np.where(between, np.minimum(far[a], far[b]), 0.0)
 
     def _pairs(self, pairs: Sequence[tuple[int, int]], rates: Sequence[Floats] = ()) -> "Pairs":
+        import pinocchio as pin
+
         geometry = pin.GeometryModel()
         names = []
         for part in self.parts:
@@ -177,6 +183,8 @@ class Pairs:
         self, q: Floats, margin: float | Floats = 0.0, segment: Segment | None = None
     ) -> Bools:
         """Return (N,) in which states (N, n) any pair is closer than its margin, m."""
+        import pinocchio as pin
+
         out = np.zeros(len(q), dtype=np.bool_)
         if not self._pairs:
             return out
@@ -191,6 +199,8 @@ class Pairs:
         self, q: Floats, margin: float = 0.0, segment: Segment | None = None
     ) -> dict[tuple[str, str], float]:
         """Return the pairs closer than a margin in any state (N, n), and their distance, m."""
+        import pinocchio as pin
+
         out: dict[tuple[str, str], float] = {}
         hit = np.flatnonzero(self.touching(q, margin, segment))
         if not len(hit):
@@ -207,6 +217,8 @@ class Pairs:
 
     def how_often(self, q: Floats, margin: float = 0.0) -> Floats:
         """(K,) share of the states in which each pair is closer than a margin, m."""
+        import pinocchio as pin
+
         count = np.zeros(len(self._pairs))
         self._prepare(margin, None)
         for turned in self._arm.chain_angles(q):
@@ -225,6 +237,8 @@ class Pairs:
         )
 
     def _gap(self, k: int) -> float:
+        import pinocchio as pin
+
         return float(pin.computeDistance(self._geometry, self._state, k).min_distance)
 
     def _prepare(self, margin: float | Floats, segment: Segment | None) -> None:
@@ -240,6 +254,8 @@ class Pairs:
                 self._state.activeCollisionPairs[k] = self._names[a] not in segment.ignored
 
     def _place(self, turned: Floats, lies: "_Lies | None" = None, i: int = 0) -> None:
+        import pinocchio as pin
+
         pin.updateGeometryPlacements(self._model, self._data, self._geometry, self._state, turned)
         if lies is not None:
             half, turn, middle = lies
@@ -306,6 +322,8 @@ def _lies(segment: Segment, count: int) -> _Lies:
 
 def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
     """Coal's capsule, which lies along z about its middle, and where it is."""
+    import pinocchio as pin
+
     way = end - start
     shape = pin.coal.Capsule(radius, float(np.linalg.norm(way)))
     return shape, pin.SE3(_turn(way[None])[0], 0.5 * (start + end))
@@ -313,6 +331,8 @@ def _capsule(start: Floats, end: Floats, radius: float) -> tuple[Any, Any]:
 
 def _obstacle(thing: Obstacle) -> tuple[Any, Any]:
     """Coal's shape of an obstacle, and where its middle is."""
+    import pinocchio as pin
+
     if thing.center_m is not None and thing.size_m is not None:
         return pin.coal.Box(*thing.size_m), pin.SE3(np.eye(3), np.array(thing.center_m))
     if thing.bottom_m is None or thing.radius_m is None or thing.height_m is None:

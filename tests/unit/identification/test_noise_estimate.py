@@ -194,7 +194,7 @@ def test_an_estimate_does_not_outlive_the_readings_that_it_is_of(
 ) -> None:
     path = run_of(sampled(3, 5e-6, 1e-4), tmp_path)
     cell = hc.Cell.load(tmp_path / "CELL.toml")
-    monkeypatch.setattr("hilcal.identification.noise_estimate.measured_noise", lambda *_: None)
+    monkeypatch.setattr("hilcal.cli.running.measured_noise", lambda *_: None)
     with CampaignFile.open(path) as file:
         estimate_noise(terminal(False), cell.configured(), cell, file)
         stored = file.readings()

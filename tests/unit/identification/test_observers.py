@@ -258,7 +258,7 @@ Q = "p1,none,0,-1,0,0,0,0"
     ("more", "cells", "message"),
     [
         ("distance_m,from", "1.0,A", r"row 2: nothing states the noise of point A; .*'cov_d_d'"),
-        ("distance_m,cov_d_d", "1.0,1e-10", r"column 'from' is missing; it names what"),
+        ("distance_m,cov_d_d", "1.0,1e-10", r"without column 'from'; give both"),
         ("distance_m,from,cov_d_d", "1.0,,1e-10", r"row 2, column 'from': the cell is empty"),
         ("distance_m,from,cov_d_d", "-1.0,A,1e-10", r"'distance_m': -1 m cannot be right"),
         ("distance_m,from,cov_d_d", "1.0,A,0", r"'cov_d_d': a variance of 0 m² cannot be right"),
