@@ -43,7 +43,7 @@ from hilcal.tables.parquet_stream import open_stream
 from hilcal.types import Floats
 
 if TYPE_CHECKING:  # needs Pinocchio, which a fit does not
-    from hilcal.design.checked_plan import CheckedPlan
+    from hilcal.design.summary import CheckedPlan
     from hilcal.drivers.simulated.rehearsal import Rehearsal, SimulationCase
 
 
@@ -323,9 +323,8 @@ def plan(
         CannotAnswerError: the cell leaves too few poses, or the readings are too few.
     """
     with needed_by("a plan"):
-        from hilcal.design.checked_plan import checked
         from hilcal.design.planner import Request, make
-        from hilcal.design.summary import about, summarise
+        from hilcal.design.summary import about, checked, summarise
 
     config, rng = cell.configured(), np.random.default_rng(seed)
     if given is not None and prior is not None:

@@ -22,8 +22,7 @@ import numpy as np
 from hilcal import limits
 from hilcal.identification.gauss_newton import whitened_jacobian
 from hilcal.model.model import Model
-from hilcal.readings.readings import ObserverName, Readings, States
-from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.readings import ObserverName, Readings, SerialNoise, States
 from hilcal.readings.whitening import Mode, whitening
 from hilcal.types import Floats
 

@@ -21,9 +21,7 @@ from hilcal.identification.fit import Fit, fit
 from hilcal.identification.predictive import Predictive, predictive
 from hilcal.model.model import Model
 from hilcal.names import quoted
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.readings import Readings
-from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.readings import ArmScatter, Readings, SerialNoise
 from hilcal.readings.whitening import MODES, SCALINGS, Mode, Scaling
 from hilcal.store.kept_texts import COMMAND
 from hilcal.store.revision import CARRIED, STORED, RevisionRecord, to_text

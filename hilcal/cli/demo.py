@@ -26,9 +26,9 @@ from hilcal.cli.running import (
 )
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import load_config
-from hilcal.design.checked_plan import refuse
 from hilcal.design.next import measure_next
 from hilcal.design.planner import Request
+from hilcal.design.summary import refuse
 from hilcal.diagnosis.diagnosis import Diagnosis, History
 from hilcal.diagnosis.document import to_json
 from hilcal.diagnosis.doubt import in_doubt as left_open

@@ -20,12 +20,11 @@ from hilcal.cli.fitting import (
 from hilcal.cli.options import POSES, catalogue_with, check_seed, command
 from hilcal.cli.terminal import Terminal, terminal
 from hilcal.config import CellConfig, load_config
-from hilcal.design.checked_plan import CheckedPlan, checked, refusal
 from hilcal.design.choice import CRITERIA, canonical
 from hilcal.design.next import Next, PairPower
 from hilcal.design.nominal_model import check_effects
 from hilcal.design.planner import Planned, Request, make
-from hilcal.design.summary import about, remarks, summarise
+from hilcal.design.summary import CheckedPlan, about, checked, refusal, remarks, summarise
 from hilcal.diagnosis.doubt import MOST
 from hilcal.diagnosis.verdict import diagnose
 from hilcal.effects.catalogue import Catalogue

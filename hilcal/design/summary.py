@@ -4,10 +4,12 @@ One value, computed once; terminal, JSON and viewer read it directly, the plan's
 """
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
+from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.design.choice import choose, choose_poses, compound_objective, only, unknown
 from hilcal.design.information import DesignProblem, reading_derivatives
@@ -15,11 +17,14 @@ from hilcal.design.planner import Planned, Say
 from hilcal.design.predicted import predicted
 from hilcal.design.run_order import Confounding, Duration
 from hilcal.effects.protocol import FRAME_ROLES, Role
-from hilcal.errors import CannotAnswerError
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.measuring.dry_run import DryRun, dry_run
 from hilcal.regression.schur import schur_complement
 from hilcal.regression.spectrum import VISIBLE
-from hilcal.store.plan import REFERENCE
+from hilcal.shown import Shown, Tabular
+from hilcal.store.plan import REFERENCE, Plan
 from hilcal.types import Floats
+from hilcal.whole_file import replace_file
 
 COMPARED = ("D", "A", "E", "K", "I")  # all but T-optimality, which needs suspects
 SHARES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)  # budgets of the curve by the plan's; a choice
@@ -375,3 +380,50 @@ def detectable_effects(planned: Planned, config: CellConfig) -> Iterator[Detecta
             least.append(size_m / np.sqrt(apart) if apart > VISIBLE * len(where) else np.inf)
         smallest = float(np.median(least))
         yield DetectableEffect(effect.name, smallest if np.isfinite(smallest) else None)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CheckedPlan(Shown, Tabular):
+    """A plan whose dry run passed, and its summary."""
+
+    plan: Plan  # poses, loads and steps, as a plan file holds them
+    dry: DryRun
+    summary: PlanSummary  # cost, predicted precision and efficiency
+
+    @property
+    def efficiency(self) -> float | None:
+        """Certified lower bound of the efficiency; None without a certificate."""
+        return self.summary.efficiency
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan file, which `hilcal run --plan` takes."""
+        replace_file(path, self.plan.to_json() + "\n")
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the JSON document."""
+        return {
+            **self.summary.to_dict(),
+            "loads": list(self.plan.loads),
+            "load_changes": self.dry.load_changes,
+            "motions": self.dry.motions,
+            "duration_s": self.dry.duration,
+        }
+
+
+def checked(cell: Cell, config: CellConfig, plan: Plan, summary: PlanSummary) -> CheckedPlan:
+    """Check a plan in a dry run, whose remarks come first in the summary."""
+    dry = dry_run(cell, config, plan)
+    refuse(dry, "the plan")
+    remarks = tuple(dict.fromkeys((*dry.remarks, *summary.remarks)))
+    return CheckedPlan(plan, dry, replace(summary, remarks=remarks))
+
+
+def refuse(dry: DryRun, what: str) -> None:
+    """Refuse a plan that did not pass its dry run."""
+    if (found := refusal(dry, what)) is not None:
+        raise found
+
+
+def refusal(dry: DryRun, what: str) -> InputError | None:
+    """Return the same without raising it; None where the plan has passed."""
+    return InputError(f"{what} cannot be run: {dry.first}") if dry.problems else None

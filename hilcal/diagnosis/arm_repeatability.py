@@ -1,7 +1,7 @@
 """Whether an estimated scatter of the arm is of the size of an arm's repeatability."""
 
 from hilcal.diagnosis.effect_ranking import SAME_EVIDENCE
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 from hilcal.robot.arm import Arm
 
 RP_PER_RMS = 2.09

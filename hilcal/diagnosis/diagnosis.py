@@ -19,7 +19,7 @@ from hilcal.diagnosis.separability import Separability
 from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.fit import Fit
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 from hilcal.shown import Shown, Tabular, presenter
 
 Verdict = Literal["adequate", "missing_effect", "ambiguous", "unknown_effect", "noise_misjudged"]

@@ -49,7 +49,7 @@ from hilcal.identification.linearisation import (
     linearise,
     model_columns,
 )
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 from hilcal.regression.evidence import FamilyScore
 
 CHANCE = 0.01

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 from hilcal.diagnosis.pose_constants import pose_constants
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.readings.ranges import angle_name, travel_name
+from hilcal.readings.readings import angle_name, travel_name
 from hilcal.types import Floats
 
 POLYNOMIAL = 3

@@ -8,7 +8,7 @@ import numpy as np
 from hilcal.diagnosis.misfit_breakdown import ROW_ORDER
 from hilcal.identification.linearisation import Linearisation
 from hilcal.model.observe import motion
-from hilcal.readings.ranges import angle_name, travel_name
+from hilcal.readings.readings import angle_name, travel_name
 from hilcal.types import Floats, Ints
 
 HARMONICS = 4

@@ -1,6 +1,6 @@
 """Whether the noise of a fit's readings is correlated along their order, and how far.
 
-The law is that of `readings.serial_noise`. A misfit looks alike where neighbours in the order are
+The law is that of `readings.readings`. A misfit looks alike where neighbours in the order are
 neighbours in joint space, so it is estimated beside all that could be missing. With L the whitening
 of the measurements by the covariance without correlation, B the columns of the model and y their
 residual,
@@ -41,7 +41,7 @@ from hilcal.identification.effect_columns import columns_of_each
 from hilcal.identification.fit import Fit, fit
 from hilcal.model.observe import motion
 from hilcal.readings.covariance import instrument_root
-from hilcal.readings.serial_noise import Clock, SerialNoise
+from hilcal.readings.readings import Clock, SerialNoise
 from hilcal.readings.whitening import Group, arrival_groups, deflection_groups, runs
 from hilcal.regression.schur import inverse_root
 from hilcal.types import Floats, Ints

@@ -67,7 +67,7 @@ from hilcal.diagnosis.noise_verdict import PREDICTABLE, judge_noise
 from hilcal.diagnosis.residual_regression import ResidualRegression
 from hilcal.diagnosis.separability import Separability, separability
 from hilcal.identification.fit import Fit
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 
 NOTHING = History()
 IN_SAMPLE = ("pose", "direction")

@@ -22,9 +22,8 @@ from hilcal.cell import Cell
 from hilcal.identification.fit import Fit
 from hilcal.identification.full_covariance import joint_factors
 from hilcal.model.model import Model
-from hilcal.readings.arm_scatter import ArmScatter, ScatterKind
 from hilcal.readings.covariance import scatter_alone, with_scatter
-from hilcal.readings.readings import Readings
+from hilcal.readings.readings import ArmScatter, Readings, ScatterKind
 from hilcal.readings.whitening import Whitening, covariance_blocks, whitening
 from hilcal.regression.variance_components import (
     BlockRows,

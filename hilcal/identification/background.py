@@ -28,7 +28,7 @@ from hilcal.identification.mixed_fit import (
     mixed_fit_of,
 )
 from hilcal.model.model import Model
-from hilcal.readings.arm_scatter import ArmScatter
+from hilcal.readings.readings import ArmScatter
 from hilcal.types import Floats
 
 MOST_ROWS = 1500

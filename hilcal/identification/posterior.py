@@ -33,8 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.stats import chi2
 
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.ranges import Range
+from hilcal.readings.readings import ArmScatter, Range
 from hilcal.readings.whitening import Mode
 from hilcal.regression.normal_equations import INFORMATION, NULL_SHARE
 from hilcal.regression.schur import schur_complement

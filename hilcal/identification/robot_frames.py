@@ -25,8 +25,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.effects.protocol import FRAME_ROLES
 from hilcal.model.model import Model
-from hilcal.readings.ranges import FULL_TURN
-from hilcal.readings.readings import States
+from hilcal.readings.readings import FULL_TURN, States
 from hilcal.robot import se3
 from hilcal.types import Bools, Floats
 

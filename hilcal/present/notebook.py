@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator
 from functools import singledispatch
 from typing import TYPE_CHECKING
 
-from hilcal.design.checked_plan import CheckedPlan
+from hilcal.design.summary import CheckedPlan
 from hilcal.diagnosis.comparison import Comparison
 from hilcal.diagnosis.diagnosis import Diagnosis
 from hilcal.discovery.discovery import Discovery

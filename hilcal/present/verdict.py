@@ -16,8 +16,7 @@ from hilcal.diagnosis.stepwise_alternatives import Alternative
 from hilcal.diagnosis.wrong_figures import WrongFigure
 from hilcal.identification.full_prediction import disagreement_words
 from hilcal.numbers import few, length, p_equals, sizes
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.serial_noise import SerialNoise
+from hilcal.readings.readings import ArmScatter, SerialNoise
 from hilcal.robot.arm import Arm
 
 MOST_LIKELY, MOST_HIDDEN = 4, 4

@@ -175,7 +175,7 @@ def _of_arrival(readings: Readings, factor: Floats) -> Floats | None:
 
 
 def symmetric_root(covariance: Floats) -> Floats:
-    """S (..., m, m) of covariances, see `serial_noise`."""
+    """S (..., m, m) of covariances, see `readings.readings`."""
     std = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     per = 1.0 / np.where(std > 0, std, 1.0)
     values, vectors = np.linalg.eigh(covariance * per[..., :, None] * per[..., None, :])
@@ -184,7 +184,7 @@ def symmetric_root(covariance: Floats) -> Floats:
 
 
 def instrument_root(readings: Readings, m: int | None = None) -> Floats:
-    """(N, m, m) S of `serial_noise`, of the first m elements: root of all but the arm's scatter."""
+    """(N, m, m) S of `SerialNoise`, of the first m elements: root of all but the arm's scatter."""
     v = readings.covariance if readings.stated is None else readings.stated
     if readings.stated is None and readings.common is not None:
         v = v - readings.common @ np.swapaxes(readings.common, 1, 2)
@@ -197,8 +197,8 @@ def measurement_covariance(
     """(G, L·m, L·m) covariance D C Dᵀ of the measurements of each group, D = [I, −weights].
 
     C, of all its readings, has the blocks V_i, and F_i F_jᵀ for two readings of one arrival; where
-    their noise is correlated, φ S_i C_ij S_jᵀ more, see `serial_noise`. Of groups (G, L) of loaded
-    and (G, U) of unloaded rows.
+    their noise is correlated, φ S_i C_ij S_jᵀ more, see `readings.readings`. Of groups (G, L) of
+    loaded and (G, U) of unloaded rows.
     """
     rows = np.concatenate([loaded, reference], axis=1)
     groups, count = rows.shape

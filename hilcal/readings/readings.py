@@ -1,18 +1,34 @@
-"""States of the arm, and readings of the tracker in them."""
+"""States of the arm, and readings of the tracker in them, with their noise and their ranges.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Literal
+Noise that is correlated along the order of the readings, as of air that moves slowly: a share φ of
+the stated covariance V_i of reading i is not white: with S_i S_iᵀ = V_i,
+
+    e_i = √(1 − φ) w_i + √φ S_i z_i,    Cov(z_i, z_j) = exp(−|t_i − t_j| / τ) 1
+
+w_i independent of covariance V_i, each element of z an Ornstein-Uhlenbeck process. So the stated
+covariance holds for each reading. t is the time of a reading, or its number in the order, where
+z is an AR(1) process with ρ = exp(−1/τ). S_i is the symmetric root of V_i's correlation matrix
+times the standard deviations: neighbours with nearly the same V have nearly the same S, in any
+units. Of V, an estimated scatter of the arm and what targets share in one arrival are left out:
+these are of the arm, and new in each arrival.
+
+Source: Gelb (ed.), *Applied Optimal Estimation* (1974), section 3.8 (exponentially correlated
+noise).
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from hilcal.errors import InputError
-from hilcal.readings.arm_scatter import ArmScatter
-from hilcal.readings.serial_noise import SerialNoise
 from hilcal.shown import Brief, Tabular
 from hilcal.types import Bools, Floats, Ints
 
 ObserverKind = Literal["station", "point", "gauge"]
+ScatterKind = Literal["joints", "each joint", "isotropic"]
+Clock = Literal["time", "order"]
 SAME_POSE = 1e-6  # Commanded joints of one pose agree to this, rad
 
 
@@ -78,6 +94,94 @@ class ObserverName:
     def __str__(self) -> str:
         """Return both."""
         return f"{self.kind} {self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class ArmScatter:
+    """An estimate of the arm's scatter; see `identification.arm_scatter`.
+
+    Attributes:
+        kind: "joints" (one σ for all of them), "each joint" (one σ per joint), or "isotropic" (of
+            the target's position).
+        std: σ of each, rad, or m where isotropic.
+        std_error: their standard uncertainties.
+        size_m: rms over the readings of the 3-D displacement of the target.
+        log_evidence: log odds of this against noise of the instrument that is larger than stated.
+        instrument_factor: by how much the instrument's standard deviations were larger, then.
+        predicted_share: share of the misfit that something recorded predicts on poses left out.
+        predicted_by: the variables that predict it, at most two.
+    """
+
+    kind: ScatterKind
+    std: tuple[float, ...]
+    std_error: tuple[float, ...]
+    size_m: float
+    log_evidence: float
+    instrument_factor: float
+    predicted_share: float = 0.0
+    predicted_by: tuple[str, ...] = ()
+
+    def to_json(self) -> dict[str, object]:
+        """Return the attributes by name, SI."""
+        return asdict(self)
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "ArmScatter":
+        """Return what `to_json` wrote."""
+        given: dict[str, Any] = dict(content)
+        lists = given.keys() & {"std", "std_error", "predicted_by"}
+        return cls(**{**given, **{k: tuple(given[k]) for k in lists}})
+
+
+@dataclass(frozen=True, slots=True)
+class SerialNoise:
+    """An estimate of correlated noise; see `diagnosis.serial_noise`.
+
+    Attributes:
+        clock: what t is: "time", s, or "order", the number of the reading.
+        share: φ, 0 to 1.
+        share_error: its standard uncertainty.
+        length: τ, s or readings.
+        rho: correlation of z between consecutive readings, of the median distance in time.
+        rho_error: its standard uncertainty.
+        log_likelihood_ratio: gain of the restricted log likelihood over white noise, with every
+            effect that the readings could show beside either.
+        proved: whether that is more than chance; False where effects explain the readings as well.
+        instead: what explains them as well, where it is not proved.
+        wider: least and largest factor by which it changes the standard uncertainties of the
+            parameters.
+    """
+
+    clock: Clock
+    share: float
+    share_error: float
+    length: float
+    rho: float
+    rho_error: float
+    log_likelihood_ratio: float
+    proved: bool = True
+    instead: tuple[str, ...] = ()
+    wider: tuple[float, float] = (1.0, 1.0)
+
+    @property
+    def half(self) -> float:
+        """Distance after which half of the correlation is left, s or readings."""
+        return self.length * float(np.log(2.0))
+
+    def correlation(self, t: Floats) -> Floats:
+        """Cov(z_i, z_j) (..., N, N) of readings at t (..., N)."""
+        return np.asarray(np.exp(-np.abs(t[..., :, None] - t[..., None, :]) / self.length))
+
+    def to_json(self) -> dict[str, object]:
+        """Return the attributes by name, and `half`."""
+        return {**asdict(self), "half": self.half}
+
+    @classmethod
+    def from_json(cls, content: Mapping[str, Any]) -> "SerialNoise":
+        """Return what `to_json` wrote."""
+        given: dict[str, Any] = {name: x for name, x in content.items() if name != "half"}
+        lists = given.keys() & {"instead", "wider"}
+        return cls(**{**given, **{name: tuple(given[name]) for name in lists}})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,3 +352,64 @@ class Readings(Tabular):
         visit[order] = np.arange(len(self)) - np.repeat(first, np.diff(np.append(first, len(self))))
         keys[:, 3] = visit
         return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+MARGIN = 0.02  # share of the fitted range by which a reading is beyond it; a choice
+FULL_TURN = 2.0 * np.pi
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Values of one variable in the fitted readings; SI."""
+
+    variable: str
+    unit: str
+    low: float
+    high: float
+
+    def over(self, values: Floats, *, turning: bool = False) -> Floats:
+        """Return by how much values (N,) are outside; zero or less inside."""
+        if not turning:
+            return np.asarray(np.maximum(values - self.high, self.low - values))
+        above = np.mod(values - self.low, FULL_TURN)
+        return np.asarray(np.minimum(above - (self.high - self.low), FULL_TURN - above))
+
+    def beyond(self, values: Floats, *, turning: bool = False) -> Bools:
+        """Which values are outside, by more than `MARGIN` of the range; arguments as of `over`."""
+        allowed = MARGIN * (self.high - self.low) + 1e-9 * max(abs(self.low), abs(self.high), 1.0)
+        return np.asarray(self.over(values, turning=turning) > allowed)
+
+
+def angle_name(joint: int) -> str:
+    """Return the variable of a joint's angle; joints count from 0."""
+    return f"joint {joint + 1} angle"
+
+
+def travel_name(joint: int) -> str:
+    """Return the variable of the travel of a joint that slides; joints count from 0."""
+    return f"joint {joint + 1} travel"
+
+
+def turning_variables(turns: Bools) -> frozenset[str]:
+    """Return the variables that mean the same whole turns on, of joints (n,) that do."""
+    return frozenset(angle_name(j) for j in np.flatnonzero(turns).tolist())
+
+
+def variables(s: States, units: Sequence[str]) -> Iterator[tuple[str, str, Floats]]:
+    """Yield name, unit, and the values (N,) of what a prediction may extrapolate in."""
+    for j, unit in enumerate(units):
+        yield (travel_name if unit == "m" else angle_name)(j), unit, s.q[:, j]
+    for name, unit, part in (("force", "N", slice(0, 3)), ("moment", "N·m", slice(3, 6))):
+        yield name, unit, np.linalg.norm(s.wrench[:, part], axis=1)
+    if s.air_temperature is not None:
+        yield "air temperature", "K", s.air_temperature
+    if s.joint_temperature is not None:
+        for j in range(s.joint_temperature.shape[1]):
+            yield f"joint {j + 1} temperature", "K", s.joint_temperature[:, j]
+
+
+def ranges_of(s: States, units: Sequence[str]) -> tuple[Range, ...]:
+    """Return the ranges of `variables`."""
+    return tuple(
+        Range(name, unit, float(v.min()), float(v.max())) for name, unit, v in variables(s, units)
+    )

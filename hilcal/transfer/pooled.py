@@ -16,7 +16,7 @@ from scipy.stats import norm
 
 from hilcal.errors import CannotAnswerError
 from hilcal.identification.posterior import Posterior, PosteriorEffect, Source
-from hilcal.readings.ranges import Range
+from hilcal.readings.readings import Range
 from hilcal.regression.hierarchy import (
     FALSE_ALARM,
     UNDETERMINED,
