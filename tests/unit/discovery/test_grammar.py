@@ -1,16 +1,32 @@
 """What laws are made of: functions of one variable, quantities, and which are tried."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
 
 from hilcal.discovery import grammar as products
 from hilcal.discovery import shapes
-from hilcal.discovery.amplitudes import Amplitude, Factor, variables
+from hilcal.discovery.amplitudes import Amplitude, Composed, Factor, Variable, composed, variables
+from hilcal.discovery.curve import curves
+from hilcal.discovery.discovery import Discovery, agreement, discover
 from hilcal.discovery.grammar import grammar
 from hilcal.discovery.law import Form, LawPart, effect_class, source_of_form
+from hilcal.discovery.refit import exact, left_by, refine
+from hilcal.discovery.screen import screen
+from hilcal.discovery.shapes import Shape
 from hilcal.discovery.sites import sites
 from hilcal.effects.check import check_effect, example_cell, example_situation, example_states
 from hilcal.effects.force_sensor import recorded
+from hilcal.effects.protocol import Situation
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
+from hilcal.identification.linearisation import linearise
+from hilcal.readings.whitening import whitening
+from hilcal.types import Floats
+from studies.law_scene import scene
+from tests.support.rehearsed import rehearsed
 
 
 def test_every_function_is_an_effect_with_its_derivative() -> None:
@@ -92,3 +108,140 @@ def test_every_quantity_reads_the_same_in_the_written_effect() -> None:
     for v in variables(s):
         read = eval(v.code, {"s": s, "np": np, "recorded": recorded})
         assert np.allclose(read, v.read(s), rtol=1e-12, atol=0), v.names
+
+
+SIGMA = 6.0
+
+
+def example() -> Situation:
+    cell = example_cell()
+    return example_situation(cell, example_states(cell))
+
+
+def named(s: Situation) -> dict[str, Variable]:
+    return {v.symbol: v for v in variables(s)}
+
+
+def product(*factors: Factor) -> Amplitude:
+    return Amplitude(factors)
+
+
+def waved(v: Variable) -> Factor:
+    return Factor(v, shapes.COS, (1.0,))
+
+
+@pytest.mark.parametrize(
+    ("shape", "numbers"),
+    [
+        (shapes.ABOVE, (3.0,)),
+        (shapes.BELOW, (-2.0,)),
+        (shapes.ABOVE_POWER, (-3.0, 1.6)),
+        (shapes.BELOW_POWER, (4.0, 2.3)),
+        (shapes.THRESHOLD, (2.0,)),
+        (shapes.SATURATION, (9.0,)),
+        (shapes.STEP, (-1.0, 7.0)),
+    ],
+)
+def test_a_function_of_a_sum_of_products_is_an_effect_with_its_derivative(
+    shape: Shape, numbers: tuple[float, ...]
+) -> None:
+    known = named(example())
+    u = composed(
+        (
+            (1.0, product(Factor(known["τ_2"], shapes.LINEAR), waved(known["q_5"]))),
+            (-0.7, product(Factor(known["τ_3"], shapes.LINEAR))),
+            (0.03, product(Factor(known["m4_y"], shapes.LINEAR))),
+        )
+    )
+    bent = Factor(u, shape, numbers)
+    places = [p for p in sites(6) if p.takes(True)]
+    form = Form(
+        (
+            LawPart(places[1], product(bent), 0),
+            LawPart(places[9], product(bent, waved(known["q_4"])), 1),
+        )
+    )
+    check_effect(effect_class(source_of_form(form, "tried"), "tried"))
+
+
+def test_a_bend_with_a_fractional_power_has_its_unit_and_its_formula() -> None:
+    known = named(example())
+    u = composed(((1.0, product(Factor(known["τ_2"], shapes.LINEAR), waved(known["q_5"]))),))
+    form = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE_POWER, (5.0, 1.5))), 0),))
+    assert form.text() == "dq_3 = a·max(τ_2·cos(q_5) - 5, 0)^1.5"
+    assert form.latex() == r"\delta q_3 = a\,\max(\tau_2\,\cos(q_5) - 5, 0)^{1.5}"
+    assert form.unit(0) == "rad/((N·m)^1.5)"
+    assert form.variables == ("joint 2 torque", "joint 5 angle")
+    assert form.elastic
+
+
+def test_a_sum_is_written_with_its_weights_and_reads_what_its_products_read() -> None:
+    s = example()
+    known = named(s)
+    u = composed(((1.0, product(waved(known["q_5"]))), (-0.25, product(waved(known["q_6"])))))
+    assert u.symbol == "(cos(q_5) - 0.25·cos(q_6))"
+    assert u.recorded == (known["q_5"], known["q_6"])
+    wanted = np.cos(s.angle[:, 4]) - 0.25 * np.cos(s.angle[:, 5])
+    assert np.allclose(u.read(s), wanted, rtol=1e-12)
+    assert np.allclose(eval(u.code, {"s": s, "np": np}), wanted, rtol=1e-12)
+
+
+@cache
+def campaign() -> tuple[Fit, Floats]:
+    """Deflections with a joint that gives way where two quantities together pass a level."""
+    of = rehearsed(30, seed=11)
+    cell, readings, states = of.cell, of.readings, of.readings.states
+    at = scene(of.world, states)
+    level = at.torque[:, 1] * np.cos(states.q[:, 4])
+    moved = at.of_joint(3, np.maximum(level - np.quantile(level, 0.6), 0.0))
+    w = whitening(readings, "deflection")
+    moved = moved * (SIGMA / np.sqrt(np.mean(w.whiten(w.raw(moved)) ** 2)))
+    readings = replace(readings, value=readings.value + moved)
+    return fit(baseline(cell, readings, "deflection"), readings, "deflection"), moved
+
+
+@cache
+def found() -> Discovery:
+    return discover(campaign()[0], name="beyond")
+
+
+@pytest.mark.long
+def test_a_bend_of_a_product_is_found_with_its_site_and_quantities() -> None:
+    law = found().laws[0]
+    assert law.acts_on == ("joint 3",)
+    assert set(law.variables) == {"joint 2 torque", "joint 5 angle"}
+    assert "max(cos(q_5)·τ_2 - " in law.formula
+    assert {symbol for symbol, *_ in law.ranges} == {"τ_2", "q_5"}
+
+
+@pytest.mark.long
+def test_the_effect_of_a_bend_does_what_was_hidden() -> None:
+    before, moved = campaign()
+    d = found()
+    assert d.after is not None
+    assert agreement(before, d.after, moved) > 0.99
+    assert d.after.variance_factor < 0.5 * before.variance_factor
+    check_effect(effect_class(d.source, "beyond"))
+    drawn = curves(d.after, d.laws[0].form)[0]
+    assert drawn.quantity == "cos(q_5)·τ_2"
+    assert drawn.line[0, 0] < drawn.line[0, -1]
+
+
+def test_levels_weights_and_exponents_are_refined_together() -> None:
+    at = screen(linearise(campaign()[0]))
+    s = at.linear.fit.solution.prediction.situation
+    known = {v.symbol: v for v in at.grammar.known}
+    lever = product(Factor(known["τ_2"], shapes.LINEAR), waved(known["q_5"]))
+    other = product(Factor(known["τ_3"], shapes.LINEAR))
+    u = composed(((1.0, lever), (0.4, other)))
+    level = float(np.quantile(u.read(s), 0.5))
+    begin = Form((LawPart(sites(6)[2], product(Factor(u, shapes.ABOVE, (level,))), 0),))
+    after = refine(at, begin)
+    assert left_by(at, after, s) < 0.5 * left_by(at, begin, s)
+    (bent,) = after.parts[0].amplitude.factors
+    assert isinstance(bent.variable, Composed)
+    ((_, one), (weight, two)) = bent.variable.terms
+    assert (one, two) == (lever, other)
+    assert abs(weight) < 0.1
+    assert bent.numbers != (level,)
+    exact(at, after, "refined")

@@ -1,19 +1,32 @@
 """Probabilities of structures, the Pareto list, and the average: against what is known exactly."""
 
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from hilcal.discovery.discovery import Discovery, alternatives, discovery_json
+from hilcal.discovery import shapes
+from hilcal.discovery.amplitudes import Amplitude, Factor, variables
+from hilcal.discovery.curve import curves
+from hilcal.discovery.discovery import Discovery, alternatives, discover, discovery_json
+from hilcal.discovery.law import Form, LawPart, effect_class
+from hilcal.discovery.problem import SearchProblem
+from hilcal.discovery.screen import LawTerm, Screen
+from hilcal.discovery.search import search
+from hilcal.discovery.sites import sites
 from hilcal.discovery.structures import Structure, averaged, pareto, posterior
+from hilcal.effects.check import check_effect
 from hilcal.errors import CannotAnswerError
+from hilcal.identification.baseline import baseline
+from hilcal.identification.fit import Fit, fit
 from hilcal.identification.residual import residual
 from hilcal.readings.whitening import whitening
 from hilcal.regression.evidence import STRENGTHS, score_family
-from tests.unit.discovery.test_discover import LAW, campaign, found
+from hilcal.robot import se3
+from tests.unit.discovery.test_discover import LAW, campaign, found, screened
 
 
 def test_probabilities_sum_to_one_with_that_of_no_law() -> None:
@@ -147,3 +160,134 @@ def test_the_average_of_one_law_is_its_fit_and_more_laws_spread_it() -> None:
 def test_nothing_is_averaged_without_a_law() -> None:
     with pytest.raises(CannotAnswerError, match="no law was found"):
         Discovery(campaign(LAW), "no_law").average(campaign(LAW).readings)
+
+
+def products(s: Screen, count: int) -> list[tuple[int, int]]:
+    """Sites and products, of which the model explains neither these nor their factors alone."""
+    words = s.grammar
+    seen = s.square > 0
+    out = []
+    rng = np.random.default_rng(3)
+    for f in rng.permutation(np.flatnonzero((words.less >= 0).all(axis=0))).tolist():
+        one, two = words.less[:, f].tolist()
+        places = np.flatnonzero(seen[:, f] & seen[:, one] & seen[:, two])
+        if len(places):
+            out.append((int(rng.choice(places)), f))
+        if len(out) == count:
+            return out
+    raise AssertionError("too few products")
+
+
+def test_a_product_knows_what_is_left_without_either_factor() -> None:
+    words = screened().grammar
+    for _, f in products(screened(), 20):
+        first, second = words.at(f).factors
+        without_first, without_second = words.less[:, f].tolist()
+        assert words.at(without_first) == Amplitude((second,))
+        assert words.at(without_second) == Amplitude((first,))
+    single = words.amplitudes.index(Amplitude((words.singles[0],)))
+    assert words.less[:, single].tolist() == [-1, -1]
+
+
+def test_a_pair_is_found_of_which_neither_part_explains_anything_alone() -> None:
+    """As where a temperature is far from its zero all the time: T d and d are nearly the same."""
+    s = screened()
+    place, f, less, direction = _nearly_alike(s)
+    p = SearchProblem(s)
+    noise = 0.3 * np.random.default_rng(5).standard_normal(len(p.residual))
+    p.residual = p._thin_residual = 40.0 * direction + p.model.project_out(noise)
+    p.rss = float(p.residual @ p.residual)
+    alone = p.beside(()).score([LawTerm(((place, k),), 0.0) for k in (f, less)])
+    assert all(c.score.gain < 0.05 * p.rss for c in alone)
+    best = search(p, most=1)[0].terms[0]
+    x = np.hstack([p.columns(best)])
+    free = p.model.project_out(x)
+    told = free @ np.linalg.lstsq(free, p.residual, rcond=None)[0]
+    assert told @ told > 0.95 * p.rss
+    assert {at for at, _ in best.parts} == {place}
+
+
+def _nearly_alike(s: Screen) -> tuple[int, int, int, np.ndarray]:
+    """A product of a site, a factor of it alone, and the unit direction between their columns."""
+    for place, f in products(s, 1000):
+        for less in s.grammar.less[:, f].tolist():
+            free = s.linear.project_out(s.columns([(place, f), (place, less)]))
+            unit = free / np.linalg.norm(free, axis=0)
+            cosine = float(unit[:, 0] @ unit[:, 1])
+            if 0.8 < abs(cosine) < 0.97 and s.alias[place] == place:
+                between = unit[:, 0] - np.sign(cosine) * unit[:, 1]
+                return place, f, less, between / np.linalg.norm(between)
+    raise AssertionError("no such pair")
+
+
+SHARE = 0.3
+"""Share of what the sensor reads along +z that is not there; it reads the other way rightly."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def short_products() -> None:
+    """All products, other than in the other files of this folder: the law is one of the longer."""
+
+
+@cache
+def misread() -> Fit:
+    """The same arm with nothing hidden, read by a force sensor that is wrong on one side."""
+    of = campaign()
+    assert not of.outlier.any()
+    states = of.readings.states
+    turn = of.solution.prediction.situation.chain.rotation[-1]
+    along = se3.apply(np.swapaxes(turn, 1, 2), states.wrench[:, :3])
+    more = np.zeros_like(along)
+    more[:, 2] = SHARE / (1 - SHARE) * np.maximum(along[:, 2], 0.0)
+    wrench = states.wrench.copy()
+    wrench[:, :3] += se3.apply(turn, more)
+    readings = replace(of.readings, states=replace(states, wrench=wrench))
+    return fit(baseline(of.model.cell, readings, of.mode), readings, of.mode)
+
+
+@cache
+def sensor_law() -> Discovery:
+    return discover(misread())
+
+
+@pytest.mark.long
+def test_a_one_sided_force_sensor_is_found_with_its_size() -> None:
+    d = sensor_law()
+    law = d.laws[0]
+    assert law.acts_on == ("force sensor, force along z",)
+    assert law.variables == ("force sensor force z",)
+    (a,) = law.parameters
+    assert a.unit == "1"
+    assert abs(a.value - SHARE) < 4 * a.std < 0.5 * SHARE
+    assert d.after is not None
+    assert d.after.chi2 < 0.5 * misread().chi2
+
+
+@pytest.mark.long
+def test_what_is_written_is_an_effect_of_the_setup_with_its_derivative() -> None:
+    d = sensor_law()
+    kind = effect_class(d.source, d.laws[0].name)
+    assert kind.of_setup
+    check_effect(kind)
+
+
+@pytest.mark.long
+def test_the_curve_of_the_law_is_drawn_beside_the_readings() -> None:
+    d = sensor_law()
+    assert d.after is not None
+    curve = curves(d.after, d.laws[0].form)[0]
+    assert (curve.of, curve.unit, curve.quantity) == ("sensor_fz", "N", "fS_z")
+    away = (curve.y - SHARE * np.maximum(curve.x, 0.0)) / curve.std
+    assert abs(float(np.mean(away[curve.x > 0]))) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("quantities", "unit"),
+    [(("S_z",), "1"), (("S_z", "S_z"), "1/N"), (("S_x", "t"), "1/s"), (("t",), "N/s")],
+)
+def test_units_of_the_sensors_own_quantities_cancel(quantities: tuple[str, ...], unit: str) -> None:
+    known = variables(misread().solution.prediction.situation)
+    named = {v.symbol.removeprefix("f").partition(" ")[0].strip("("): v for v in known}
+    factors = tuple(Factor(named[q], shapes.LINEAR) for q in quantities)
+    site = next(s for s in sites(6) if s.symbol == "sensor_fz")
+    assert Form((LawPart(site, Amplitude(factors), 0),)).unit(0) == unit

@@ -4,14 +4,33 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from hilcal.config.joints import Conventions, Coupling
 from hilcal.drivers.simulated import truth
-from hilcal.effects.link_compliance import long_links
+from hilcal.effects.links import long_links
+from hilcal.errors import CannotAnswerError, InputError
+from hilcal.identification.baseline import baseline, with_effects
+from hilcal.identification.fit import fit
 from hilcal.model.model import Model
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import robot_names
+from hilcal.robot.chain import evaluate
+from hilcal.robot.conventions import as_counted
+from hilcal.types import Floats
 from tests.support.arm_cases import arm_of
-from tests.support.effect_cases import CELLS, SOFT, make, position, situation, soft, some_states
+from tests.support.campaigns import campaign
+from tests.support.effect_cases import (
+    CELLS,
+    SOFT,
+    TURN,
+    joints,
+    make,
+    position,
+    situation,
+    soft,
+    some_states,
+)
 
 # --- elastic --------------------------------------------------------------------------------
 
@@ -104,3 +123,171 @@ def test_links_that_grow_each_by_their_own_grow_together():
     a, b = position(one, states, np.array([1e-5])), position(each, states, np.full(8, 1e-5))
     np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
     assert [p.name for p in each.effects[0].parameters] == [f"link{k}" for k in range(8)]
+
+
+ODD = CELLS["odd"]
+
+
+def coupled(arm, **factors):
+    """An arm whose joints follow others: j3q2=-1.0 is joint 3 by joint 2."""
+    entries = tuple(
+        Coupling(joint=int(name[1]), follows=int(name[3]), factor=k) for name, k in factors.items()
+    )
+    return as_counted(arm, Conventions(joint_coupling=entries))
+
+
+@pytest.mark.parametrize("given", [{}, {"j3q2": -1.0, "j7q6": 0.5}])
+def test_it_is_what_the_factors_of_the_description_are_off_by(given):
+    """An arm described with other factors stands where the effect says, whatever it is coupled by.
+
+    The factors are those of the controller's values, also where these turn other joints too.
+    """
+    believed = coupled(ODD.arm, **given)
+    k = {"j2q1": 3e-3, "j3q2": -2e-3, "j7q5": 1e-3, "j7q6": -1e-3}
+    true = coupled(ODD.arm, **{p: given.get(p, 0.0) + k.get(p, 0.0) for p in {*k, *given}})
+    cell = replace(ODD, arm=believed)
+    states = some_states(cell)
+    effect = make("joint_coupling", cell, states)
+    theta = np.array([k.get(p.name.replace(".", ""), 0.0) for p in effect.parameters])
+    assert np.count_nonzero(theta) == len(k)
+    chain = Model(cell, (effect,)).predict(states, theta).situation.chain
+    expected = evaluate(true, states.q)
+    np.testing.assert_allclose(chain.position[-1], expected.position[-1], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(chain.rotation[-1], expected.rotation[-1], rtol=0, atol=1e-14)
+
+
+def test_pairs_are_those_of_arms_with_couplings_or_those_that_are_named():
+    states = some_states(ODD)
+    assert make("joint_coupling", ODD, states).options == {"pairs": "2:1/3:2/4:3/5:4/6:5/7:5/7:6"}
+    some = make("joint_coupling", ODD, states, {"pairs": "4:4/ 3:2"})
+    assert some.options == {"pairs": "3:2/4:4"}
+    assert [p.name for p in some.parameters] == ["j3.q2", "j4.q4"]
+    assert some.parameters[1].meaning == "own ratio of joint 4"
+    s = Model(ODD, ()).predict(states, np.zeros(0)).situation
+    twist = some.deviation(np.array([0.1, 0.01]), s).twist
+    expected = np.zeros_like(twist)
+    expected[:, 2, 5], expected[:, 3, 5] = 0.1 * states.q[:, 1], 0.01 * states.q[:, 3]
+    np.testing.assert_allclose(twist, expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize("given", ["", "3", "3:2/3:2", "8:1", "0:1", "3-2", 3.2, None, ["3:2"]])
+def test_other_pairs_are_refused_with_what_would_be_valid(given):
+    with pytest.raises(InputError, match=r"pairs = .*; valid: pairs of joints 1 to 7") as caught:
+        make("joint_coupling", ODD, some_states(ODD), {"pairs": given})
+    assert "\n" not in str(caught.value)
+
+
+def test_hidden_factors_are_estimated_within_their_uncertainty():
+    c = campaign("joint_coupling", "absolute", 0, strength=3.0)
+    names = ("joint_compliance", "joint_coupling")
+    found = fit(with_effects(c.cell, c.readings, "absolute", names), c.readings, "absolute")
+    z = [
+        (p.value - c.world.truth[p.name]) / p.std
+        for p in found.parameters
+        if p.name.startswith("joint_coupling")
+    ]
+    assert len(z) == 6
+    assert np.sqrt(np.mean(np.square(z))) < 2.0  # chi-square of 6: 24 has a chance of 5e-4
+    assert (
+        found.variance_factor
+        < 1.2
+        < fit(baseline(c.cell, c.readings, "absolute"), c.readings, "absolute").variance_factor
+    )
+
+
+def acting(wrench: Floats, flange: Floats, name: str, theta: Floats, turn: Floats) -> Floats:
+    """What acts where a sensor says `wrench`, state by state: said = error(true) in its axes."""
+    out = np.zeros_like(wrench)
+    for i, w in enumerate(wrench):
+        if not np.any(w):
+            continue
+        r = flange[i] @ Rotation.from_rotvec(turn).as_matrix()
+        said = np.concatenate([r.T @ w[:3], r.T @ w[3:]])
+        if name == "wrench_bias":
+            true = said - theta
+        elif name == "wrench_gain":
+            true = said / (1 + theta)
+        else:
+            mounted = Rotation.from_rotvec(theta).as_matrix()
+            true = np.concatenate([mounted @ said[:3], mounted @ said[3:]])
+        out[i] = np.concatenate([r @ true[:3], r @ true[3:]])
+    return out
+
+
+ERRORS = {
+    "wrench_bias": np.array([2.0, -1.0, 3.0, 0.3, -0.2, 0.1]),
+    "wrench_gain": np.array([0.03, -0.02, 0.01, 0.02, -0.04, 0.01]),
+    "sensor_misalignment": np.array([0.03, -0.02, 0.04]),
+}
+
+
+@pytest.mark.parametrize("options", [{}, {"rotvec_rad": TURN}], ids=["flange", "turned"])
+@pytest.mark.parametrize("name", ERRORS)
+def test_a_sensor_that_misreads_is_the_same_as_another_load(name, options):
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    model = soft(cell, states, name, options)
+    theta = ERRORS[name]
+    found = model.predict(states, np.concatenate([joints(cell), theta]))
+    turn = np.array(options.get("rotvec_rad", [0.0, 0.0, 0.0]))
+    other = acting(states.wrench, found.situation.chain.rotation[-1], name, theta, turn)
+    plain = Model(cell, model.effects[:1])
+    expected = plain.predict(replace(states, wrench=other), joints(cell))
+    np.testing.assert_allclose(
+        found.observation.position, expected.observation.position, rtol=0, atol=1e-12
+    )
+    np.testing.assert_allclose(found.situation.load.wrench, other, rtol=0, atol=1e-10)
+    believed = plain.predict(states, joints(cell)).observation.position
+    away = np.linalg.norm(found.observation.position - believed, axis=1)
+    loaded = np.any(states.wrench != 0, axis=1)
+    assert away[loaded].min() > 1e-6
+    assert away[~loaded].max() == 0.0
+
+
+def test_a_load_that_only_turns_is_a_load_too():
+    """A state counts as unloaded only where force and moment are exactly zero."""
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    states = replace(states, wrench=np.tile([0.0, 0, 0, 0, 0, 1e-9], (len(states), 1)))
+    model = soft(cell, states, "wrench_bias")
+    bias = np.array([5.0, 0, 0, 0, 0, 0])
+    moved = position(model, states, joints(cell), bias) - position(
+        model, states, joints(cell), 0 * bias
+    )
+    assert np.linalg.norm(moved, axis=1).min() > 1e-6
+
+
+def test_a_gain_that_no_sensor_has_is_said_in_words():
+    cell = CELLS["ur10e"]
+    states = some_states(cell)
+    model = soft(cell, states, "wrench_gain")
+    with pytest.raises(CannotAnswerError, match=r"wrench_gain: a gain error of -120 %") as caught:
+        position(model, states, joints(cell), np.array([0, 0, -1.2, 0, 0, 0]))
+    assert "\n" not in str(caught.value)
+
+
+def test_changes_of_the_load_add():
+    """Load point, weights and sensor together are the load that they make together."""
+    cell = CELLS["odd"]
+    states = some_states(cell)
+    names = ("joint_compliance", "load_point", "link_mass", "wrench_bias", "wrench_gain")
+    model = Model(cell, tuple(make(n, cell, states) for n in names))
+    rng = np.random.default_rng(3)
+    shift, moments = rng.normal(size=3) * 0.02, rng.normal(size=(7, 3)) * 0.05
+    bias, gain = ERRORS["wrench_bias"], ERRORS["wrench_gain"]
+    theta = np.concatenate([joints(cell), shift, moments.ravel(), bias, gain])
+    found = model.predict(states, theta)
+    flange = found.situation.chain.rotation[-1]
+    no_turn = np.zeros(3)
+    parts = [
+        acting(states.wrench, flange, name, ERRORS[name], no_turn) - states.wrench
+        for name in names[3:]
+    ]
+    other = replace(
+        cell,
+        load_point=cell.load_point + shift,
+        arm=replace(cell.arm, coms=cell.arm.coms + moments / cell.arm.masses[:, None]),
+    )
+    plain = Model(other, (make("joint_compliance", other, states),))
+    expected = position(plain, replace(states, wrench=states.wrench + sum(parts)), joints(cell))
+    np.testing.assert_allclose(found.observation.position, expected, rtol=0, atol=1e-12)

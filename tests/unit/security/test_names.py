@@ -534,7 +534,7 @@ def _made(tmp_path_factory: pytest.TempPathFactory):
     from hilcal.discovery.amplitudes import Factor
     from hilcal.discovery.law import Form, LawPart
     from hilcal.discovery.sites import sites
-    from tests.unit.discovery.test_composed import example, named, product
+    from tests.unit.discovery.test_grammar import example, named, product
 
     FOLDER.append(tmp_path_factory.mktemp("names"))
     linear = product(Factor(named(example())["τ_2"], shapes.LINEAR))
