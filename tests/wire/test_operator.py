@@ -92,12 +92,12 @@ def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "lacks socket"),
-        ({"socket": 3}, "lacks socket"),
-        ({"socket": "x", "hand_s": -1}, "hand_s = -1; valid"),
-        ({"socket": "x", "hand_s": True}, "hand_s = True; valid"),
-        ({"socket": "x", "hands": 2}, "no key 'hands'"),
-        ({"socket": "x", "person": "me"}, "person = 'me'; valid: true or false"),
+        ({}, 'lacks "socket": .* where the simulated operator lives'),
+        ({"socket": 3}, "socket = 3 is not valid"),
+        ({"socket": "x", "hand_s": -1}, "hand_s = -1 is not valid: .*0 to 3600"),
+        ({"socket": "x", "hand_s": True}, "hand_s = .rue is not valid"),
+        ({"socket": "x", "hands": 2}, 'no .*key "hands"'),
+        ({"socket": "x", "person": "me"}, "person = .me. is not valid: .*true"),
     ],
 )
 def test_wrong_options_of_the_simulated_person_are_refused(options, message):
