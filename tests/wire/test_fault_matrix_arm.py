@@ -13,6 +13,8 @@ from hilcal.types import Floats
 from tests.support.campaign_cases import (
     Act,
     Fault,
+    Run,
+    Site,
     act,
     begin,
     cell,
@@ -26,8 +28,6 @@ from tests.support.campaign_cases import (
     right,
     stopped_on_its_way,
 )
-from tests.support.campaign_run import Run
-from tests.support.campaign_site import Site
 
 pytestmark = pytest.mark.long
 

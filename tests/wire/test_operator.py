@@ -20,8 +20,7 @@ from hilcal.drivers.terminal_operator import open_operator as open_terminal
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring import devices
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
-from tests.support.campaign_site import Site
+from tests.support.campaign_cases import STARVED, Site, cell, nothing_goes_on
 from tests.support.cli_cases import Capsys, run
 from tests.support.living_cell import config
 from tests.support.paths import ROOT
