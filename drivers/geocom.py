@@ -29,14 +29,7 @@ from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import (
-    Clock,
-    Report,
-    Row,
-    TargetLostError,
-    TrackerSample,
-    report_of,
-)
+from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats
@@ -52,9 +45,7 @@ UNKNOWN = frozenset({5, 27, 3081})
 """Not implemented, not available, no such request: this instrument does without it."""
 BUSY = frozenset({13, 1293})
 """Another process inside the instrument is at work; ask again a little later."""
-GARBLED = frozenset(
-    {3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102},
-)
+GARBLED = frozenset({3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102})
 """Request or reply were damaged or out of step on the line; ask again after draining it."""
 
 WARNINGS = {

@@ -8,11 +8,7 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring.connect import Setup
-from hilcal.measuring.devices import (
-    PointingTracker,
-    TargetLostError,
-    WrenchSample,
-)
+from hilcal.measuring.devices import PointingTracker, TargetLostError, WrenchSample
 from hilcal.measuring.measure import MeasuredStop, Measurer
 from hilcal.measuring.progress import Remark
 from hilcal.readings.covariance import joint_scatter

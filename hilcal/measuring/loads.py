@@ -9,11 +9,7 @@ from hilcal.cell import Cell
 from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
-from hilcal.measuring.devices import (
-    ConfirmingOperator,
-    TerminalPerson,
-    WrongLoadError,
-)
+from hilcal.measuring.devices import ConfirmingOperator, TerminalPerson, WrongLoadError
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import Answered, Phase, Question, Remark

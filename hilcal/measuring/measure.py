@@ -32,12 +32,7 @@ from scipy import stats
 
 from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Setup
-from hilcal.measuring.devices import (
-    ArmSample,
-    TargetLostError,
-    TrackerSample,
-    WrenchSample,
-)
+from hilcal.measuring.devices import ArmSample, TargetLostError, TrackerSample, WrenchSample
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import POLL_S, Mover
 from hilcal.measuring.progress import Remark
@@ -268,10 +263,7 @@ class Measurer:
         self._config, self._clock, self._watcher = setup.config, setup.clock, setup.watcher
 
     def measure(
-        self,
-        name: str,
-        find: Callable[[], None] | None = None,
-        force: WrenchSample | None = None,
+        self, name: str, find: Callable[[], None] | None = None, force: WrenchSample | None = None
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 

@@ -359,13 +359,7 @@ class Soak:
         self.counts[f"fault: {fault.name}"] += 1
 
     def _meets(
-        self,
-        run: Run,
-        faults: tuple[Fault, ...],
-        goal: object,
-        *,
-        exact: bool,
-        undo: bool = True,
+        self, run: Run, faults: tuple[Fault, ...], goal: object, *, exact: bool, undo: bool = True
     ) -> str:
         since = self.site.now()
         self._met = ", ".join(fault.name for fault in faults)

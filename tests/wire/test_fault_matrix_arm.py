@@ -74,11 +74,7 @@ def alone(op: str, **arguments: object) -> Act:
 
 MOTION = (
     Fault(
-        "protective stop",
-        arm("protective_stop"),
-        unlock,
-        ("protective stop", "unlock"),
-        fast=True,
+        "protective stop", arm("protective_stop"), unlock, ("protective stop", "unlock"), fast=True
     ),
     Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),
