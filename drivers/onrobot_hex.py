@@ -14,13 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import (
-    ByDeviceClock,
-    FrameFormat,
-    SensorFormat,
-    checked_config,
-    open_streaming,
-)
+from hilcal.drivers import force_stream as fs
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
@@ -36,7 +30,7 @@ def _checksum(frame: bytes) -> bytes:
     return (sum(frame) & 0xFFFF).to_bytes(2, "big")
 
 
-def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFormat:
+def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> fs.SensorFormat:
     unit = 1.0 / np.repeat((counts_per_N, counts_per_Nm), 3)
 
     def overload(wrench: Floats, status: int) -> str:
@@ -46,8 +40,10 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFor
             return f"the {NAME} is loaded over its range; take the load off"
         return ""
 
-    frame = FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
-    return SensorFormat(NAME, frame, _BODY, unit, lambda: ByDeviceClock(1.0 / rate, 16), overload)
+    frame = fs.FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
+    return fs.SensorFormat(
+        NAME, frame, _BODY, unit, lambda: fs.ByDeviceClock(1.0 / rate, 16), overload
+    )
 
 
 class HexOptions(Section):
@@ -60,6 +56,6 @@ class HexOptions(Section):
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor] and wait for the first frame."""
-    section = checked_config(config, tuple(HexOptions.model_fields))
+    section = fs.checked_config(config, tuple(HexOptions.model_fields))
     o = check_section(dict(section.options), HexOptions, "[force_sensor] options")
-    return open_streaming(section, BAUD, _sensor(o.counts_per_N, o.counts_per_Nm, o.rate_hz))
+    return fs.open_streaming(section, BAUD, _sensor(o.counts_per_N, o.counts_per_Nm, o.rate_hz))
