@@ -8,14 +8,7 @@ the status: 0 skipped samples, 1 over range, 2 invalid measurement, 3 raw values
 import numpy as np
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import (
-    ByDeviceClock,
-    FrameFormat,
-    SensorFormat,
-    checked_config,
-    crc_x25,
-    open_streaming,
-)
+from hilcal.drivers import force_stream as fs
 from hilcal.measuring.devices import ForceSensorDevice
 from hilcal.types import Floats
 
@@ -35,18 +28,18 @@ def _overload(wrench: Floats, status: int) -> str:
     return ""
 
 
-SENSOR = SensorFormat(
+SENSOR = fs.SensorFormat(
     name="Bota sensor",
-    frame=FrameFormat(b"\xaa", 37, lambda frame: crc_x25(frame[1:]).to_bytes(2, "little")),
+    frame=fs.FrameFormat(b"\xaa", 37, lambda frame: fs.crc_x25(frame[1:]).to_bytes(2, "little")),
     body=np.dtype(
         [("status", "<u2"), ("wrench", "<f4", 6), ("ticks", "<u4"), ("temperature", "<f4")]
     ),
     unit=np.ones(6),
-    losses=lambda: ByDeviceClock(1e-6, 32),
+    losses=lambda: fs.ByDeviceClock(1e-6, 32),
     overload=_overload,
 )
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor] and wait for the first frame."""
-    return open_streaming(checked_config(config), BAUD, SENSOR)
+    return fs.open_streaming(fs.checked_config(config), BAUD, SENSOR)

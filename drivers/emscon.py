@@ -25,14 +25,7 @@ from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers import emscon_packets as es
 from hilcal.drivers.links import network_failures, own_axes
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import (
-    Clock,
-    Report,
-    Row,
-    TargetLostError,
-    TrackerSample,
-    report_of,
-)
+from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import tracker_covariance, tracker_noise
 from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
@@ -55,8 +48,7 @@ class EmsconOptions(Section):
     """[tracker.options]: keys of the driver "emscon"."""
 
     target: Literal["position", "pose"] = Field(
-        "position",
-        description='"position" (a reflector) or "pose" (a 6-D target: T-Probe, T-Mac)',
+        "position", description='"position" (a reflector) or "pose" (a 6-D target: T-Probe, T-Mac)'
     )
     reflector: str | None = Field(
         None,

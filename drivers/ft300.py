@@ -18,17 +18,8 @@ import numpy as np
 import serial
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import (
-    DEVICE,
-    ByArrival,
-    ForceStream,
-    FrameFormat,
-    SensorFormat,
-    checked_config,
-    crc_modbus,
-    serial_port,
-    streaming,
-)
+from hilcal.drivers import force_stream as fs
+from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
@@ -97,20 +88,20 @@ def _overload(wrench: Floats, status: int) -> str:
     )
 
 
-SENSOR = SensorFormat(
+SENSOR = fs.SensorFormat(
     name="Robotiq FT 300",
-    frame=FrameFormat(b"\x20\x4e", 16, lambda frame: crc_modbus(frame).to_bytes(2, "little")),
+    frame=fs.FrameFormat(b"\x20\x4e", 16, lambda frame: fs.crc_modbus(frame).to_bytes(2, "little")),
     body=np.dtype([("wrench", "<i2", 6)]),
     unit=1.0 / np.repeat((100.0, 1000.0), 3),
-    losses=lambda: ByArrival(RATE_HZ),
+    losses=lambda: fs.ByArrival(RATE_HZ),
     overload=_overload,
 )
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor], ask who is there, and start the stream."""
-    section = checked_config(config)
-    path = serial_port(section)
+    section = fs.checked_config(config)
+    path = fs.serial_port(section)
     port = open_port(DEVICE, path, section.baud or BAUD, timeout=0.1)
     try:
         with line_failures(DEVICE, path):
@@ -121,8 +112,8 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         raise
     name = f"{SENSOR.name}, serial number {number}"
     facts = (("firmware", firmware),)
-    stream = ForceStream(port, SENSOR, name, facts, before_close=lambda: _end(port))
-    return streaming(stream, FIRST_FRAME_S)
+    stream = fs.ForceStream(port, SENSOR, name, facts, before_close=lambda: _end(port))
+    return fs.streaming(stream, FIRST_FRAME_S)
 
 
 def _begin(port: serial.Serial) -> tuple[str, str]:

@@ -29,43 +29,23 @@ from hilcal.config import CellConfig
 from hilcal.config.cell import Tracker as TrackerConfig
 from hilcal.drivers.links import close_port, drain, line_failures, open_port
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import (
-    Clock,
-    Report,
-    Row,
-    TargetLostError,
-    TrackerSample,
-    report_of,
-)
+from hilcal.measuring.devices import Clock, Report, Row, TargetLostError, TrackerSample, report_of
 from hilcal.readings.covariance import TrackerNoise, tracker_covariance
 from hilcal.toml import NonNegative, Positive, Section, check_section
 from hilcal.types import Floats
 
-NULL = 0
-GEOCOM_VERSION = 110
-DO_MEASURE = 2008
-FACE = 2026
-GET_ATMOSPHERE = 2029
-FULL_MEASUREMENT = 2167
-SERIAL_NUMBER = 5003
-NAME = 5004
-FIRMWARE = 5034
-POWER = 5039
-LOCK_IN = 9013
-TURN = 9027
-LOCK_STATE = 9021
-FINE_ADJUST = 9037
-MEASURE_DISTANCE_ANGLE = 17017
-SEARCH = 17020
+NULL, GEOCOM_VERSION, DO_MEASURE, FACE = 0, 110, 2008, 2026
+GET_ATMOSPHERE, FULL_MEASUREMENT = 2029, 2167
+SERIAL_NUMBER, NAME, FIRMWARE, POWER = 5003, 5004, 5034, 5039
+LOCK_IN, LOCK_STATE, TURN, FINE_ADJUST = 9013, 9021, 9027, 9037
+MEASURE_DISTANCE_ANGLE, SEARCH = 17017, 17020
 
 OK = 0
 UNKNOWN = frozenset({5, 27, 3081})
 """Not implemented, not available, no such request: this instrument does without it."""
 BUSY = frozenset({13, 1293})
 """Another process inside the instrument is at work; ask again a little later."""
-GARBLED = frozenset(
-    {3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102},
-)
+GARBLED = frozenset({3073, 3074, 3076, 3078, 3080, 3082, 3085, 3087, 3093, 3094, 3101, 3102})
 """Request or reply were damaged or out of step on the line; ask again after draining it."""
 
 WARNINGS = {

@@ -20,16 +20,9 @@ import numpy as np
 from pydantic import Field
 
 from hilcal.config import CellConfig
-from hilcal.config.sections import Whole
-from hilcal.drivers.force_stream import (
-    DEVICE,
-    ByDeviceClock,
-    ForceStream,
-    FrameFormat,
-    SensorFormat,
-    checked_config,
-    streaming,
-)
+from hilcal.config.rig import Whole
+from hilcal.drivers import force_stream as fs
+from hilcal.drivers.force_stream import DEVICE
 from hilcal.drivers.links import address, network_failures
 from hilcal.errors import DeviceError
 from hilcal.measuring.devices import ForceSensorDevice
@@ -183,7 +176,7 @@ def _number(words: str, *names: str) -> float:
     return number if np.isfinite(number) and number > 0.0 else 0.0
 
 
-def sensor_format(words: str, options: NetFtOptions, where: str) -> SensorFormat:
+def sensor_format(words: str, options: NetFtOptions, where: str) -> fs.SensorFormat:
     """Return what the sensor sends, by its page."""
     counts = [_number(words, name) for name in ("cfgcpf", "cfgcpt")]
     names = [_value(words, f"s{name}", name) for name in ("cfgfu", "cfgtu")]
@@ -202,21 +195,21 @@ def sensor_format(words: str, options: NetFtOptions, where: str) -> SensorFormat
             f"{DEVICE} at {where}: its page does not tell its rate; give [force_sensor.options] "
             "rate_hz, records per second"
         )
-    return SensorFormat(
+    return fs.SensorFormat(
         name=_value(words, "prodname") or "ATI Net F/T",
-        frame=FrameFormat(b"", RECORD, lambda record: b""),
+        frame=fs.FrameFormat(b"", RECORD, lambda record: b""),
         body=np.dtype(
             [("ticks", ">u4"), ("number", ">u4"), ("status", ">u4"), ("wrench", ">i4", 6)]
         ),
         unit=np.repeat([units[0] / counts[0], units[1] / counts[1]], 3),
-        losses=lambda: ByDeviceClock(1.0 / rate, 32),
+        losses=lambda: fs.ByDeviceClock(1.0 / rate, 32),
         overload=_overload,
     )
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Read the sensor's page, ask it to send, and wait for the first record."""
-    section = checked_config(config, tuple(NetFtOptions.model_fields))
+    section = fs.checked_config(config, tuple(NetFtOptions.model_fields))
     options = check_section(section.options, NetFtOptions, "[force_sensor] options")
     host, port = address("[force_sensor]", "netft", section.host, PORT)
     words = page(host, options.web_port)
@@ -234,6 +227,6 @@ def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
         )
     line = Datagrams(host, port)
     known = tuple((what, told) for what, told in facts if told)
-    return streaming(
-        ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
+    return fs.streaming(
+        fs.ForceStream(line, sensor, facts=known, deframer=line, failures=network_failures)
     )

@@ -10,25 +10,19 @@ stands in each sensor's own sheet, so the configuration has to give it:
     options = { counts_per_N = 50.0, counts_per_Nm = 2000.0, rate_hz = 1000.0 }
 """
 
-from typing import Any
-
 import numpy as np
+from pydantic import Field
 
 from hilcal.config import CellConfig
-from hilcal.drivers.force_stream import (
-    ByDeviceClock,
-    FrameFormat,
-    SensorFormat,
-    checked_config,
-    open_streaming,
-)
-from hilcal.errors import InputError
+from hilcal.drivers import force_stream as fs
 from hilcal.measuring.devices import ForceSensorDevice
+from hilcal.toml import Positive, Section, check_section
 from hilcal.types import Floats
 
 BAUD = 1_000_000
 FULL_COUNT = 32767
 NAME = "OnRobot HEX"
+_SHEET = "a number over 0, from the sensor's own sheet"
 _BODY = np.dtype([("ticks", ">u2"), ("status", ">u2"), ("wrench", ">i2", 6)])
 
 
@@ -36,7 +30,7 @@ def _checksum(frame: bytes) -> bytes:
     return (sum(frame) & 0xFFFF).to_bytes(2, "big")
 
 
-def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFormat:
+def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> fs.SensorFormat:
     unit = 1.0 / np.repeat((counts_per_N, counts_per_Nm), 3)
 
     def overload(wrench: Floats, status: int) -> str:
@@ -46,22 +40,22 @@ def _sensor(counts_per_N: float, counts_per_Nm: float, rate: float) -> SensorFor
             return f"the {NAME} is loaded over its range; take the load off"
         return ""
 
-    frame = FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
-    return SensorFormat(NAME, frame, _BODY, unit, lambda: ByDeviceClock(1.0 / rate, 16), overload)
+    frame = fs.FrameFormat(b"\xaa\x07\x08\x10", 22, _checksum, weak=True)
+    return fs.SensorFormat(
+        NAME, frame, _BODY, unit, lambda: fs.ByDeviceClock(1.0 / rate, 16), overload
+    )
+
+
+class HexOptions(Section):
+    """[force_sensor.options]: keys of the driver "hex"."""
+
+    counts_per_N: Positive = Field(description=_SHEET)
+    counts_per_Nm: Positive = Field(description=_SHEET)
+    rate_hz: Positive = Field(1000.0, description="records per second, over 0")
 
 
 def open_force_sensor(config: CellConfig) -> ForceSensorDevice:
     """Open the port of [force_sensor] and wait for the first frame."""
-    section = checked_config(config, ("counts_per_N", "counts_per_Nm", "rate_hz"))
-    given = {"rate_hz": 1000.0, **section.options}
-    values = []
-    for name in ("counts_per_N", "counts_per_Nm", "rate_hz"):
-        value: Any = given.get(name)
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not number or not 0.0 < float(value) < 1e9:
-            raise InputError(
-                f'[force_sensor] options: driver "{section.driver}" needs {name}, a number over 0 '
-                "(see the sensor's own sheet)"
-            )
-        values.append(float(value))
-    return open_streaming(section, BAUD, _sensor(*values))
+    section = fs.checked_config(config, tuple(HexOptions.model_fields))
+    o = check_section(dict(section.options), HexOptions, "[force_sensor] options")
+    return fs.open_streaming(section, BAUD, _sensor(o.counts_per_N, o.counts_per_Nm, o.rate_hz))

@@ -144,23 +144,20 @@ class SimulatedArm:
         """Return what the controller knows now; currents and tool forces are zero."""
         now = self._ask("sample")
         still = np.zeros(len(now["q"]))
+        names = ("q", "q_target", "qd", "joint_temperature", "payload_com")
         return ArmSample(
             host_ns=time.monotonic_ns(),
             timestamp=float(now["timestamp"]),
-            q=np.array(now["q"]),
-            q_target=np.array(now["q_target"]),
-            qd=np.array(now["qd"]),
             target_moment=np.array(now["torque"]),
             current=still,
             target_current=still,
-            joint_temperature=np.array(now["joint_temperature"]),
             tcp_pose=np.array(now["flange"]),
             tcp_force=np.zeros(6),
             ft_raw_wrench=None,
             payload=float(now["payload"]),
-            payload_com=np.array(now["payload_com"]),
             speed_scaling=1.0,
             safety=str(now["safety"]),
+            **{name: np.array(now[name]) for name in names},
         )
 
     def take_control(self, mass: float, com: Floats) -> None:

@@ -119,43 +119,22 @@ class Draw:
         return np.asarray(size[:, None] * [1.0, 1.3] * rng.uniform(0.5, 1.5, (len(which), 2)))
 
 
-DEFLECTION_EFFECTS = (
-    "joint_compliance",
-    "joint_tilt_compliance",
-    "base_compliance",
-    "link_compliance",
-    "joint_stiffening",
-    "hysteresis",
-    "load_point",
-    "tracker_drift",
-    "tool_compliance",
-    "periodic_joint_compliance",
-    "backlash",
-    "creep",
-    "wrench_bias",
-    "wrench_gain",
-    "sensor_misalignment",
+_SHOWN_BY_DEFLECTIONS = (
+    "joint_compliance joint_tilt_compliance base_compliance link_compliance joint_stiffening "
+    "hysteresis load_point tracker_drift tool_compliance periodic_joint_compliance backlash creep "
+    "wrench_bias wrench_gain sensor_misalignment"
 )
+_OTHERS = (
+    "encoder_offset joint_coupling transmission_error link_geometry target_offset base_frame "
+    "thermal_growth thermal_joint_drift link_mass tracker_scale"
+)
+DEFLECTION_EFFECTS = tuple(_SHOWN_BY_DEFLECTIONS.split())
 """Effects that a deflection shows; the others cancel in it to first order.
 
 What changes with temperature changes little from an unloaded reading to the loaded ones that
 follow it; a scale of parts in a million changes a deflection by as little.
 """
-
-EFFECTS = (
-    *DEFLECTION_EFFECTS,
-    "encoder_offset",
-    "joint_coupling",
-    "transmission_error",
-    "link_geometry",
-    "target_offset",
-    "base_frame",
-    "thermal_growth",
-    "thermal_joint_drift",
-    "link_mass",
-    "tracker_scale",
-)
-"""Every effect that can be hidden in any arm."""
+EFFECTS = (*DEFLECTION_EFFECTS, *_OTHERS.split())  # all that can be hidden in any arm
 OF_SLIDES = ("guide_error",)  # those that only arms with joints that slide have
 ALL_EFFECTS = (*EFFECTS, *OF_SLIDES)  # every effect that can be hidden
 

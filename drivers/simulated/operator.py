@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, Strict
 
 from hilcal.config import CellConfig, CellLoad
 from hilcal.drivers.simulated import admin
 from hilcal.drivers.terminal_operator import TerminalOperator
-from hilcal.errors import DeviceError, InputError
+from hilcal.errors import DeviceError
 from hilcal.measuring.devices import Clock, Report
+from hilcal.toml import Section, check_section
 
 HAND_S = 20.0  # time that a person takes to change a load, s
-
-_OPTIONS = ("socket", "hand_s", "person")
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,29 +63,27 @@ class SimulatedOperator:
         """Nothing to give back."""
 
 
-def open_operator(config: CellConfig) -> SimulatedOperator:
-    """Return the simulated operator of a configuration.
+class SimulatedPersonOptions(Section):
+    """[operator.options]: keys of the driver "simulated"."""
 
-    Its [operator] options are `socket`, the world's admin socket, `hand_s`, how long a change of a
-    load takes, s of cell time, and `person`: true where it is left to the person at the terminal.
-    """
-    options = config.operator.options
-    for key in options:
-        if key not in _OPTIONS:
-            raise InputError(
-                f"[operator] options has no key {key!r} for the simulated operator; "
-                f"valid: {', '.join(_OPTIONS)}"
-            )
-    socket, hand = options.get("socket"), options.get("hand_s", HAND_S)
-    if not isinstance(socket, str) or not socket:
-        raise InputError(
-            "[operator] options lacks socket: the simulated operator lives in a simulated cell "
-            '(hilcal demo); with a real one use driver = "terminal"'
-        )
-    if isinstance(hand, bool) or not isinstance(hand, int | float) or not 0 <= hand <= 3600:
-        raise InputError(f"[operator] options hand_s = {hand!r}; valid: a time in s, 0 to 3600")
-    person = options.get("person", False)
-    if not isinstance(person, bool):
-        raise InputError(f"[operator] options person = {person!r}; valid: true or false")
-    asked = TerminalOperator(config) if person else None
-    return SimulatedOperator(Path(socket), float(hand), Clock(config.simulation.clock), asked)
+    socket: str = Field(
+        min_length=1,
+        description="the admin socket of a simulated cell, where the simulated operator lives "
+        '(hilcal demo); with a real one use driver = "terminal"',
+    )
+    hand_s: Annotated[float, Strict(), Field(ge=0, le=3600)] = Field(
+        HAND_S, description="how long a change of the load takes in s of cell time, 0 to 3600"
+    )
+    person: Annotated[bool, Strict()] = Field(
+        False, description="true where loads are left to the person at the terminal, or false"
+    )
+
+
+def open_operator(config: CellConfig) -> SimulatedOperator:
+    """Return the simulated operator of a configuration."""
+    options = check_section(
+        dict(config.operator.options), SimulatedPersonOptions, "[operator] options"
+    )
+    asked = TerminalOperator(config) if options.person else None
+    clock = Clock(config.simulation.clock)
+    return SimulatedOperator(Path(options.socket), options.hand_s, clock, asked)

@@ -193,17 +193,9 @@ class PtyPort:
 
     def state(self) -> dict[str, Any]:
         """Return the counters and faults."""
-        return {
-            "sent": self.sent,
-            "dropped": self.dropped,
-            "waiting": self._waiting,
-            "plugged": self.plugged,
-            "baud": self.baud,
-            "client_baud": self._client_baud(),
-            "flip": self.flip,
-            "cut": self.cut,
-            "mute": self.mute,
-        }
+        names = ("sent", "dropped", "plugged", "baud", "flip", "cut", "mute")
+        state = {name: getattr(self, name) for name in names}
+        return {**state, "waiting": self._waiting, "client_baud": self._client_baud()}
 
     def _absorb(self) -> None:
         """Take in what the client did: packet mode puts a status byte before its data.

@@ -10,15 +10,8 @@ import numpy as np
 
 from hilcal.cell import Cell, cell_from_config
 from hilcal.config import CellConfig
+from hilcal.drivers.simulated import injected_effects as injected
 from hilcal.drivers.simulated.cell_processes import SimulatedCell
-from hilcal.drivers.simulated.injected_effects import (
-    ALL_EFFECTS,
-    DEFLECTION_EFFECTS,
-    OF_SLIDES,
-    hide,
-    nothing_hidden,
-    softened,
-)
 from hilcal.drivers.simulated.own_law import own_law, own_names
 from hilcal.drivers.simulated.truth import warm_up
 from hilcal.drivers.simulated.world import SimulatedNoise, World
@@ -42,12 +35,12 @@ REGISTRATION_ROTVEC = (0.0, 0.0, 2.1)
 
 def choices() -> tuple[str, ...]:
     """Effects that can be hidden: all that the world has; every arm has joint compliance."""
-    return tuple(e for e in ALL_EFFECTS if e != "joint_compliance")
+    return tuple(e for e in injected.ALL_EFFECTS if e != "joint_compliance")
 
 
 def own_choices(catalogue: Catalogue | None) -> tuple[str, ...]:
     """Effects of a user's own that can be hidden, too; see `own_law`."""
-    return () if catalogue is None else own_names(catalogue, ALL_EFFECTS)
+    return () if catalogue is None else own_names(catalogue, injected.ALL_EFFECTS)
 
 
 def invented_law(catalogue: Catalogue) -> Catalogue:
@@ -124,8 +117,10 @@ def measurement_noise(config: CellConfig, samples: int = 1) -> SimulatedNoise:
 def as_told(config: CellConfig, choice: str, catalogue: Catalogue | None = None) -> CellConfig:
     """Return the configuration that the program is given when an effect is hidden."""
     check_choice(choice, catalogue)
-    if not config.loads and choice in DEFLECTION_EFFECTS:
-        shown = ", ".join((*(e for e in choices() if e not in DEFLECTION_EFFECTS), NOTHING))
+    if not config.loads and choice in injected.DEFLECTION_EFFECTS:
+        shown = ", ".join(
+            (*(e for e in choices() if e not in injected.DEFLECTION_EFFECTS), NOTHING)
+        )
         raise InputError(
             f"the cell has no [[loads]]; {choice}, which loads show, needs at least one; valid to "
             f"hide: {shown}"
@@ -154,26 +149,26 @@ def simulation_case(
     config = as_told(config, choice, catalogue)
     cell = cell_from_config(config, base_dir)
     slides, hidden = bool(cell.arm.slides.any()), choice
-    if choice in OF_SLIDES and not slides:
+    if choice in injected.OF_SLIDES and not slides:
         raise InputError(f"hide {choice}: no joint of {cell.arm.name} slides")
     if choice == RANDOM:  # a wrong registration shows only where one is believed
-        unseen = ("base_frame", *(() if config.loads else DEFLECTION_EFFECTS))
-        unseen += () if slides else OF_SLIDES
+        unseen = ("base_frame", *(() if config.loads else injected.DEFLECTION_EFFECTS))
+        unseen += () if slides else injected.OF_SLIDES
         hidden = str(rng.choice([e for e in choices() if e not in unseen]))
     v = visit(cell)
     own = None
     if catalogue is not None and hidden in own_choices(catalogue):
         own = own_law(catalogue, hidden, cell, v.states)
-    loaded = choice in DEFLECTION_EFFECTS if own is None else own.effect.elastic
+    loaded = choice in injected.DEFLECTION_EFFECTS if own is None else own.effect.elastic
     mode: Mode = "deflection" if loaded and _paired(v) else "absolute"
     joint_std = config.repeatability.per_joint(cell.arm.n)
-    world = nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
+    world = injected.nothing_hidden(cell, rng, noise=noise, joint_std=joint_std)
     strength = 0.0
     if hidden != NOTHING:
         strength = config.simulation.strength_sigma
-        world = softened(world, hidden)
+        world = injected.softened(world, hidden)
         what = own or hidden
-        world = hide(
+        world = injected.hide(
             what, cell, v.states, strength, mode, rng, world=world, pose=v.pose, cycle=v.cycle
         )
     return SimulationCase(config, cell, mode, world, hidden, strength)

@@ -27,14 +27,8 @@ from typing import Any
 
 import numpy as np
 
+from hilcal.drivers.simulated import ur_programs as programs
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_programs import (
-    PROGRAM_STOP,
-    ControlScript,
-    ProtectiveStop,
-    ScriptStream,
-    WaypointProgram,
-)
 from hilcal.drivers.simulated.ur_rtde import Faults
 from hilcal.drivers.simulated.ur_state import ArmState, Goal, RobotMode, Runtime, SafetyMode
 from hilcal.types import Floats
@@ -60,9 +54,9 @@ class OrderResult(Enum):
     REFUSED = "refused"
 
 
-_PROGRAMS: dict[str, type[ControlScript | WaypointProgram]] = {
-    "control script": ControlScript,
-    "program of waypoints": WaypointProgram,
+_PROGRAMS: dict[str, type[programs.ControlScript | programs.WaypointProgram]] = {
+    "control script": programs.ControlScript,
+    "program of waypoints": programs.WaypointProgram,
 }
 
 
@@ -74,7 +68,7 @@ class Controller:
         self.scripts, self.unlock_after = 0, UNLOCK_AFTER
         self.hears: Callable[[int], bool] = lambda register: False
         """Whether the client that writes an integer register has an open link."""
-        self._program: ControlScript | WaypointProgram | None = None
+        self._program: programs.ControlScript | programs.WaypointProgram | None = None
         self._compiling: tuple[float, str] | None = None
         self._powering: tuple[float, RobotMode] | None = None
         self._interrupted: Goal | None = None
@@ -100,7 +94,7 @@ class Controller:
         program, waits = self._program, False
         if program is not None and program.late and arm.runtime is Runtime.PLAYING:
             # one whose client has an open link is late for want of a turn
-            heard = isinstance(program, ControlScript) and self.hears(program.register)
+            heard = isinstance(program, programs.ControlScript) and self.hears(program.register)
             waits = program.late < PATIENCE and heard
             if not waits:
                 self.stop_program("watchdog: no input package in time")
@@ -116,7 +110,7 @@ class Controller:
             try:
                 if not self._program.poll():
                     self.stop_program("it ended")
-            except ProtectiveStop:
+            except programs.ProtectiveStop:
                 self.protective_stop("asked for by the program")
             except ValueError as error:
                 self.stop_program(str(error))
@@ -136,7 +130,7 @@ class Controller:
 
     async def take_programs(self, reader: asyncio.StreamReader) -> None:
         """Run every program that a client sends, until it goes."""
-        stream = ScriptStream()
+        stream = programs.ScriptStream()
         with contextlib.suppress(OSError):
             while data := await reader.read(_READ):
                 for text in stream.feed(data):
@@ -151,7 +145,7 @@ class Controller:
         self._program = self._compiling = self._interrupted = None
         arm.runtime = Runtime.STOPPED
         speed = float(np.max(np.abs(motion.qd)))
-        motion.stop(max(PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
+        motion.stop(max(programs.PROGRAM_STOP, speed / STOP_TIME), arm.clock.now)
         if ran is not arm.runtime:
             self.publish()
 

@@ -13,16 +13,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from hilcal.drivers.simulated import ur_state as ur
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_state import (
-    GRAVITY,
-    REGISTERS,
-    ArmState,
-    RobotMode,
-    Runtime,
-    pose,
-    transform,
-)
 from hilcal.types import Floats
 
 VERSION = 2
@@ -80,7 +72,7 @@ _INPUTS = {
 
 def _table(groups: dict[str, str], side: str) -> dict[str, str]:
     table = {name: kind for kind, names in groups.items() for name in names.split()}
-    for k in range(REGISTERS):
+    for k in range(ur.REGISTERS):
         table[f"{side}_int_register_{k}"] = "INT32"
         table[f"{side}_double_register_{k}"] = "DOUBLE"
     return table
@@ -159,7 +151,7 @@ class Sensors:
     Where nobody has written the truth, the arm is rigid and carries what it has been told.
     """
 
-    def __init__(self, arm: ArmState, board: Blackboard, rng: np.random.Generator) -> None:
+    def __init__(self, arm: ur.ArmState, board: Blackboard, rng: np.random.Generator) -> None:
         self._arm, self._board, self._rng = arm, board, rng
         self._places: dict[bytes, Floats] = {}
         self._readers = self._table()
@@ -226,7 +218,8 @@ class Sensors:
             "safety_status": lambda: (arm.safety_mode,),
             "safety_status_bits": lambda: (arm.safety_bits,),
             "robot_status_bits": lambda: (
-                (arm.robot_mode is not RobotMode.POWER_OFF) | (arm.runtime is Runtime.PLAYING) << 1,
+                (arm.robot_mode is not ur.RobotMode.POWER_OFF)
+                | (arm.runtime is ur.Runtime.PLAYING) << 1,
             ),
             "runtime_state": lambda: (arm.runtime,),
             "joint_position_deviation_ratio": self._deviation,
@@ -237,7 +230,7 @@ class Sensors:
 
     @property
     def _powered(self) -> bool:
-        return self._arm.robot_mode is RobotMode.RUNNING
+        return self._arm.robot_mode is ur.RobotMode.RUNNING
 
     @property
     def _has_truth(self) -> bool:
@@ -273,7 +266,7 @@ class Sensors:
         return np.asarray(held + _TORQUE_PER_AMPERE * self._noise(_CURRENT_STD))
 
     def _tool_pose(self, q: Floats) -> Floats:
-        return pose(self._flange(q) @ transform(self._arm.tcp))
+        return ur.pose(self._flange(q) @ ur.transform(self._arm.tcp))
 
     def _tool_speed(self, qd: Floats) -> Floats:
         if not qd.any():
@@ -286,7 +279,7 @@ class Sensors:
     def _weight(self) -> Floats:
         """Wrench of the payload that has been told, at the flange, flange axes."""
         arm = self._arm
-        force = arm.payload * (self._flange(arm.trajectory.q)[:3, :3].T @ GRAVITY)
+        force = arm.payload * (self._flange(arm.trajectory.q)[:3, :3].T @ ur.GRAVITY)
         return np.concatenate([force, np.cross(arm.payload_com, force)])
 
     def _wrench(self) -> Floats:
@@ -334,7 +327,7 @@ class Faults:
 class RtdeLinks:
     """All RTDE clients of one controller."""
 
-    arm: ArmState
+    arm: ur.ArmState
     sensors: Sensors
     faults: Faults
     taken: Callable[[], None]  # called after each input package

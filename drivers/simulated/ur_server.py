@@ -28,14 +28,8 @@ from typing import Any
 import numpy as np
 
 from hilcal.drivers.simulated import admin
+from hilcal.drivers.simulated import ur_controller as control
 from hilcal.drivers.simulated.blackboard import Blackboard
-from hilcal.drivers.simulated.ur_controller import (
-    NOT_INITIALISED,
-    Controller,
-    DashboardServer,
-    PrimaryPort,
-    RobotApiServer,
-)
 from hilcal.drivers.simulated.ur_rtde import Faults, RtdeLink, RtdeLinks, Sensors
 from hilcal.drivers.simulated.ur_state import ArmState, Kinematics, Trajectory, WorldClock
 from hilcal.errors import DeviceError, HilcalError, InputError
@@ -83,17 +77,19 @@ class UrServer:
         factory: FactoryKinematics | None = None,
     ) -> None:
         self.arm, self.faults = state, Faults()
-        self.controller = Controller(state, board)
+        self.controller = control.Controller(state, board)
         sensors = Sensors(state, board, rng)
         self.rtde = RtdeLinks(state, sensors, self.faults, self.controller.step)
         self.controller.hears = self.rtde.hears
         arm = state.kinematics.arm
         self.is_x = state.version[0] >= POLYSCOPE_X
-        supervision = RobotApiServer if self.is_x else DashboardServer
+        supervision = control.RobotApiServer if self.is_x else control.DashboardServer
         self.dashboard = supervision(self.controller, self.faults, arm.name)
-        status = NOT_INITIALISED if factory is None else factory.status
+        status = control.NOT_INITIALISED if factory is None else factory.status
         rows = None if factory is None else factory.rows
-        self.primary = PrimaryPort(self.controller, _rows(arm) if rows is None else rows, status)
+        self.primary = control.PrimaryPort(
+            self.controller, _rows(arm) if rows is None else rows, status
+        )
         self._host, self._supervised = host, api_port if self.is_x else DASHBOARD
         self._listening: asyncio.Server | None = None
         self._others: list[asyncio.Server] = []

@@ -21,7 +21,7 @@ import numpy as np
 from hilcal.drivers.ur_link import probe, states
 from hilcal.drivers.ur_link.lines import Connection, LinkError
 from hilcal.drivers.ur_link.probe import ControllerFacts
-from hilcal.drivers.ur_link.receive_worker import GETTERS
+from hilcal.drivers.ur_link.receive_worker import OUTPUTS as OUTPUTS
 from hilcal.drivers.ur_link.supervision import Supervision
 from hilcal.drivers.ur_link.worker import Worker, WorkerError
 from hilcal.errors import InputError
@@ -75,33 +75,31 @@ def _kinematics_of(part: bytes) -> FactoryKinematics:
 
 N = 6  # joints of every arm of this maker
 
-OUTPUTS = tuple(GETTERS)  # the outputs of the client library that are recorded
-
 OPTIONAL = frozenset({"target_speed_fraction", "payload", "payload_cog", "ft_raw_wrench"})
 """Outputs that older controllers lack (payload and payload_cog come with 5.5.1, ft_raw_wrench
 with 5.9)."""
 
 
-LARGEST = {
-    "timestamp": 1e10,
-    "actual_q": 100.0,
-    "target_q": 100.0,
-    "actual_qd": 100.0,
-    "target_moment": 1e5,
-    "actual_current": 1e4,
-    "target_current": 1e4,
-    "joint_temperatures": 200.0,
-    "actual_TCP_pose": 100.0,
-    "actual_TCP_force": 1e5,
-    "ft_raw_wrench": 1e5,
-    "payload": 1e3,
-    "payload_cog": 100.0,
-    "speed_scaling": 10.0,
-    "target_speed_fraction": 10.0,
+FIELDS = {
+    "timestamp": ("timestamp", 0, 1e10),
+    "q": ("actual_q", N, 100.0),
+    "q_target": ("target_q", N, 100.0),
+    "qd": ("actual_qd", N, 100.0),
+    "target_moment": ("target_moment", N, 1e5),
+    "current": ("actual_current", N, 1e4),
+    "target_current": ("target_current", N, 1e4),
+    "joint_temperature": ("joint_temperatures", N, 200.0),
+    "tcp_pose": ("actual_TCP_pose", 6, 100.0),
+    "tcp_force": ("actual_TCP_force", 6, 1e5),
+    "ft_raw_wrench": ("ft_raw_wrench", 6, 1e5),
+    "payload": ("payload", 0, 1e3),
+    "payload_com": ("payload_cog", 3, 100.0),
+    "speed_scaling": ("speed_scaling", 0, 10.0),
 }
-"""Magnitudes beyond which a field cannot be what an arm of this maker measures (s, rad, rad/s, N·m,
-A, °C, m, N, kg); choices, ten times and more beyond the largest of them. A packet that a fault on
-the way has changed is as a rule far outside."""
+"""By field of a sample: its output, how many numbers it has (0: one alone), and the magnitude
+beyond which it cannot be what an arm of this maker measures (s, rad, rad/s, N·m, A, °C, m, N, kg);
+choices, ten times and more beyond the largest of them. A packet that a fault on the way has changed
+is as a rule far outside."""
 
 STALE_S = 0.2
 """In a motion, the link is lost when the controller's timestamp stands for so long, real s."""
@@ -125,42 +123,21 @@ class Reading:
 
 def read(answer: dict[str, Any]) -> Reading:
     """Return the reading in the answer of the receive worker."""
-    fields, host_ns = answer["fields"], int(answer["host_ns"])
+    fields = answer["fields"]
 
-    def number(name: str) -> float:
-        value = float(fields[name])
-        if not math.isfinite(value) or abs(value) > LARGEST[name]:
-            raise ReadingError(f"{name} is {value}")
-        return value
-
-    def vector(name: str, n: int) -> Floats:
+    def checked(name: str, count: int, largest: float) -> Any:
         value = np.asarray(fields[name], dtype=np.float64)
-        if value.shape != (n,) or not (np.abs(value) <= LARGEST[name]).all():
+        if value.shape != (count,) * (count > 0) or not (np.abs(value) <= largest).all():
             raise ReadingError(f"{name} is {fields[name]}")
-        return value
+        return value if count else float(value)
 
-    bits = int(fields["safety_status_bits"])
-    scaling = number("speed_scaling")
+    values: dict[str, Any] = {"ft_raw_wrench": None, "payload": math.nan, "payload_com": None}
+    values |= {key: checked(*field) for key, field in FIELDS.items() if field[0] in fields}
     if "target_speed_fraction" in fields:  # the slider; the two multiply
-        scaling *= number("target_speed_fraction")
-    sample = ArmSample(
-        host_ns=host_ns,
-        timestamp=number("timestamp"),
-        q=vector("actual_q", N),
-        q_target=vector("target_q", N),
-        qd=vector("actual_qd", N),
-        target_moment=vector("target_moment", N),
-        current=vector("actual_current", N),
-        target_current=vector("target_current", N),
-        joint_temperature=vector("joint_temperatures", N),
-        tcp_pose=vector("actual_TCP_pose", 6),
-        tcp_force=vector("actual_TCP_force", 6),
-        ft_raw_wrench=vector("ft_raw_wrench", 6) if "ft_raw_wrench" in fields else None,
-        payload=number("payload") if "payload" in fields else math.nan,
-        payload_com=vector("payload_cog", 3) if "payload_cog" in fields else None,
-        speed_scaling=scaling,
-        safety=states.safety_word(bits),
-    )
+        values["speed_scaling"] *= checked("target_speed_fraction", 0, 10.0)
+    bits = int(fields["safety_status_bits"])
+    host_ns, safety = int(answer["host_ns"]), states.safety_word(bits)
+    sample = ArmSample(host_ns=host_ns, safety=safety, **values)
     return Reading(sample, int(fields["robot_mode"]), int(fields["runtime_state"]), bits)
 
 

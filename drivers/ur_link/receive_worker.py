@@ -10,31 +10,21 @@ from typing import Any
 
 from hilcal.drivers.ur_link.worker import answered, start, words
 
-GETTERS = {
-    "timestamp": "getTimestamp",
-    "actual_q": "getActualQ",
-    "target_q": "getTargetQ",
-    "actual_qd": "getActualQd",
-    "target_moment": "getTargetMoment",
-    "actual_current": "getActualCurrent",
-    "target_current": "getTargetCurrent",
-    "joint_temperatures": "getJointTemperatures",
-    "actual_TCP_pose": "getActualTCPPose",
-    "actual_TCP_force": "getActualTCPForce",
-    "robot_mode": "getRobotMode",
-    "runtime_state": "getRuntimeState",
-    "safety_status_bits": "getSafetyStatusBits",
-    "speed_scaling": "getSpeedScaling",
-    "target_speed_fraction": "getTargetSpeedFraction",
-    "payload": "getPayload",
-    "payload_cog": "getPayloadCog",
-    "ft_raw_wrench": "getFtRawWrench",
-}
-"""Outputs that the client library knows; another name would shift the fields behind it."""
-
+_NAMES = (
+    "timestamp actual_q target_q actual_qd target_moment actual_current target_current "
+    "joint_temperatures actual_TCP_pose actual_TCP_force robot_mode runtime_state "
+    "safety_status_bits speed_scaling target_speed_fraction payload payload_cog ft_raw_wrench"
+)
+OUTPUTS = tuple(_NAMES.split())
+"""Those that are recorded; the client library knows them: another name would shift the fields
+behind it. It has a getter for each, `getActualTCPPose` for `actual_TCP_pose`."""
 _POLL = 0.0005  # s
 _TRIES = 20
 _FIRST_S = 2.0  # until the first data come, s
+
+
+def _getter(output: str) -> str:
+    return "get" + "".join(part[0].upper() + part[1:] for part in output.split("_"))
 
 
 class StaleError(Exception):
@@ -59,7 +49,7 @@ def _sample(link: Any, names: list[str], stale: float) -> dict[str, Any]:
     """Return all fields of one and the same packet."""
     stamp = _next_stamp(link, stale)
     for _ in range(_TRIES):
-        fields = {name: getattr(link, GETTERS[name])() for name in names}
+        fields = {name: getattr(link, _getter(name))() for name in names}
         host_ns = time.monotonic_ns()
         again = link.getTimestamp()
         if again == stamp == fields["timestamp"]:

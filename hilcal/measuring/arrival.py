@@ -7,15 +7,10 @@ import numpy as np
 
 from hilcal.cell import Cell
 from hilcal.errors import DeviceError, InputError
-from hilcal.measuring.devices import (
-    Clock,
-    PointingTracker,
-    TargetLostError,
-    TrackerDevice,
-    WrenchSample,
-)
+from hilcal.measuring.connect import Setup
+from hilcal.measuring.devices import PointingTracker, TargetLostError, WrenchSample
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.progress import Remark, Watcher
+from hilcal.measuring.progress import Remark
 from hilcal.readings.covariance import joint_scatter
 from hilcal.robot import chain as chains
 from hilcal.robot.chain import drive_jacobian
@@ -236,17 +231,10 @@ class ArrivalReader:
     hidden, or taken for another one, is a missing reading, not a failure.
     """
 
-    def __init__(
-        self,
-        cell: Cell,
-        tracker: TrackerDevice,
-        measurer: Measurer,
-        registration: RoughRegistration,
-        clock: Clock,
-        watcher: Watcher,
-    ) -> None:
+    def __init__(self, setup: Setup, measurer: Measurer, registration: RoughRegistration) -> None:
+        cell, tracker = setup.cell, setup.rig.tracker
         self._cell, self._measurer, self._registration = cell, measurer, registration
-        self._clock, self._watcher, self._said = clock, watcher, False
+        self._clock, self._watcher, self._said = setup.clock, setup.watcher, False
         self._tracker: PointingTracker | None = None
         if cell.targets is None:
             return

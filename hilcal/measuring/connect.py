@@ -12,11 +12,13 @@ from hilcal.errors import HilcalError, InputError
 from hilcal.measuring import devices
 from hilcal.measuring.devices import (
     ArmDevice,
+    Clock,
     ForceSensorDevice,
     OperatorDevice,
     Report,
     TrackerDevice,
 )
+from hilcal.measuring.progress import Watcher
 from hilcal.robot.arm import Arm
 from hilcal.robot.catalogue import load_arm, robot_names
 from hilcal.robot.factory import (
@@ -44,6 +46,17 @@ class Rig:
         for device in (self.arm, self.tracker, self.force, self.operator):
             if device is not None:
                 device.close()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """What all parts of a session use: open devices, the cell, its time, and who watches."""
+
+    rig: Rig
+    cell: Cell
+    config: CellConfig
+    clock: Clock
+    watcher: Watcher
 
 
 Factory = Callable[[CellConfig], Any]

@@ -6,19 +6,13 @@ from functools import partial
 import numpy as np
 
 from hilcal.cell import Cell
-from hilcal.config import CellConfig, CellLoad
+from hilcal.config import CellLoad
 from hilcal.errors import DeviceError
-from hilcal.measuring.devices import (
-    ArmDevice,
-    Clock,
-    ConfirmingOperator,
-    OperatorDevice,
-    TerminalPerson,
-    WrongLoadError,
-)
+from hilcal.measuring.connect import Setup
+from hilcal.measuring.devices import ConfirmingOperator, TerminalPerson, WrongLoadError
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import Mover
-from hilcal.measuring.progress import Answered, Phase, Question, Remark, Watcher
+from hilcal.measuring.progress import Answered, Phase, Question, Remark
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
 
@@ -40,23 +34,12 @@ def payload(cell: Cell, load: CellLoad | None) -> tuple[float, Floats]:
 class Hook:
     """What hangs at the arm; WrongLoadError where what hangs is wrong `TRIES` times."""
 
-    def __init__(
-        self,
-        arm: ArmDevice,
-        operator: OperatorDevice,
-        meter: ForceMeter | None,
-        mover: Mover,
-        cell: Cell,
-        config: CellConfig,
-        clock: Clock,
-        watcher: Watcher,
-    ) -> None:
+    def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
         """Nothing is known of what hangs before `begin`."""
-        self.hanging = UNLOADED
-        self._doubted = False
-        self.since = clock.now()
-        self._arm, self._operator, self._meter, self._mover = arm, operator, meter, mover
-        self._cell, self._config, self._clock, self._watcher = cell, config, clock, watcher
+        self.hanging, self.since, self._doubted = UNLOADED, setup.clock.now(), False
+        self._arm, self._operator, self._meter = setup.rig.arm, setup.rig.operator, meter
+        self._cell, self._config, self._mover = setup.cell, setup.config, mover
+        self._clock, self._watcher = setup.clock, setup.watcher
 
     def load(self, name: str) -> CellLoad | None:
         """Return a load by name, None for the unloaded state."""

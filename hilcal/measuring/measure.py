@@ -30,19 +30,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from hilcal.config import CellConfig
 from hilcal.errors import DeviceError
-from hilcal.measuring.devices import (
-    ArmSample,
-    Clock,
-    TargetLostError,
-    TrackerDevice,
-    TrackerSample,
-    WrenchSample,
-)
+from hilcal.measuring.connect import Setup
+from hilcal.measuring.devices import ArmSample, TargetLostError, TrackerSample, WrenchSample
 from hilcal.measuring.force import ForceMeter
 from hilcal.measuring.motion import POLL_S, Mover
-from hilcal.measuring.progress import Remark, Watcher
+from hilcal.measuring.progress import Remark
 from hilcal.readings.covariance import covariance_of_mean
 from hilcal.readings.whitening import inverse_root
 from hilcal.robot import se3
@@ -265,23 +258,12 @@ class MeasuredStop:
 class Measurer:
     """Measures readings of an arm that stands at its goal."""
 
-    def __init__(
-        self,
-        mover: Mover,
-        tracker: TrackerDevice,
-        meter: ForceMeter | None,
-        config: CellConfig,
-        clock: Clock,
-        watcher: Watcher,
-    ) -> None:
-        self._mover, self._tracker, self._meter = mover, tracker, meter
-        self._config, self._clock, self._watcher = config, clock, watcher
+    def __init__(self, setup: Setup, meter: ForceMeter | None, mover: Mover) -> None:
+        self._mover, self._tracker, self._meter = mover, setup.rig.tracker, meter
+        self._config, self._clock, self._watcher = setup.config, setup.clock, setup.watcher
 
     def measure(
-        self,
-        name: str,
-        find: Callable[[], None] | None = None,
-        force: WrenchSample | None = None,
+        self, name: str, find: Callable[[], None] | None = None, force: WrenchSample | None = None
     ) -> MeasuredStop:
         """Measure at the present pose, called `name`.
 

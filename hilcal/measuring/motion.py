@@ -8,10 +8,11 @@ import numpy as np
 from hilcal.cell import Cell
 from hilcal.config import CellConfig, CellLoad
 from hilcal.errors import DeviceError
-from hilcal.measuring.devices import ArmDevice, ArmSample, Clock, LoadChangedError
+from hilcal.measuring.connect import Setup
+from hilcal.measuring.devices import ArmSample, LoadChangedError
 from hilcal.measuring.feasibility import Feasibility, Margins
 from hilcal.measuring.force import MOMENT_LEVER_M, ForceMeter, TaredWrench
-from hilcal.measuring.progress import ArmAt, Watcher
+from hilcal.measuring.progress import ArmAt
 from hilcal.measuring.route import Stop, duration, on_route
 from hilcal.store.plan import UNLOADED
 from hilcal.types import Floats
@@ -215,23 +216,16 @@ class Mover:
     `goal` (n,) is where the arm has been left, or goes; None while that is unknown.
     """
 
-    def __init__(
-        self,
-        arm: ArmDevice,
-        meter: ForceMeter | None,
-        guard: Guard,
-        config: CellConfig,
-        clock: Clock,
-        watcher: Watcher,
-    ) -> None:
+    def __init__(self, setup: Setup, meter: ForceMeter | None) -> None:
         """Use an open arm; the watcher is told where it is while it moves, and must not wait."""
+        cell, config = setup.cell, setup.config
         self.goal: Floats | None = None
         self.hanging: tuple[str, ...] = (UNLOADED,)
-        self.side = np.zeros(guard.cell.arm.n)
-        self.watch = None if meter is None else LoadWatch(meter, guard.cell, config)
-        self._arm, self._meter, self._guard = arm, meter, guard
-        self._limits = Feasibility(guard.cell, config)
-        self._motion, self._clock, self._watcher = config.motion, clock, watcher
+        self.side = np.zeros(cell.arm.n)
+        self.watch = None if meter is None else LoadWatch(meter, cell, config)
+        self._arm, self._meter, self.guard = setup.rig.arm, meter, Guard(cell, config)
+        self._limits = Feasibility(cell, config)
+        self._motion, self._clock, self._watcher = config.motion, setup.clock, setup.watcher
         self._under_way = False
         self._ticked: tuple[float, int] = (-1.0, 0)
 
@@ -239,7 +233,7 @@ class Mover:
         """Return a sample of the arm after it and the force sensor have been checked."""
         sample = self._arm.sample()
         felt = None if self._meter is None else self._meter.felt()
-        checked = (self._guard.check(sample, felt, load) for load in self.hanging)
+        checked = (self.guard.check(sample, felt, load) for load in self.hanging)
         reason = next(filter(None, checked), None) or self._clock_stands(sample)
         if reason is not None:
             if sample.safety != NORMAL:
@@ -284,7 +278,7 @@ class Mover:
         """
         while True:
             sample = self._arm.sample()
-            unfit = self._guard.state(sample)
+            unfit = self.guard.state(sample)
             if unfit is not None:
                 raise DeviceError(unfit)
             q = sample.q
@@ -368,7 +362,7 @@ class Mover:
     def _worst(self, off: Floats) -> tuple[str, float]:
         """Name of the joint that is off the most, and by how much, rad."""
         k = int(np.argmax(np.abs(off)))
-        return self._guard.cell.arm.joint_names[k], float(np.abs(off[k]))
+        return self.guard.cell.arm.joint_names[k], float(np.abs(off[k]))
 
     def _check_progress(
         self, start: Floats, goal: Floats, sample: ArmSample, last: ArmSample | None, name: str

@@ -8,7 +8,7 @@ from typing import Any
 from hilcal.cell import Cell
 from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError, InputError
-from hilcal.measuring.connect import Rig
+from hilcal.measuring.connect import Rig, Setup
 from hilcal.measuring.devices import ArmDevice, Clock
 from hilcal.measuring.progress import Phase, Remark, Watcher
 from hilcal.measuring.route import DryRun, dry_run, route
@@ -57,7 +57,8 @@ def run(
     for text in whole.remarks:
         watcher.notify(Remark(text))
     stops = route(left, cell.arm, config.limits.joint_margin_rad)
-    session = Session(rig, cell, config, plan, store, clock, watcher, live, wall, goal, epoch)
+    setup = Setup(rig, cell, config, clock, watcher)
+    session = Session(setup, plan, store, live, wall, goal, epoch)
     try:
         session.walk(stops)
     except BaseException as error:

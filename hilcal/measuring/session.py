@@ -9,16 +9,14 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from hilcal.cell import Cell
-from hilcal.config import CellConfig
 from hilcal.errors import DeviceError, HilcalError
 from hilcal.measuring.arrival import ArrivalReader, RoughRegistration, TargetReading
-from hilcal.measuring.connect import Rig
-from hilcal.measuring.devices import Clock, LoadChangedError, TargetLostError, WrenchSample
+from hilcal.measuring.connect import Setup
+from hilcal.measuring.devices import LoadChangedError, TargetLostError, WrenchSample
 from hilcal.measuring.force import ForceMeter, TaredWrench
 from hilcal.measuring.loads import TRIES, Hook, payload
 from hilcal.measuring.measure import MeasuredStop, Measurer
-from hilcal.measuring.motion import Guard, Mover
+from hilcal.measuring.motion import Mover
 from hilcal.measuring.progress import (
     GoalMet,
     GoalStatus,
@@ -26,7 +24,6 @@ from hilcal.measuring.progress import (
     Phase,
     ReadingStored,
     Remark,
-    Watcher,
 )
 from hilcal.measuring.route import Stop, way_home
 from hilcal.measuring.session_state import (
@@ -55,13 +52,9 @@ class Session:
 
     def __init__(
         self,
-        rig: Rig,
-        cell: Cell,
-        config: CellConfig,
+        setup: Setup,
         plan: Plan,
         store: RunLog,
-        clock: Clock,
-        watcher: Watcher,
         live: LiveModel | None = None,
         wall: Callable[[], float] = time.time,
         goal: StoppingRule | None = None,
@@ -69,26 +62,22 @@ class Session:
     ) -> None:
         """Read what earlier sessions stored; no device is used yet."""
         self.in_control = False
-        self._rig, self._cell, self._config, self._plan = rig, cell, config, plan
-        self._store, self._clock, self._watcher, self._live = store, clock, watcher, live
-        self._wall = wall
+        self._rig, self._cell, self._config = setup.rig, setup.cell, setup.config
+        self._clock, self._watcher = setup.clock, setup.watcher
+        self._plan, self._store, self._live, self._wall = plan, store, live, wall
         self._rule = goal
         self._goal: GoalStatus | None = None
-        window = clock.real(config.acquire.force_window_s)
+        rig, cell, config, clock = self._rig, self._cell, self._config, self._clock
         self._meter: ForceMeter | None = None
         if rig.force is not None and config.force_sensor is not None:
+            window = clock.real(config.acquire.force_window_s)
             self._meter = ForceMeter(rig.force, config.force_sensor, cell, window)
-        self._guard = Guard(cell, config)
-        self._mover = Mover(rig.arm, self._meter, self._guard, config, clock, watcher)
-        self._measurer = Measurer(self._mover, rig.tracker, self._meter, config, clock, watcher)
-        self._hook = Hook(
-            rig.arm, rig.operator, self._meter, self._mover, cell, config, clock, watcher
-        )
+        self._mover = Mover(setup, self._meter)
+        self._hook = Hook(setup, self._meter, self._mover)
         self._joint_std = config.repeatability.per_joint(cell.arm.n)
         self._state = SessionState(cell, self._joint_std)
-        self._reader = ArrivalReader(
-            cell, rig.tracker, self._measurer, self._state.registration, clock, watcher
-        )
+        measurer = Measurer(setup, self._meter, self._mover)
+        self._reader = ArrivalReader(setup, measurer, self._state.registration)
         self._identified = 0
         self._temperatures: bool | None = None
         self._torques: bool | None = None
@@ -203,7 +192,7 @@ class Session:
         it does not stand where it was read last.
         """
         sample = self._rig.arm.sample()
-        unfit = self._guard.state(sample)
+        unfit = self._mover.guard.state(sample)
         if unfit is not None:
             raise DeviceError(unfit)
         if self._temperatures is None:

@@ -26,8 +26,7 @@ from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog, create_run
 from tests.support.campaigns import campaign, configuration, noiseless, plan, with_noise
 from tests.support.cli_cases import ok, quickly_planned, refused, run
-from tests.support.fake_bench import POSES, Bench
-from tests.support.fake_world import REGISTRATION
+from tests.support.fake_bench import POSES, REGISTRATION, Bench
 
 COMPLIANCE = np.array([3e-5, 4e-5, 3e-5, 6e-5, 6e-5, 8e-5])  # rad/(N·m)
 

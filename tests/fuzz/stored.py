@@ -31,12 +31,7 @@ from hilcal.tables.propose import propose
 from hilcal.tables.write import revision_table
 from hilcal.transfer.members import LIST, entries
 from tests.fuzz.bench import Bench
-from tests.fuzz.damage import (
-    NUMBERS,
-    bytes_damaged,
-    document_damaged,
-    words_damaged,
-)
+from tests.fuzz.damage import NUMBERS, bytes_damaged, document_damaged, words_damaged
 from tests.fuzz.harness import Accepted, Parser
 from tests.support.unguarded import unguarded
 

@@ -12,7 +12,7 @@ import psutil
 from hilcal.procedure.state import Files
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
-from tests.support.campaign_run import LOOK_S, still_running
+from tests.support.campaign_cases import LOOK_S, still_running
 
 ROOT = Path(__file__).resolve().parents[2]
 CELL = """\

@@ -1,22 +1,299 @@
-"""Campaigns on a simulated cell: fixtures, faults in the middle of a run, and what must hold."""
+"""Campaigns on one simulated cell whose runs meet faults: the site, a run, what has to hold."""
 
+import os
 import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
+import psutil
 import pytest
 
-from hilcal.cell import Cell
+from hilcal.cell import Cell, cell_from_config
+from hilcal.config import CellConfig, load_config
+from hilcal.config.template import to_toml
+from hilcal.drivers.simulated.cell_processes import SimulatedCell
+from hilcal.drivers.simulated.rehearsal import case_of_plan, simulated_cell
+from hilcal.drivers.simulated.world import World
 from hilcal.identification.full_covariance import with_joint_scatter
+from hilcal.measuring.route import dry_run
+from hilcal.robot.catalogue import configs_dir
 from hilcal.store.campaign_file import CampaignFile
-from hilcal.store.plan import Step
+from hilcal.store.plan import Plan, Step
 from hilcal.store.run_log import RunLog
 from hilcal.types import Floats
-from tests.support.campaign_run import EndedError, Run
-from tests.support.campaign_site import Site, site
+from tests.support.spread_plan import spread_plan
+
+DEADLINE = 60.0  # nothing here may take longer, s; far above what it takes
+HAND_S = 2.0
+"""The simulated person is quick, s of cell time: nothing here depends on how long it takes."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Site:
+    """A running simulated cell with its files, and a short plan for it."""
+
+    simulated: SimulatedCell
+    world: World
+    cell: Cell
+    config: CellConfig
+    plan: Plan
+    toml: Path
+    plan_file: Path
+    directory: Path
+    runs: list["Run"]
+
+    def end_runs(self) -> None:
+        """End what a test that failed has left running."""
+        for run in self.runs:
+            if run.process.poll() is None:
+                run.kill()
+                run.process.wait()
+        self.runs.clear()
+
+    def ask(self, device: str, op: str, **arguments: Any) -> Any:
+        return self.simulated.ask(device, op, **arguments)
+
+    def slider(self, share: float) -> None:
+        """Set the speed slider on the pendant; what runs goes on at that share of its speed."""
+        self.ask("arm", "set", slider=share)
+
+    def now(self) -> float:
+        """Time as the simulated devices stamp it, s."""
+        return time.monotonic()
+
+    def shorter(self, directory: Path, poses: int) -> "Site":
+        """The same cell with a plan of fewer poses."""
+        plan = spread_plan(self.cell, self.config, poses, np.random.default_rng(7), repeats=0)
+        plan_file = directory / "plan.json"
+        plan_file.write_text(plan.to_json(), encoding="utf-8")
+        return replace(self, plan=plan, plan_file=plan_file, directory=directory)
+
+    def dashboard(self, *commands: str) -> list[str]:
+        """Say something to the controller's dashboard, as the pendant's buttons do."""
+        assert self.config.robot.host is not None
+        with (
+            socket.create_connection((self.config.robot.host, 29999), timeout=5.0) as line,
+            line.makefile("rw") as stream,
+        ):
+            stream.readline()
+            answers = []
+            for command in commands:
+                stream.write(command + "\n")
+                stream.flush()
+                answers.append(stream.readline().strip())
+        return answers
+
+    def until(self, what: Callable[[], bool]) -> None:
+        """Wait until something holds."""
+        end = time.monotonic() + DEADLINE
+        while not what():
+            assert time.monotonic() < end
+            time.sleep(0.02)
+
+
+@contextmanager
+def site(
+    directory: Path,
+    *,
+    clock: float = 20.0,
+    poses: int = 3,
+    seed: int = 5,
+    tracker: dict[str, Any] | None = None,
+    force_sensor: dict[str, Any] | None = None,
+) -> Iterator[Site]:
+    """Run a simulated cell with two loads and a plan of few poses; other instruments as given."""
+    base_dir = configs_dir() / "cells"
+    config = load_config(base_dir / "demo_ur10e.toml")
+    changes = {
+        "simulation": config.simulation.model_copy(update={"clock": clock}),
+        "operator": config.operator.model_copy(update={"options": {"hand_s": HAND_S}}),
+        "loads": config.loads[:2],
+        "tracker": config.tracker.model_copy(update=tracker),
+        "force_sensor": config.force_sensor and config.force_sensor.model_copy(update=force_sensor),
+    }
+    config = config.model_copy(update=changes)
+    cell = cell_from_config(config)
+    # Not every such plan passes the check: some motion may be too near to an obstacle.
+    rngs = (np.random.default_rng([seed, k]) for k in range(20))
+    plans = (spread_plan(cell, config, poses, rng, repeats=1) for rng in rngs)
+    plan = next(p for p in plans if not dry_run(cell, config, p).problems)
+    secret = case_of_plan(config, plan, "nothing", seed)
+    with simulated_cell(secret, seed, base_dir, directory / "cell") as running:
+        toml, plan_file = directory / "cell.toml", directory / "plan.json"
+        toml.write_text(to_toml(running.config), encoding="utf-8")
+        plan_file.write_text(plan.to_json(), encoding="utf-8")
+        yield Site(
+            running, secret.world, secret.cell, running.config, plan, toml, plan_file, directory, []
+        )
+
+
+ROOT = Path(__file__).resolve().parents[2]
+BEGUN = "waiting for the operator to take everything off"
+"""What a run says as soon as every device is there and ready."""
+TAKEN = re.compile(r"\d+/\d+ ")
+SLOW = 0.1  # position of the speed slider while an arm is to be stopped on its way
+LOOK_S = 0.25
+"""Time between two looks at the processes that a run has started; each reads those of the whole
+machine."""
+FAR_RAD = 0.5
+"""The arm is stopped so far from its goal; at that speed it would take 0.8 s to arrive."""
+
+
+class EndedError(AssertionError):
+    """A run has ended too early."""
+
+
+class Run:
+    """One `hilcal run`, in a session of its own."""
+
+    def __init__(
+        self,
+        site: Site,
+        path: Path,
+        *more: str,
+        limit: int | None = None,
+        how: tuple[str, ...] = (),
+    ) -> None:
+        """Start it; unless `how` says otherwise, `--resume` where the campaign is there already."""
+        self.site, self.path = site, path
+        self.log = path.with_suffix(f".{time.monotonic_ns()}.log")
+        usual = ("--resume",) if path.exists() else ("--plan", str(site.plan_file))
+        command = [sys.executable, "-m", "hilcal", "run", str(site.toml), "-o", str(path)]
+        environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        with self.log.open("wb") as log:
+            self.process = subprocess.Popen(
+                [*command, *(how or usual), *more],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+                env=environment,
+                preexec_fn=None if limit is None else lambda: _limited(limit),
+            )
+        self._family: set[int] = {self.process.pid}
+        self._looked = 0.0
+        site.runs.append(self)
+
+    @property
+    def words(self) -> str:
+        """What it has said so far."""
+        return self.log.read_text(encoding="utf-8", errors="replace")
+
+    def wait_until(self, what: Callable[[], bool], words: str) -> None:
+        """Wait until something holds."""
+        end = time.monotonic() + DEADLINE
+        while not what():
+            self._look()
+            if self.process.poll() is not None:
+                raise EndedError(f"it ended before {words}:\n{self.words}")
+            assert time.monotonic() < end, f"no {words} in {DEADLINE} s:\n{self.words}"
+            time.sleep(0.02)
+
+    def some_readings(self) -> None:
+        """Wait until this run has stored a reading."""
+        self.wait_until(lambda: bool(TAKEN.search(self.words)), "a reading")
+
+    def moving(self) -> Floats:
+        """Wait until the arm moves, so slowly and so far that it will not arrive soon."""
+        self.site.slider(SLOW)
+        plan = self.site.plan
+        goal = np.zeros(6)
+
+        def far() -> bool:
+            name = self.words.splitlines()[-1].partition("moving to ")[2]
+            state = self.site.ask("arm", "state")
+            if name not in plan.pose_names or not state["moving"]:
+                return False
+            goal[:] = plan.joints(name)
+            return bool(np.abs(goal - state["q"]).max() > FAR_RAD)
+
+        self.wait_until(far, "motion")
+        return goal
+
+    def measuring(self) -> None:
+        """Wait until a reading has just begun."""
+        count = len(self.words.splitlines())
+        self.wait_until(
+            lambda: "measuring" in "".join(self.words.splitlines()[count:]), "measurement"
+        )
+
+    def next_reading(self, words: str) -> None:
+        """Wait until one more reading is stored."""
+        count = len(TAKEN.findall(self.words))
+        self.wait_until(lambda: len(TAKEN.findall(self.words)) > count, f"a reading with {words}")
+
+    def family(self) -> set[int]:
+        """Process numbers of it and of all that it has started."""
+        try:
+            children = psutil.Process(self.process.pid).children(recursive=True)
+            self._family |= {child.pid for child in children}
+        except psutil.Error:
+            pass
+        return self._family
+
+    def _look(self) -> None:
+        """Note what it has started meanwhile, now and then."""
+        if time.monotonic() - self._looked > LOOK_S:
+            self.family()
+            self._looked = time.monotonic()
+
+    def interrupt(self) -> None:
+        """Ctrl-C at the terminal: the whole group gets it."""
+        self.family()
+        os.killpg(self.process.pid, signal.SIGINT)
+
+    def kill(self) -> None:
+        """Kill -9, only the program itself."""
+        self.family()
+        self.process.kill()
+
+    def end(self, longest: float = DEADLINE) -> tuple[int, str]:
+        """Wait for its end; returns the exit code and what it said."""
+        end = time.monotonic() + longest
+        while self.process.poll() is None:
+            self._look()
+            assert time.monotonic() < end, f"it hangs:\n{self.words}"
+            time.sleep(0.02)
+        return self.process.wait(), self.words
+
+    def left_behind(self) -> list[str]:
+        """Processes that it has left behind, after a moment."""
+        return still_running(self._family, 3.0)
+
+
+def still_running(processes: set[int], seconds: float) -> list[str]:
+    """Commands of those of some processes that have not ended after so long."""
+    end = time.monotonic() + seconds
+    while True:
+        names = [name for pid in processes if (name := _alive(pid))]
+        if not names or time.monotonic() > end:
+            return names
+        time.sleep(0.02)
+
+
+def _limited(size: int) -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, size))
+
+
+def _alive(pid: int) -> str:
+    try:
+        process = psutil.Process(pid)
+        if process.status() == psutil.STATUS_ZOMBIE:
+            return ""
+        return " ".join(process.cmdline())
+    except psutil.Error:
+        return ""
+
 
 LONG = 900.0  # a whole campaign may take so long, s
 STARVED = re.compile(

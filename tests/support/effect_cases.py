@@ -72,8 +72,7 @@ def situation(cell: Cell, seed: int = 2) -> Situation:
     rng = np.random.default_rng(seed)
     shape = (len(states), cell.arm.n)
     deviation = Deviation(
-        dq=1e-2 * rng.normal(size=shape),
-        twist=1e-2 * rng.normal(size=(shape[0], shape[1] + 1, 6)),
+        dq=1e-2 * rng.normal(size=shape), twist=1e-2 * rng.normal(size=(shape[0], shape[1] + 1, 6))
     )
     chain = chains.evaluate(cell.arm, states.q, deviation)
     load = Load(states.wrench, cell.load_point, cell.tool_mass, cell.tool_com, cell.gravity)

@@ -1,10 +1,12 @@
-"""A bench in memory: cell, plans and everything that a run needs."""
+"""A bench in memory: devices that share one small world, cell, plans, and a store."""
 
+import json
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from hilcal.cell import cell_from_config
+from hilcal.cell import Cell, cell_from_config
 from hilcal.config import (
     Acquire,
     CellConfig,
@@ -17,11 +19,380 @@ from hilcal.config import (
     Tool,
     Tracker,
 )
+from hilcal.errors import DeviceError
 from hilcal.measuring.connect import Rig
+from hilcal.measuring.devices import (
+    ArmSample,
+    Clock,
+    Losses,
+    Report,
+    TargetLostError,
+    TrackerSample,
+    WrenchSample,
+)
+from hilcal.measuring.run import run
+from hilcal.readings.readings import Readings
+from hilcal.robot import chain as chains
+from hilcal.robot import se3
 from hilcal.store.plan import Plan, Step
-from tests.support.fake_devices import FakeArm, FakeClock, FakeForce, FakeOperator, FakeTracker
-from tests.support.fake_store import MemoryStore, Notes
-from tests.support.fake_world import World
+from hilcal.store.stored_schema import Detail, check, check_event
+from hilcal.types import Bools, Floats
+
+REGISTRATION = se3.matrix(se3.rotation(np.array([0.02, -0.03, 2.1])), np.array([2.4, -1.6, -0.5]))
+SAG = 2e-5  # m/N, how far the target gives way along the force
+
+
+class Killed(BaseException):
+    """The process is killed: nothing that it does from now on reaches anybody."""
+
+
+@dataclass
+class World:
+    """Arm, load and time, and the calls that reached any device."""
+
+    config: CellConfig
+    cell: Cell
+    q: Floats
+    time: float = 100.0
+    start: Floats = field(default_factory=lambda: np.zeros(6))
+    goal: Floats = field(default_factory=lambda: np.zeros(6))
+    begun: float = 0.0
+    lasts: float = 0.0
+    is_moving: bool = False
+    load: str = "none"
+    payload: tuple[float, Floats] | None = None
+    control: bool = False
+    offset: Floats = field(default_factory=lambda: np.array([3.0, -2.0, 5.0, 0.1, 0.2, -0.1]))
+    tool_mass: float = 0.8
+    calls: list[str] = field(default_factory=list)
+    fail: dict[int, BaseException] = field(default_factory=dict)
+    kill_at: int | None = None
+    kill_after: tuple[str, int] | None = None  # a call, and how many of it
+    killed: bool = False
+    safety: str = "normal"
+    extra: Floats = field(default_factory=lambda: np.zeros(6))  # further force, sensor axes
+    extra_speed: float = 0.0
+    shift: Floats = field(default_factory=lambda: np.zeros(3))  # of the target
+    creep: float = 0.0  # m/s, of the target while at rest
+    hurry: float = 20.0  # how much faster than commanded the arm moves, from the next motion on
+    hurried: float = 1.0  # the same of the motion under way
+    jitter: float = 0.0  # rad, of the joints from sample to sample at rest
+    torques: float = 0  # the next so many samples at rest tell the torques of the joints
+    lost: int = 0  # the next so many measurements see no target
+    not_found: int = 0  # the next so many searches find none
+    wrong: list[str] = field(default_factory=list)  # loads that are hung instead, in order
+    at_start: list[tuple[Floats, str]] = field(default_factory=list)  # load at each motion
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(5))
+
+    def call(self, name: str) -> None:
+        """Count a call; fail where that is wanted."""
+        if self.killed:
+            raise Killed
+        self.calls.append(name)
+        k = len(self.calls)
+        last = self.kill_after is not None and self.kill_after[0] == name
+        if last and self.calls.count(name) == self.kill_after[1]:  # type: ignore[index]
+            self.kill_at = k
+        if self.kill_at == k:
+            self.killed = True
+            raise Killed
+        if k in self.fail:
+            raise self.fail[k]
+
+    def again(self) -> None:
+        """Start the program anew: the arm has stopped where it was, the load still hangs."""
+        self.joints()
+        self.is_moving = self.control = self.killed = False
+        self.kill_at = self.kill_after = None
+        self.fail = {}
+        self.calls.clear()
+
+    def joints(self) -> Floats:
+        """Where the joints are now, rad."""
+        if self.is_moving:
+            share = min(1.0, (self.time - self.begun) / self.lasts)
+            self.q = self.start + share * (self.goal - self.start)
+            self.is_moving = share < 1.0
+        return self.q
+
+    def pull(self) -> Floats:
+        """(6,) wrench of the load at the load point, base axes."""
+        for load in self.config.loads:
+            if load.name == self.load:
+                return load.wrench(self.cell.gravity)
+        return np.zeros(6)
+
+    def position(self) -> Floats:
+        """(3,) target in sensor axes."""
+        chain = chains.evaluate(self.cell.arm, self.joints()[None])
+        at = chain.point(self.cell.target[:3, 3])[0] + SAG * self.pull()[:3] + self.shift
+        return REGISTRATION[:3, :3] @ at + REGISTRATION[:3, 3] + self.creep * self.time
+
+    def wrench(self) -> Floats:
+        """(6,) what the sensor reads, sensor axes (those of the flange)."""
+        rotation = chains.evaluate(self.cell.arm, self.joints()[None]).rotation[-1][0]
+        force = rotation.T @ (self.tool_mass * self.cell.gravity)
+        out = np.concatenate([force, np.cross(self.cell.tool_com, force)])
+        pull = self.pull()
+        f, m = rotation.T @ pull[:3], rotation.T @ pull[3:]
+        out += np.concatenate([f, m + np.cross(self.cell.load_point, f)])
+        return out + self.offset + self.extra
+
+
+class MemoryStore:
+    """Keeps what it is given, as JSON where a file would; may be full."""
+
+    def __init__(self, world: World) -> None:
+        self.world = world
+        self.full_at: int | None = None
+        self.rows: list[tuple[Step, Readings, str]] = []
+        self.events: list[tuple[str, dict[str, Any]]] = []
+
+    def record(self, reading: Readings, step: Step, detail: dict[str, Any]) -> None:
+        self.world.call("store.record")
+        if self.full_at == len(self.rows):
+            raise DeviceError("run.hilcal: the disk is full")
+        assert len(reading) == 1
+        assert not self.world.is_moving, "stored in motion"
+        text = json.dumps(detail, allow_nan=False)
+        check(Detail, json.loads(text))
+        self.rows.append((step, reading, text))
+        self.world.call("store.recorded")
+
+    def event(self, kind: str, content: dict[str, Any]) -> None:
+        self.world.call("store.event")
+        check_event(json.loads(json.dumps({"kind": kind, "utc": "now", **content})))
+        self.events.append((kind, content))
+
+    def done(self) -> frozenset[Step]:
+        return frozenset(step for step, _, _ in self.rows)
+
+    def details(self) -> list[dict[str, Any]]:
+        return [json.loads(text) for _, _, text in self.rows]
+
+    def readings(self) -> Readings | None:
+        if not self.rows:
+            return None
+        rows = [reading for _, reading, _ in self.rows]
+        poses = tuple(dict.fromkeys(r.pose_names[0] for r in rows))
+        loads = tuple(dict.fromkeys(r.load_names[0] for r in rows))
+        states = {
+            name: np.concatenate([getattr(r.states, name) for r in rows])
+            for name in rows[0].states.__dataclass_fields__
+            if getattr(rows[0].states, name) is not None
+        }
+        return Readings(
+            states=type(rows[0].states)(**states),
+            pose=np.array([poses.index(r.pose_names[0]) for r in rows]),
+            load=np.array([loads.index(r.load_names[0]) for r in rows]),
+            cycle=np.concatenate([r.cycle for r in rows]),
+            value=np.concatenate([r.value for r in rows]),
+            covariance=np.concatenate([r.covariance for r in rows]),
+            load_names=loads,
+            pose_names=poses,
+        )
+
+    def kinds(self) -> list[str]:
+        """Kinds of the events, in order."""
+        return [kind for kind, _ in self.events]
+
+    def last(self, kind: str) -> dict[str, Any]:
+        """The newest event of a kind."""
+        return next(content for k, content in reversed(self.events) if k == kind)
+
+
+@dataclass
+class Notes:
+    """A watcher that remembers."""
+
+    told: list[object] = field(default_factory=list)
+
+    def notify(self, event: object) -> None:
+        self.told.append(event)
+
+    def of(self, kind: type) -> list[Any]:
+        """What was told of one kind."""
+        return [event for event in self.told if isinstance(event, kind)]
+
+
+STD = 1e-5  # m, of one measurement
+TORQUE = np.array([3.0, -40.0, 20.0, 5.0, 1.0, -0.5])  # N·m, of every pose
+
+
+@dataclass
+class FakeArm:
+    """An arm that moves in straight lines."""
+
+    world: World
+
+    def report(self) -> Report:
+        return Report("arm", "fake")
+
+    def sample(self) -> ArmSample:
+        w = self.world
+        w.call("arm.sample")
+        q = w.joints()
+        speed = (w.goal - w.start) / w.lasts / w.hurried if w.is_moving else np.zeros(6)
+        if not w.is_moving:
+            q = q + w.jitter * w.rng.standard_normal(6)
+        w.torques -= not w.is_moving
+        return ArmSample(
+            host_ns=int(w.time * 1e9),
+            timestamp=w.time,
+            q=q.copy(),
+            q_target=q.copy(),
+            qd=speed + w.extra_speed,
+            target_moment=np.zeros(6),
+            current=np.zeros(6),
+            target_current=np.zeros(6),
+            joint_temperature=np.full(6, 30.0),
+            tcp_pose=np.zeros(6),
+            tcp_force=np.zeros(6),
+            ft_raw_wrench=None,
+            payload=0.0 if w.payload is None else w.payload[0],
+            payload_com=None if w.payload is None else w.payload[1],
+            speed_scaling=1.0,
+            safety=w.safety,
+            torque=TORQUE + 0.1 * w.rng.standard_normal(6) if w.torques >= 0 else None,
+        )
+
+    def take_control(self, mass: float, com: Floats) -> None:
+        self.world.call("arm.take_control")
+        self.world.control, self.world.payload = True, (mass, com)
+
+    def set_payload(self, mass: float, com: Floats) -> None:
+        self.world.call("arm.set_payload")
+        assert self.world.control
+        assert not self.world.is_moving
+        self.world.payload = (mass, com)
+
+    def start_move(self, q: Floats, speed: float, acceleration: float) -> None:
+        w = self.world
+        w.call("arm.start_move")
+        assert w.control, "a motion without control"
+        w.start, w.goal, w.begun = w.joints().copy(), q.copy(), w.time
+        way = float(np.abs(w.goal - w.start).max())
+        w.hurried = w.hurry
+        w.lasts = max(way / speed / w.hurry, 1e-6)
+        w.is_moving = True
+        w.at_start.append((q.copy(), w.load))
+
+    def moving(self) -> bool:
+        self.world.call("arm.moving")
+        self.world.joints()
+        return self.world.is_moving
+
+    def stop(self) -> None:
+        self.world.call("arm.stop")
+        self.world.joints()
+        self.world.is_moving = False
+
+    def close(self) -> None:
+        self.world.is_moving = self.world.control = False
+
+
+@dataclass
+class FakeTracker:
+    """A tracker with white noise."""
+
+    world: World
+
+    def report(self) -> Report:
+        return Report("tracker", "fake")
+
+    def measure(self) -> TrackerSample:
+        w = self.world
+        w.call("tracker.measure")
+        w.time += 0.1
+        if w.lost > 0:
+            w.lost -= 1
+            raise TargetLostError("tracker: the beam is broken")
+        assert not w.is_moving, "measured in motion"
+        value = w.position() + STD * w.rng.standard_normal(3)
+        return TrackerSample(int(w.time * 1e9), value, STD**2 * np.eye(3))
+
+    def find_target(self) -> None:
+        w = self.world
+        w.call("tracker.find_target")
+        w.time += 1.0
+        if w.not_found > 0:
+            w.not_found -= 1
+            raise TargetLostError("tracker: no target found")
+
+    def close(self) -> None:
+        return
+
+
+@dataclass
+class FakeForce:
+    """A force sensor of 100 Hz."""
+
+    world: World
+
+    def report(self) -> Report:
+        return Report("force sensor", "fake")
+
+    def latest(self) -> WrenchSample:
+        self.world.call("force.latest")
+        return self._sample(1)
+
+    def average(self, seconds: float) -> WrenchSample:
+        self.world.call("force.average")
+        self.world.time += seconds
+        return self._sample(int(100 * seconds))
+
+    def _sample(self, frames: int) -> WrenchSample:
+        covariance = np.diag([0.01] * 3 + [1e-4] * 3) if frames > 1 else np.zeros((6, 6))
+        return WrenchSample(int(self.world.time * 1e9), self.world.wrench(), covariance, frames)
+
+    def losses(self) -> Losses:
+        return Losses(1000, 0, 0, 0)
+
+    def close(self) -> None:
+        return
+
+
+@dataclass
+class FakeOperator:
+    """Hangs what it is asked for, or what `World.wrong` says."""
+
+    world: World
+    asked: list[tuple[str, str]] = field(default_factory=list)
+
+    def report(self) -> Report:
+        return Report("operator", "fake")
+
+    def hang(self, load: CellLoad | None, why: str) -> None:
+        w = self.world
+        w.call("operator.hang")
+        assert not w.is_moving, "a person asked to work at a moving arm"
+        name = "none" if load is None else load.name
+        self.asked.append((name, why))
+        w.time += 20.0
+        w.load = w.wrong.pop(0) if w.wrong else name
+
+    def confirm(self, question: str) -> None:
+        self.world.call("operator.confirm")
+        assert not self.world.is_moving, "a person asked to look at a moving arm"
+        self.asked.append(("confirm", question))
+
+    def close(self) -> None:
+        return
+
+
+@dataclass(frozen=True)
+class FakeClock(Clock):
+    """The world's time."""
+
+    world: World | None = None
+
+    def now(self) -> float:
+        assert self.world is not None
+        return self.world.time
+
+    def sleep(self, seconds: float) -> None:
+        assert self.world is not None
+        self.world.time += max(0.0, seconds)
 
 
 def configuration(**changes: Any) -> CellConfig:
@@ -88,3 +459,16 @@ class Bench:
         force = None if self.config.force_sensor is None else FakeForce(self.world)
         self.rig = Rig(FakeArm(self.world), FakeTracker(self.world), force, self.operator)
         self.clock = FakeClock(world=self.world)
+
+
+def measure(b: Bench, plan: Plan | None = None, **more: Any) -> Readings:
+    """Run a plan (the usual one if None) to its end; returns all readings."""
+    run(b.rig, b.cell, b.config, plan or usual_plan(), b.store, b.clock, b.notes, **more)
+    readings = b.store.readings()
+    assert readings is not None
+    return readings
+
+
+def rows(readings: Readings, load: str) -> Bools:
+    """Which readings were taken under a load."""
+    return readings.load == readings.load_names.index(load)

@@ -16,10 +16,7 @@ from hilcal.drivers.simulated.admin import ask
 from hilcal.drivers.simulated.blackboard import Blackboard
 
 START_S = 30.0
-TRACKER_NOISE = (
-    ("--range-std", "5e-6", "0.15e-6"),
-    ("--transverse-std", "7.5e-6", "3e-6"),
-)
+TRACKER_NOISE = (("--range-std", "5e-6", "0.15e-6"), ("--transverse-std", "7.5e-6", "3e-6"))
 
 
 @dataclass(eq=False)

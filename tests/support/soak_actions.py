@@ -19,9 +19,17 @@ from hilcal.measuring.route import dry_run
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
 from tests.support.calibrate_process import Calibration
-from tests.support.campaign_cases import STARVED, Fault, right, stopped_on_its_way
-from tests.support.campaign_run import BEGUN, EndedError, Run
-from tests.support.campaign_site import Site, site
+from tests.support.campaign_cases import (
+    BEGUN,
+    STARVED,
+    EndedError,
+    Fault,
+    Run,
+    Site,
+    right,
+    site,
+    stopped_on_its_way,
+)
 from tests.support.spread_plan import spread_plan
 from tests.wire import test_fault_matrix_person as person
 from tests.wire.test_fault_matrix_arm import MOTION, REST
@@ -351,13 +359,7 @@ class Soak:
         self.counts[f"fault: {fault.name}"] += 1
 
     def _meets(
-        self,
-        run: Run,
-        faults: tuple[Fault, ...],
-        goal: object,
-        *,
-        exact: bool,
-        undo: bool = True,
+        self, run: Run, faults: tuple[Fault, ...], goal: object, *, exact: bool, undo: bool = True
     ) -> str:
         since = self.site.now()
         self._met = ", ".join(fault.name for fault in faults)

@@ -158,12 +158,7 @@ def _revision(k, parts, truth, offset, covariance, torque, names):
         cells=(str(k), EFFECTS[k], "", "", "", "", "", verdict),
         panels={"verdict": (words, *([suspects] if left else []))},
         follows=DependenceCurve(
-            left[0],
-            "",
-            torque[:, 1],
-            1e6 * residual[:, 2],
-            "torque of joint 2 [Nm]",
-            "z [µm]",
+            left[0], "", torque[:, 1], 1e6 * residual[:, 2], "torque of joint 2 [Nm]", "z [µm]"
         )
         if left
         else None,

@@ -13,6 +13,8 @@ from hilcal.types import Floats
 from tests.support.campaign_cases import (
     Act,
     Fault,
+    Run,
+    Site,
     act,
     begin,
     cell,
@@ -26,8 +28,6 @@ from tests.support.campaign_cases import (
     right,
     stopped_on_its_way,
 )
-from tests.support.campaign_run import Run
-from tests.support.campaign_site import Site
 
 pytestmark = pytest.mark.long
 
@@ -74,11 +74,7 @@ def alone(op: str, **arguments: object) -> Act:
 
 MOTION = (
     Fault(
-        "protective stop",
-        arm("protective_stop"),
-        unlock,
-        ("protective stop", "unlock"),
-        fast=True,
+        "protective stop", arm("protective_stop"), unlock, ("protective stop", "unlock"), fast=True
     ),
     Fault("emergency stop", arm("emergency_stop"), release, ("emergency stop",)),
     Fault("local mode", arm("local_mode"), arm("remote_mode"), ("local",)),

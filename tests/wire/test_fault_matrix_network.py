@@ -8,6 +8,8 @@ import pytest
 from hilcal.drivers import emscon_packets as es
 from tests.support.campaign_cases import (
     Fault,
+    Run,
+    Site,
     act,
     begin,
     each,
@@ -18,9 +20,8 @@ from tests.support.campaign_cases import (
     nothing_goes_on,
     path,
     right,
+    site,
 )
-from tests.support.campaign_run import Run
-from tests.support.campaign_site import Site, site
 
 pytestmark = pytest.mark.long
 

@@ -13,6 +13,8 @@ import pytest
 
 from tests.support.campaign_cases import (
     Fault,
+    Run,
+    Site,
     act,
     begin,
     cell,
@@ -25,8 +27,6 @@ from tests.support.campaign_cases import (
     right,
     stopped_on_its_way,
 )
-from tests.support.campaign_run import Run
-from tests.support.campaign_site import Site
 
 pytestmark = pytest.mark.long
 

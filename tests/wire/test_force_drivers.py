@@ -154,7 +154,7 @@ def test_a_cell_without_force_sensor_or_with_a_strange_option(start):
 
 @pytest.mark.parametrize("options", [{}, {"counts_per_N": 50.0}, {**OPTIONS["hex"], "rate_hz": 0}])
 def test_a_hex_needs_its_scale(options):
-    with pytest.raises(InputError, match=r"needs .* a number over 0"):
+    with pytest.raises(InputError, match=r"it must be .*over 0"):
         onrobot_hex.open_force_sensor(config("hex", "/dev/null", options=options))
 
 

@@ -15,14 +15,15 @@ from hilcal.present.viewer.recording import executable
 from tests.support.campaign_cases import (
     STARVED,
     TRIES,
+    EndedError,
+    Run,
+    Site,
     cell,
     nothing_goes_on,
     path,
     right,
     whole,
 )
-from tests.support.campaign_run import EndedError, Run
-from tests.support.campaign_site import Site
 
 pytestmark = pytest.mark.slow
 

@@ -20,8 +20,7 @@ from hilcal.drivers.terminal_operator import open_operator as open_terminal
 from hilcal.errors import DeviceError, InputError
 from hilcal.measuring import devices
 from hilcal.store.campaign_file import CampaignFile
-from tests.support.campaign_cases import STARVED, cell, nothing_goes_on
-from tests.support.campaign_site import Site
+from tests.support.campaign_cases import STARVED, Site, cell, nothing_goes_on
 from tests.support.cli_cases import Capsys, run
 from tests.support.living_cell import config
 from tests.support.paths import ROOT
@@ -92,12 +91,12 @@ def test_a_simulated_person_without_a_world_reports_it(world, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({}, "lacks socket"),
-        ({"socket": 3}, "lacks socket"),
-        ({"socket": "x", "hand_s": -1}, "hand_s = -1; valid"),
-        ({"socket": "x", "hand_s": True}, "hand_s = True; valid"),
-        ({"socket": "x", "hands": 2}, "no key 'hands'"),
-        ({"socket": "x", "person": "me"}, "person = 'me'; valid: true or false"),
+        ({}, 'lacks "socket": .* where the simulated operator lives'),
+        ({"socket": 3}, "socket = 3 is not valid"),
+        ({"socket": "x", "hand_s": -1}, "hand_s = -1 is not valid: .*0 to 3600"),
+        ({"socket": "x", "hand_s": True}, "hand_s = .rue is not valid"),
+        ({"socket": "x", "hands": 2}, 'no .*key "hands"'),
+        ({"socket": "x", "person": "me"}, "person = .me. is not valid: .*true"),
     ],
 )
 def test_wrong_options_of_the_simulated_person_are_refused(options, message):

@@ -15,7 +15,11 @@ import pytest
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog
 from tests.support.campaign_cases import (
+    BEGUN,
     STARVED,
+    EndedError,
+    Run,
+    Site,
     begin,
     cell,
     failed,
@@ -27,8 +31,6 @@ from tests.support.campaign_cases import (
     stopped_within,
     whole,
 )
-from tests.support.campaign_run import BEGUN, EndedError, Run
-from tests.support.campaign_site import Site
 
 __all__ = ["cell", "nothing_goes_on", "path"]  # fixtures
 

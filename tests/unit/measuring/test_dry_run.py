@@ -249,9 +249,7 @@ def test_duration_is_that_of_the_leading_joint(
 
 @settings(max_examples=10, deadline=None)
 @given(st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 6), min_size=2, max_size=4, unique=True))
-def test_whatever_passes_keeps_every_limit_on_its_whole_way(
-    drawn: list[tuple[float, ...]],
-) -> None:
+def test_whatever_passes_keeps_every_limit_on_its_whole_way(drawn: list[tuple[float, ...]]) -> None:
     """No random plan that passes leaves the box anywhere by more than what is said."""
     bench = Bench(limits=Limits(workspace_min_m=(-0.9, -0.9, 0.0), workspace_max_m=(0.9, 0.9, 1.4)))
     poses = {f"p{k}": q for k, q in enumerate(drawn)}

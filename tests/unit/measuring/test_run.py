@@ -20,10 +20,19 @@ from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.plan import Step
 from hilcal.store.rows import content_hash
 from hilcal.tables.table import read_table, write_table
-from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
-from tests.support.fake_devices import STD, TORQUE
-from tests.support.fake_world import REGISTRATION, SAG, Killed
-from tests.support.run_cases import measure, rows
+from tests.support.fake_bench import (
+    POSES,
+    REGISTRATION,
+    SAG,
+    STD,
+    TORQUE,
+    Bench,
+    Killed,
+    measure,
+    plan_of,
+    rows,
+    usual_plan,
+)
 
 
 @pytest.fixture(scope="module")

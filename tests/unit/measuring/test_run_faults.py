@@ -18,11 +18,17 @@ from hilcal.measuring.run import HOW_ON, run
 from hilcal.robot import chain as chains
 from hilcal.robot.catalogue import configs_dir
 from hilcal.store.plan import Plan, Step
-from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
-from tests.support.fake_devices import STD, FakeClock
-from tests.support.fake_world import Killed
+from tests.support.fake_bench import (
+    POSES,
+    STD,
+    Bench,
+    FakeClock,
+    Killed,
+    measure,
+    plan_of,
+    usual_plan,
+)
 from tests.support.rows import first
-from tests.support.run_cases import measure
 
 FAULTS = (
     DeviceError("arm: the line is dead"),

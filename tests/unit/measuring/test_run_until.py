@@ -14,10 +14,8 @@ from hilcal.present.progress import met_words
 from hilcal.readings.readings import Readings
 from hilcal.robot.chain import evaluate
 from hilcal.store.plan import Plan, Step
-from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
-from tests.support.fake_world import Killed
+from tests.support.fake_bench import POSES, Bench, Killed, measure, plan_of, usual_plan
 from tests.support.rows import first
-from tests.support.run_cases import measure
 
 HOME = POSES["reference"]
 

@@ -12,10 +12,8 @@ from hilcal.measuring.devices import ArmSample, TrackerSample, WrenchSample
 from hilcal.measuring.measure import Measurer
 from hilcal.measuring.progress import Phase, Remark
 from hilcal.robot.chain import evaluate
-from tests.support.fake_bench import POSES, Bench, plan_of, usual_plan
-from tests.support.fake_world import Killed
+from tests.support.fake_bench import POSES, Bench, Killed, measure, plan_of, rows, usual_plan
 from tests.support.rows import first
-from tests.support.run_cases import measure, rows
 
 FOLDED = np.array([3.0, -1.3, 2.9, -1.4, -1.4, 0.1])  # the forearm lies on the column
 FREE = np.array([0.6, -1.3, 1.6, -1.4, -1.4, 0.1])

@@ -19,9 +19,16 @@ from hilcal.robot import chain as chains
 from hilcal.store.campaign_file import CampaignFile
 from hilcal.store.run_log import RunLog, create_run
 from hilcal.types import Floats
-from tests.support.fake_bench import Bench, usual_plan
-from tests.support.fake_devices import STD, FakeTracker
-from tests.support.fake_world import REGISTRATION, SAG, Killed, World
+from tests.support.fake_bench import (
+    REGISTRATION,
+    SAG,
+    STD,
+    Bench,
+    FakeTracker,
+    Killed,
+    World,
+    usual_plan,
+)
 from tests.support.reflector_cases import NAMES, OFFSETS
 
 TOOL = Tool(

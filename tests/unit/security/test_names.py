@@ -141,7 +141,7 @@ def test_urscript(name: str, other: str) -> None:
     assert harmless(text)
     assert len(waypoints(text)) == 2
     assert [line.split("#")[0].split("(")[0].strip() for line in text.splitlines()] == [
-        *("def compensated", "movej", "movej", "end"),
+        *("def compensated", "movej", "movej", "end")
     ]
     assert text.split("\n")[1].endswith(f"  # {escaped(name)}")
 

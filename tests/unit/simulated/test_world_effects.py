@@ -11,7 +11,7 @@ from hilcal.drivers.simulated.truth import Truth
 from hilcal.drivers.simulated.world import World
 from studies.random_campaigns import dead_weights, rehearsal_states
 from tests.support.example_cell import ur10e_cell
-from tests.support.world_cases import frames, moment_beyond
+from tests.support.living_cell import frames, moment_beyond
 
 CELL = ur10e_cell()
 ARM = CELL.arm

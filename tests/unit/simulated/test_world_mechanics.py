@@ -8,7 +8,7 @@ from hilcal.drivers.simulated.mechanics import build, elasticity, equilibrium, l
 from hilcal.errors import InputError
 from hilcal.robot.arm import Arm
 from tests.support.example_cell import ur10e_cell
-from tests.support.world_cases import frames, moment_beyond
+from tests.support.living_cell import frames, moment_beyond
 
 CELL = ur10e_cell()
 ARM = CELL.arm

@@ -21,12 +21,12 @@ from tests.support.living_cell import (
     Q,
     config,
     everything,
+    further,
     life,
     same,
     states,
     world_of,
 )
-from tests.support.world_cases import further
 
 
 @pytest.mark.parametrize(("load", "wrench"), [(None, np.zeros(6)), ("5kg", WEIGHT), ("pull", PULL)])
