@@ -39,47 +39,38 @@ UNITS: tuple[tuple[str, float, float], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class StudyCell:
-    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo.
-
-    Attributes:
-        error_over_bound: root mean square over runs and parameters of the error of a parameter
-            in units of its bound, sqrt(F⁻¹_jj); 1 where the bound is attained.
-        variance_factor: mean χ²/dof of the whitened residual; None for `none`, where it has
-            no meaning.
-        unit_shift: largest change of any estimate in any run against the first unit, in
-            units of the bound.
-    """
+    """One scaling of one experiment; `_mc` are standard uncertainties of the Monte-Carlo."""
 
     scaling: Scaling  # "none", "gu" or "gc"
     correlation: float  # share ρ of each element's variance that is common to the elements
     unit: str  # units that the deflections were written in
     shared_unloaded: bool  # whether the loads of a pose share one unloaded reading
     error_over_bound: float
+    """root mean square over runs and parameters of the error of a parameter in units of its bound,
+    sqrt(F⁻¹_jj); 1 where the bound is attained."""
     error_over_bound_mc: float  # of it
     coverage: float  # share of the stated 95 % intervals that hold the true parameter
     coverage_mc: float  # of it
     variance_factor: float | None
+    """mean χ²/dof of the whitened residual; None for `none`, where it has no meaning."""
     parameter_error_over_bound: tuple[float, ...]  # (n,) the same per parameter
     parameter_coverage: tuple[float, ...]  # (n,) the same per parameter
     unit_shift: float
+    """largest change of any estimate in any run against the first unit, in units of the bound."""
 
 
 @dataclass(frozen=True, slots=True)
 class ScalingStudy:
-    """The study's cells and what they were made of.
-
-    Attributes:
-        typical_correlation: the ρ whose mean square correlation is that of the arm and the
-            tracker as specified.
-        cells: every scaling, correlation, unit and way of sharing the unloaded reading.
-    """
+    """The study's cells and what they were made of."""
 
     arm: str  # name of the arm
     runs: int  # Monte-Carlo runs per cell
     poses: int  # number of poses
     loads: int  # wrenches per pose
     typical_correlation: float
+    """the ρ whose mean square correlation is that of the arm and the tracker as specified."""
     cells: tuple[StudyCell, ...]
+    """every scaling, correlation, unit and way of sharing the unloaded reading."""
 
     def of(self, scaling: Scaling, unit: str, shared_unloaded: bool) -> tuple[StudyCell, ...]:
         """Cells of one curve, by growing correlation."""

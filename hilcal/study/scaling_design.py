@@ -38,17 +38,14 @@ _CANDIDATES = 4000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StudyDesign:
-    """P poses with L wrenches each; SI units.
-
-    Attributes:
-        std: (P, 6) standard deviations of the elements of one reading: tracker and arm, m, rad.
-    """
+    """P poses with L wrenches each; SI units."""
 
     arm: Arm
     q: Floats  # (P, n) joint angles, rad
     wrenches: Floats  # (L, 6) at the target, base axes, N and N·m
     observation: Floats  # (P, L, 6, n) blocks of A_M, m and rad per rad/(N·m)
     std: Floats
+    """(P, 6) standard deviations of the elements of one reading: tracker and arm, m, rad."""
     specified: Floats  # (P, 6, 6) correlations of one reading, as tracker and arm give them
     common: Floats  # (P, 6, 6) correlations of the arm's own repeatability J Σ_q Jᵀ
 

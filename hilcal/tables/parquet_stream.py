@@ -31,16 +31,13 @@ NAMES = ("pose", "load", "cycle")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReadingStream:
-    """A Parquet file of readings; nothing of it is held.
-
-    Attributes:
-        station: (3,) where the tracker's beam starts, m; the origin where None.
-    """
+    """A Parquet file of readings; nothing of it is held."""
 
     path: Path
     arm: Arm  # its number of joints, their limits and its reach are checked
     noise: TrackerNoise | None  # gives the covariances where the file has none
     station: tuple[float, ...] | None
+    """(3,) where the tracker's beam starts, m; the origin where None."""
     columns: tuple[str, ...]
     rows: tuple[int, ...]  # number of rows of each row group
     covers: str = INSTRUMENT  # what its covariances cover, `INSTRUMENT` or `WHOLE`
