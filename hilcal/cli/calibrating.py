@@ -108,16 +108,10 @@ AS_USUAL = CalibrationOptions()
     """
 )
 def calibrate(
-    cell: Path,
-    output: Path,
-    resume: bool = False,
-    asked: CalibrationOptions = AS_USUAL,
-    rehearse: bool = False,
-    yes: bool = False,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, resume: bool = False, asked: CalibrationOptions = AS_USUAL,
+    rehearse: bool = False, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Plan, measure, fit, measure what is in doubt, validate, correct, and measure the gain."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)

@@ -55,15 +55,9 @@ from hilcal.whole_file import replace_file
     """
 )
 def import_(
-    table: Path,
-    config: Path | None = None,
-    output: Path | None = None,
-    kind: str = "table",
-    second: Path | None = None,
-    preview: bool = False,
-    force: bool = False,
-    as_json: bool = False,
-) -> None:
+    table: Path, config: Path | None = None, output: Path | None = None, kind: str = "table",
+    second: Path | None = None, preview: bool = False, force: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Make a campaign file from a table of readings."""
     t = terminal(as_json)
     if preview:
@@ -285,14 +279,9 @@ def _named(record: RevisionRecord) -> str:
     """
 )
 def fleet(
-    directory: Path,
-    out: Path,
-    report: Path | None = None,
-    record: Path | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    as_json: bool = False,
-) -> None:
+    directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
+    workers: int | None = None, scheduler: str | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Pool many campaigns: a prior for other arms, arms unlike their type, drift."""
     # loads all that is fitted and shown
     from hilcal.cli.fitting import check_record

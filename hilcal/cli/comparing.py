@@ -40,13 +40,9 @@ from hilcal.validation import validate as validate_campaign
     """
 )
 def compare(
-    run: Path,
-    later: Path | None = None,
-    same_setup: bool = False,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, later: Path | None = None, same_setup: bool = False, revision: int | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Show where the model fails; with a later campaign, what has changed on the arm."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if later is None:
@@ -120,14 +116,9 @@ OVER = 5.0
     """
 )
 def validate(
-    run: Path,
-    other: Path,
-    register: bool = False,
-    limit: str | None = None,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, other: Path, register: bool = False, limit: str | None = None,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Predict readings of another campaign with the model."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     limit_m = None if limit is None else parse_length(limit, "--limit")

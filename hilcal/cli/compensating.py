@@ -89,16 +89,11 @@ AS_USUAL = CompensationOptions()
     """
 )
 def compensate(
-    model: Path,
-    points: Path,
-    output: list[Path] | None = None,
-    asked: CompensationOptions = AS_USUAL,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    kind: str = "table",
-    force: bool = False,
+    model: Path, points: Path, output: list[Path] | None = None,
+    asked: CompensationOptions = AS_USUAL, revision: int | None = None,
+    effects_from: list[Path] | None = None, kind: str = "table", force: bool = False,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Find the joint values that put the tool where it was asked to be, under a load."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     for path in output or ():

@@ -217,17 +217,11 @@ VALIDATION = 10  # Poses of the validation campaign; a choice for the same reaso
     """
 )
 def demo(
-    hide: str | None = None,
-    seed: int | None = None,
-    output: Path = Path("demo.hilcal"),
-    poses: int = POSES,
-    validation: int = VALIDATION,
-    without_devices: bool = False,
-    ambiguous: bool = False,
-    record: Path | None = None,
-    effects_from: list[Path] | None = None,
+    hide: str | None = None, seed: int | None = None, output: Path = Path("demo.hilcal"),
+    poses: int = POSES, validation: int = VALIDATION, without_devices: bool = False,
+    ambiguous: bool = False, record: Path | None = None, effects_from: list[Path] | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Rehearse the whole story on a simulated cell, through real drivers and wires."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)

@@ -141,13 +141,9 @@ class Wanted:
     """
 )
 def export(
-    run: Path,
-    wanted: Wanted,
-    revision: int | None = None,
-    force: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, wanted: Wanted, revision: int | None = None, force: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Hand over: readings, parameters, calibration, URDF, DH, frames."""
     t = terminal(as_json)
     wanted.check(force)

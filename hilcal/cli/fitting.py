@@ -249,20 +249,12 @@ def _drifts(text: str | None) -> dict[str, float]:
     """
 )
 def identify(
-    run: Path,
-    effects: str | None = None,
-    scaling: str = "gc",
-    readings: str | None = None,
-    fit_validation: bool = False,
-    prior: PriorOptions = NO_PRIOR,
-    effects_from: list[Path] | None = None,
-    cell: Path | None = None,
-    out: Path | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    details: bool = False,
+    run: Path, effects: str | None = None, scaling: str = "gc", readings: str | None = None,
+    fit_validation: bool = False, prior: PriorOptions = NO_PRIOR,
+    effects_from: list[Path] | None = None, cell: Path | None = None, out: Path | None = None,
+    workers: int | None = None, scheduler: str | None = None, details: bool = False,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Fit a model to the readings, and keep it as a revision.
 
     A Parquet table in place of the campaign is read as a stream, in passes that need little memory.
@@ -377,15 +369,10 @@ def identify_stream(
     """
 )
 def bootstrap(
-    run: Path,
-    revision: int | None = None,
-    draws: int = DRAWS,
-    seed: int = 0,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, revision: int | None = None, draws: int = DRAWS, seed: int = 0,
+    workers: int | None = None, scheduler: str | None = None,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Draw the poses again, refit, and compare the scatter with the stated uncertainties."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_draws(draws, seed)

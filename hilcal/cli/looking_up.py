@@ -201,12 +201,9 @@ def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     """
 )
 def scaling(
-    runs: int = 2000,
-    seed: int = 1,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    runs: int = 2000, seed: int = 1, workers: int | None = None, scheduler: str | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Show what the scalings none, gu and gc do to the same data."""
     from hilcal.engine.engine import open_engine
     from hilcal.study.scaling import check, experiments, scaling_study, table

@@ -80,23 +80,12 @@ def write(
     """
 )
 def plan(
-    cell: Path,
-    output: Path,
-    poses: int = POSES,
-    readings: int | None = None,
-    criterion: str | None = None,
-    after: Path | None = None,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    seed: int = 0,
-    unloaded_first: bool = False,
-    quick: bool = False,
-    csv: Path | None = None,
-    record: Path | None = None,
-    details: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, poses: int = POSES, readings: int | None = None,
+    criterion: str | None = None, after: Path | None = None, revision: int | None = None,
+    prior: PriorOptions = NO_PRIOR, seed: int = 0, unloaded_first: bool = False,
+    quick: bool = False, csv: Path | None = None, record: Path | None = None, details: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Choose poses, loads and their order, with a proof of how near to the best they are."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
@@ -139,14 +128,10 @@ def plan(
     """
 )
 def check(
-    cell: Path,
-    plan: Path | None = None,
-    save_calibration: Path | None = None,
-    factory: Path | None = None,
-    yes: bool = False,
-    effects_from: list[Path] | None = None,
+    cell: Path, plan: Path | None = None, save_calibration: Path | None = None,
+    factory: Path | None = None, yes: bool = False, effects_from: list[Path] | None = None,
     as_json: bool = False,
-) -> None:
+) -> None:  # fmt: skip
     """Connect to every device and report its state; nothing moves without --factory."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     if save_calibration is not None and save_calibration.suffix.lower() != ".toml":
@@ -276,21 +261,11 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
     """
 )
 def next_(
-    run: Path,
-    output: Path,
-    poses: int | None = None,
-    suspects: str | None = None,
-    cell: Path | None = None,
-    seed: int = 0,
-    quick: bool = False,
-    csv: Path | None = None,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    record: Path | None = None,
-    effects_from: list[Path] | None = None,
-    details: bool = False,
-    as_json: bool = False,
-) -> None:
+    run: Path, output: Path, poses: int | None = None, suspects: str | None = None,
+    cell: Path | None = None, seed: int = 0, quick: bool = False, csv: Path | None = None,
+    revision: int | None = None, prior: PriorOptions = NO_PRIOR, record: Path | None = None,
+    effects_from: list[Path] | None = None, details: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Plan the measurements that separate the leading suspects; exit 4 where none are in doubt."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)

@@ -248,26 +248,14 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     """
 )
 def init(
-    cell: Path = Path("CELL.toml"),
-    robot: str | None = None,
-    host: str | None = None,
-    repeatability: str | None = None,
-    tracker: str | None = None,
-    tracker_port: str | None = None,
-    tracker_accuracy: str | None = None,
-    force_sensor: str | None = None,
-    force_port: str | None = None,
-    target: str | None = None,
-    load_point: str | None = None,
-    tool_mass: str | None = None,
-    tool_com: str | None = None,
-    load: list[str] | None = None,
-    readings: str | None = None,
-    floor: str | None = None,
-    tracker_place: str | None = None,
-    force: bool = False,
-    as_json: bool = False,
-) -> None:
+    cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
+    repeatability: str | None = None, tracker: str | None = None, tracker_port: str | None = None,
+    tracker_accuracy: str | None = None, force_sensor: str | None = None,
+    force_port: str | None = None, target: str | None = None, load_point: str | None = None,
+    tool_mass: str | None = None, tool_com: str | None = None, load: list[str] | None = None,
+    readings: str | None = None, floor: str | None = None, tracker_place: str | None = None,
+    force: bool = False, as_json: bool = False,
+) -> None:  # fmt: skip
     """Write a commented CELL.toml: asks at a terminal, else takes the options."""
     t = terminal(as_json)
     options = {f"--{name.replace('_', '-')}": value for name, value in locals().items()}

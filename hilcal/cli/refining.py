@@ -122,14 +122,9 @@ def diagnose(
     """
 )
 def add(
-    run: Path,
-    effect: str,
-    revision: int | None = None,
-    record: Path | None = None,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
+    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Add an effect to the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     wanted = read_effects_text(effect, "EFFECT", catalogue)
@@ -145,14 +140,9 @@ def add(
     """
 )
 def remove(
-    run: Path,
-    effect: str,
-    revision: int | None = None,
-    record: Path | None = None,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effect: str, revision: int | None = None, record: Path | None = None,
+    view: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Take an effect out of the model: error before and after."""
     catalogue = catalogue_with(effects_from)
     catalogue[effect]  # an unknown name is refused
@@ -223,20 +213,11 @@ def _change(
     """
 )
 def refine(
-    run: Path,
-    effects: str | None = None,
-    readings: str | None = None,
-    from_latest: bool = False,
-    revision: int | None = None,
-    prior: PriorOptions = NO_PRIOR,
-    discover: bool = False,
-    background: bool = True,
-    record: Path | None = None,
-    view: bool = False,
-    details: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, effects: str | None = None, readings: str | None = None, from_latest: bool = False,
+    revision: int | None = None, prior: PriorOptions = NO_PRIOR, discover: bool = False,
+    background: bool = True, record: Path | None = None, view: bool = False, details: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Diagnose and add until the model is adequate."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     named = wanted_effects(effects, catalogue)
@@ -366,14 +347,9 @@ def revisions_json(rows: Sequence[RevisionRow]) -> list[dict[str, object]]:
     """
 )
 def discover(
-    run: Path,
-    output: Path,
-    against: str | None = None,
-    alternatives: bool = False,
-    revision: int | None = None,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, output: Path, against: str | None = None, alternatives: bool = False,
+    revision: int | None = None, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Search a law for what no effect explains, and write it as an effect."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     wanted = _effects_against(against, catalogue)

@@ -92,18 +92,10 @@ from hilcal.whole_file import replace_file
     """
 )
 def run(
-    cell: Path,
-    output: Path,
-    plan: Path | None = None,
-    resume: bool = False,
-    append: bool = False,
-    rehearse: bool = False,
-    until: str | None = None,
-    yes: bool = False,
-    view: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    cell: Path, output: Path, plan: Path | None = None, resume: bool = False, append: bool = False,
+    rehearse: bool = False, until: str | None = None, yes: bool = False, view: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Measure a campaign: every step of the plan, each reading stored before the next motion."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     config, numbers = read_cell(cell)
@@ -495,15 +487,10 @@ FASTEST = 200.0  # Clock of a simulated world, as `[simulation] clock` allows
     """
 )
 def simulate(
-    cell: Path,
-    output: Path,
-    plan: Path | None = None,
-    hide: str | None = None,
-    seed: int | None = None,
-    person: bool = False,
-    clock: float | None = None,
+    cell: Path, output: Path, plan: Path | None = None, hide: str | None = None,
+    seed: int | None = None, person: bool = False, clock: float | None = None,
     effects_from: list[Path] | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Run simulated devices for a cell until Ctrl-C, for `check` and `run` to talk to."""
     t, catalogue = terminal(False), catalogue_with(effects_from)
     config, numbers = read_cell(cell)

@@ -39,17 +39,10 @@ from hilcal.tables.units import parse_length
     """
 )
 def report(
-    run: Path,
-    later: Path | None = None,
-    output: Path | None = None,
-    limit: str | None = None,
-    validation: Path | None = None,
-    operator: str = "",
-    revision: int | None = None,
-    appendix: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, later: Path | None = None, output: Path | None = None, limit: str | None = None,
+    validation: Path | None = None, operator: str = "", revision: int | None = None,
+    appendix: bool = False, effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Write the whole story as one HTML page, a certificate first; it prints on six pages."""
     from hilcal.write_report import Asked, write_report
 
@@ -90,13 +83,9 @@ ENDING = 5.0  # How long a server of a page or a story may delay the end, s
     """
 )
 def view(
-    run: Path,
-    revision: int | None = None,
-    record: Path | None = None,
-    port: int = PORT,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, revision: int | None = None, record: Path | None = None, port: int = PORT,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Tell the story of the revisions in rerun."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     check_record(record)
@@ -181,16 +170,10 @@ def viewer_command() -> str:
     """
 )
 def workbench(
-    run: Path,
-    config: Path | None = None,
-    kind: str = "table",
-    second: Path | None = None,
-    output: Path | None = None,
-    port: int | None = None,
-    no_browser: bool = False,
-    effects_from: list[Path] | None = None,
-    as_json: bool = False,
-) -> None:
+    run: Path, config: Path | None = None, kind: str = "table", second: Path | None = None,
+    output: Path | None = None, port: int | None = None, no_browser: bool = False,
+    effects_from: list[Path] | None = None, as_json: bool = False,
+) -> None:  # fmt: skip
     """Compare, add, remove, change the cell, measure next on one page of this machine alone."""
     t, catalogue = terminal(as_json), catalogue_with(effects_from)
     from hilcal.workbench.guard import UNUSED_S
