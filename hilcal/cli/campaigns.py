@@ -43,8 +43,7 @@ from hilcal.tables.proposal import Proposal
 from hilcal.whole_file import replace_file
 
 
-@command(
-    """
+@command("""
     table | TABLE | What was measured.
     config | --config CELL.toml | The cell it was measured in.
     output | -o --output RUN.hilcal | The campaign file to make; with --preview, the mapping file.
@@ -52,8 +51,7 @@ from hilcal.whole_file import replace_file
         file.
     second | --second TABLE | The second file, e.g. of the joints.
     preview | --preview | Show how the table could be read; make no campaign.
-    """
-)
+    """)
 def import_(
     table: Path, config: Path | None = None, output: Path | None = None, kind: str = "table",
     second: Path | None = None, preview: bool = False, force: bool = False, as_json: bool = False,
@@ -95,23 +93,21 @@ def import_(
         begin = "Nothing can be fitted yet" if wrong.refused else "Note"
         t.show(Words(f"{begin}: {said}.", indent=2))
     t.document(
-        {
-            "campaign": str(output),
-            "robot": settings.robot.model,
-            "n_readings": len(readings),
-            "n_poses": poses,
-            "elements": readings.m,
-            "loads": loads,
-            "targets": targets,
-            "observers": [str(name) for name in readings.observers],
-            "covariance": found.parts,
-            "noise": None if noise is None else asdict(noise),
-            "notes": list(notes),
-            "description": None if wrong is None else wrong.to_json(cell, readings),
-            "other_arm": None if other is None else other.to_json(),
-            "torques": None if torques is None else torques.to_json(),
-            "frames": None if registered is None else registered.to_json(),
-        }
+        campaign=str(output),
+        robot=settings.robot.model,
+        n_readings=len(readings),
+        n_poses=poses,
+        elements=readings.m,
+        loads=loads,
+        targets=targets,
+        observers=[str(name) for name in readings.observers],
+        covariance=found.parts,
+        noise=None if noise is None else asdict(noise),
+        notes=list(notes),
+        description=None if wrong is None else wrong.to_json(cell, readings),
+        other_arm=None if other is None else other.to_json(),
+        torques=None if torques is None else torques.to_json(),
+        frames=None if registered is None else registered.to_json(),
     )
 
 
@@ -164,18 +160,16 @@ def show_preview(
     else:
         t.notice("nothing was written; -o mapping.toml keeps this as a mapping to edit")
     t.document(
-        {
-            "mapping": proposal.sections,
-            "understood": [
-                {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
-                for u in proposal.understood
-            ],
-            "unsure": [{"section": what, "what": words} for what, words in proposal.unsure],
-            "unused": [{"column": name, "why": why} for name, why in proposal.unused],
-            "missing": proposal.lacking,
-            "outcome": outcome,
-            "written": None if output is None else str(output),
-        }
+        mapping=proposal.sections,
+        understood=[
+            {"section": u.what, "columns": u.columns, "meaning": u.meaning, "first": u.example}
+            for u in proposal.understood
+        ],
+        unsure=[{"section": what, "what": words} for what, words in proposal.unsure],
+        unused=[{"column": name, "why": why} for name, why in proposal.unused],
+        missing=proposal.lacking,
+        outcome=outcome,
+        written=None if output is None else str(output),
     )
 
 
@@ -204,12 +198,10 @@ def info(run: Path, as_json: bool = False) -> None:
     t.document({**to_json(found, str(run), parts), **more})
 
 
-@command(
-    """
+@command("""
     number | N | The revision; the latest one if left out.
     release | --release | Accept none: the latest one is used again.
-    """
-)
+    """)
 def accept(
     run: Path, number: int | None = None, release: bool = False, as_json: bool = False
 ) -> None:
@@ -232,19 +224,15 @@ def accept(
         )
     used = records[-1] if chosen is None else chosen
     t.document(
-        {
-            "accepted": None if chosen is None else chosen.number,
-            "in_use": used.number,
-            "latest": records[-1].number,
-        }
+        accepted=None if chosen is None else chosen.number,
+        in_use=used.number,
+        latest=records[-1].number,
     )
 
 
-@command(
-    """
+@command("""
     robot | --robot FILE | URDF or DH table of its robot, for a campaign that does not hold it.
-    """
-)
+    """)
 def repair(run: Path, robot: Path | None = None, as_json: bool = False) -> None:
     """Open a campaign again that a bad revision closes: it is set aside, no reading is."""
     t = terminal(as_json)
@@ -271,13 +259,11 @@ def _named(record: RevisionRecord) -> str:
     return f"revision {record.number} ({model_name(record.effects)})"
 
 
-@command(
-    """
+@command("""
     directory | DIR | With campaign files, in folders below as well.
     out | -o PRIOR.json | What to expect of another arm.
     report | --report F.html | Write it as one HTML page.
-    """
-)
+    """)
 def fleet(
     directory: Path, out: Path, report: Path | None = None, record: Path | None = None,
     workers: int | None = None, scheduler: str | None = None, as_json: bool = False,

@@ -68,8 +68,7 @@ class CompensationOptions:
 AS_USUAL = CompensationOptions()
 
 
-@command(
-    """
+@command("""
     model | RUN.hilcal | A campaign with a revision, or a calibration (JSON).
     points | POINTS | Where to go: a table (CSV, XLSX …) or a program: UR .script, KUKA .src, ABB
         .mod, FANUC .ls, Yaskawa .jbi.
@@ -86,8 +85,7 @@ AS_USUAL = CompensationOptions()
     leave | --leave | Keep waypoints of a program that cannot be corrected as they are.
     kind | --format FORMAT | table, or a mapping, as for import.
     force | --force | Replace existing files.
-    """
-)
+    """)
 def compensate(
     model: Path, points: Path, output: list[Path] | None = None,
     asked: CompensationOptions = AS_USUAL, revision: int | None = None,

@@ -204,8 +204,7 @@ POSES = 20
 VALIDATION = 10  # Poses of the validation campaign; a choice for the same reason
 
 
-@command(
-    """
+@command("""
     hide | --hide EFFECT | An effect, random, nothing, or invented: a law that the catalogue lacks.
     seed | --seed | Of everything random.
     output | -o --output RUN.hilcal | The campaign file to make.
@@ -214,8 +213,7 @@ VALIDATION = 10  # Poses of the validation campaign; a choice for the same reaso
     without_devices | --without-devices | Draw the readings at once, through no wire.
     ambiguous | --ambiguous | Measure little at first, so that the effect is in doubt; then what
         settles it.
-    """
-)
+    """)
 def demo(
     hide: str | None = None, seed: int | None = None, output: Path = Path("demo.hilcal"),
     poses: int = POSES, validation: int = VALIDATION, without_devices: bool = False,
@@ -288,24 +286,22 @@ def demo(
     t.show("As one HTML page, with a certificate first:")
     t.command(f"hilcal report {quoted(output)}{more}")
     t.document(
-        {
-            "campaign": str(output),
-            "hidden": r.hidden,
-            "strength_sigma": r.strength_sigma,
-            "seed": number,
-            "readings": r.mode,
-            "found": ok,
-            **({} if laws is None else laws_json(laws)),
-            **({} if doubt is None else {"doubt": doubt.document}),
-            "verdict": found.verdict,
-            "message": message(found.diagnosis),
-            "rejected": list(found.rejected),
-            "revisions": revisions_json(rows),
-            "parameters": [asdict(p) for p in truth],
-            "truth": r.world.truth,
-            "compensation": None if improved is None else _improvement_json(improved),
-            "diagnoses": [to_json(s.diagnosis) for s in found.steps],
-        }
+        campaign=str(output),
+        hidden=r.hidden,
+        strength_sigma=r.strength_sigma,
+        seed=number,
+        readings=r.mode,
+        found=ok,
+        **{} if laws is None else laws_json(laws),
+        **{} if doubt is None else {"doubt": doubt.document},
+        verdict=found.verdict,
+        message=message(found.diagnosis),
+        rejected=list(found.rejected),
+        revisions=revisions_json(rows),
+        parameters=[asdict(p) for p in truth],
+        truth=r.world.truth,
+        compensation=None if improved is None else _improvement_json(improved),
+        diagnoses=[to_json(s.diagnosis) for s in found.steps],
     )
 
 

@@ -237,8 +237,7 @@ def _drifts(text: str | None) -> dict[str, float]:
     return found
 
 
-@command(
-    """
+@command("""
     effects | --effects A,B | Effects to fit, besides unknown frames; with options:
         creep(joints=each).
     scaling | --scaling S | none, gu, gc or all, side by side.
@@ -246,8 +245,7 @@ def _drifts(text: str | None) -> dict[str, float]:
         for good.
     cell | --cell CELL.toml | The cell of a stream, READINGS.parquet as RUN.
     out | -o F.json | Of a stream: write its calibration.
-    """
-)
+    """)
 def identify(
     run: Path, effects: str | None = None, scaling: str = "gc", readings: str | None = None,
     fit_validation: bool = False, prior: PriorOptions = NO_PRIOR,
@@ -362,12 +360,10 @@ def identify_stream(
     t.document(document)
 
 
-@command(
-    """
+@command("""
     draws | --draws N | Campaigns drawn.
     seed | --seed | Of the draws.
-    """
-)
+    """)
 def bootstrap(
     run: Path, revision: int | None = None, draws: int = DRAWS, seed: int = 0,
     workers: int | None = None, scheduler: str | None = None,
@@ -388,11 +384,4 @@ def bootstrap(
         with counting(t.progress, "draws", draws) as advance:
             found = draw_again(fit, engine, draws, seed, advance)
     t.show(bootstrap_report(found))
-    t.document(
-        {
-            "revision": number,
-            "seed": seed,
-            **found.to_dict(),
-            "remarks": [*bootstrap_remarks(found)],
-        }
-    )
+    t.document(revision=number, seed=seed, **found.to_dict(), remarks=[*bootstrap_remarks(found)])

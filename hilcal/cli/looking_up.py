@@ -123,12 +123,10 @@ def _source(kind: type[Effect], catalogue: Catalogue) -> str:
     return "built in" if kind in BUILT_IN else "installed"
 
 
-@command(
-    """
+@command("""
     name | NAME | Lower case, digits and _.
     output | -o --output FILE.py | The file; NAME.py by default.
-    """
-)
+    """)
 def new(name: str, output: Path | None = None, as_json: bool = False) -> None:
     """Write a file with one effect that works as it stands, to be changed into your own."""
     t = terminal(as_json)
@@ -171,11 +169,9 @@ DRIVERS_OWN: dict[str, type[Section]] = {
 """Keys of the drivers that come with the program, by section."""
 
 
-@command(
-    """
+@command("""
     section | SECTION | One of them, e.g. tracker.
-    """
-)
+    """)
 def config(section: str | None = None, as_json: bool = False) -> None:
     """Explain the sections and keys of CELL.toml: unit, default, example."""
     t, known = terminal(as_json), reference.tables(DRIVERS_OWN)
@@ -193,13 +189,11 @@ def write_page(path: str = "docs/reference/cell-configuration.md") -> None:
     replace_file(path, reference_page(reference.tables(DRIVERS_OWN)))
 
 
-@command(
-    """
+@command("""
     runs | --runs | Monte-Carlo runs.
     seed | --seed | Of the random numbers.
     workers | --workers N | Processes of this machine; 1 by default.
-    """
-)
+    """)
 def scaling(
     runs: int = 2000, seed: int = 1, workers: int | None = None, scheduler: str | None = None,
     as_json: bool = False,

@@ -69,16 +69,14 @@ def write(
             record_plan(cell, config, made.plan, made.summary, record, powers)
 
 
-@command(
-    f"""
+@command(f"""
     readings | --readings | Or so many readings, repeats not counted, at as many poses and under
         those loads that tell most.
     criterion | --criterion {"|".join(CRITERIA)} | The optimality criterion.
     after | --after RUN.hilcal | Plan on from what it knows already.
     unloaded_first | --unloaded-first | All unloaded readings before the loads: for run --until; a
         drift costs more.
-    """
-)
+    """)
 def plan(
     cell: Path, output: Path, poses: int = POSES, readings: int | None = None,
     criterion: str | None = None, after: Path | None = None, revision: int | None = None,
@@ -118,15 +116,13 @@ def plan(
     t.document({**made.to_dict(), "plan": str(output)})
 
 
-@command(
-    """
+@command("""
     save_calibration | --save-calibration F.toml | Write the kinematics that the arm's controller
         holds, for [robot] calibration.
     factory | --factory F.hilcal | Is the arm still what its factory measured? Measures a few
         readings without a load into a new campaign, or takes those of one that is there.
     yes | --yes -y | With --factory: do not ask before the arm moves.
-    """
-)
+    """)
 def check(
     cell: Path, plan: Path | None = None, save_calibration: Path | None = None,
     factory: Path | None = None, yes: bool = False, effects_from: list[Path] | None = None,
@@ -170,13 +166,12 @@ def check(
     elif dry is not None:
         failed = refusal(dry, str(plan))
     t.document(
-        {
-            "ok": not any(a.problems for a in answers) and not (dry and dry.problems),
-            "devices": [answer_json(a) for a in answers],
-            "plan": None if dry is None else asdict(dry),
-            **({} if judged is None else {"factory": judged}),
-        },
+        None,
         failed,
+        ok=not any(a.problems for a in answers) and not (dry and dry.problems),
+        devices=[answer_json(a) for a in answers],
+        plan=None if dry is None else asdict(dry),
+        **{} if judged is None else {"factory": judged},
     )
 
 
@@ -252,14 +247,12 @@ def refuse_unready(answers: tuple[ConnectionResult, ...]) -> None:
         raise DeviceError("; ".join(lines))
 
 
-@command(
-    """
+@command("""
     poses | --poses | As many readings as so many poses take under every load, 20 unless given; new
         poses, where a misfit depends on the pose alone.
     suspects | --suspects A,B | Separate these, whatever is diagnosed.
     cell | --cell CELL.toml | The cell, where it has other loads now.
-    """
-)
+    """)
 def next_(
     run: Path, output: Path, poses: int | None = None, suspects: str | None = None,
     cell: Path | None = None, seed: int = 0, quick: bool = False, csv: Path | None = None,

@@ -225,8 +225,7 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     return [CellQuestion(*(part.strip() for part in line.split(" |"))) for line in lines]
 
 
-@command(
-    f"""
+@command(f"""
     cell | CELL.toml | The file to write.
     robot | --robot | The arm, e.g. ur10e, or a .urdf.
     host | --host | Address of its controller.
@@ -245,8 +244,7 @@ tracker_place | Where does the tracker stand, roughly? x, y, z in m, base axes |
     readings | --readings KIND | absolute (unless given) or deflection: what is fitted.
     floor | --floor Z | Height that the arm stays above, m.
     tracker_place | --tracker-place X,Y,Z | Of the tracker in base axes, m.
-    """
-)
+    """)
 def init(
     cell: Path = Path("CELL.toml"), robot: str | None = None, host: str | None = None,
     repeatability: str | None = None, tracker: str | None = None, tracker_port: str | None = None,
@@ -349,12 +347,10 @@ def _complete(draft: Draft) -> None:
     check_effects(cell_from_config(config, draft.base_dir), config, installed())
 
 
-@command(
-    """
+@command("""
     cell | CELL.toml | Also look at this cell's ports and addresses.
     folder | --folder DIR | Where campaigns are stored.
-    """
-)
+    """)
 def doctor(cell: Path | None = None, folder: Path = Path("."), as_json: bool = False) -> None:
     """Look at packages, ports, permissions, network, clock and disk of this computer."""
     t = terminal(as_json)
