@@ -145,13 +145,13 @@ def doubtful_case(
     return case, plan, False
 
 
-def _fit(r: Rehearsal, case: RehearsalSettings) -> Fit:
-    return fit(baseline(r.cell, r.readings, r.mode, case.catalogue), r.readings, r.mode)
+def _fit(r: Rehearsal, catalogue: Catalogue) -> Fit:
+    return fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
 
 
 def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the hidden effect is clearly there, and a rival explains the readings as well."""
-    p = linearise(_fit(r, case))
+    p = linearise(_fit(r, case.catalogue))
     effects = [e for e in candidates(p.fit) if e.name in (r.hidden, *RESEMBLING)]
     found = {s.effect: s for s in rank_suspects(p, effects)}
     own = found.pop(r.hidden, None)
@@ -163,7 +163,7 @@ def _resembled(r: Rehearsal, case: RehearsalSettings) -> bool:
 
 def _left_open(r: Rehearsal, case: RehearsalSettings) -> bool:
     """Whether the diagnosis leaves the hidden effect and others that could be separated from it."""
-    d = judge(Evidence(_fit(r, case)), History())
+    d = judge(Evidence(_fit(r, case.catalogue)), History())
     return r.hidden in left_open(d) and all(rival.possible for rival in d.separability)
 
 
@@ -176,7 +176,7 @@ def doubted(
     """
     with working(t.progress) as say:
         say("fitting and diagnosing the first readings")
-        found = fit(baseline(r.cell, r.readings, r.mode, catalogue), r.readings, r.mode)
+        found = _fit(r, catalogue)
         d = diagnose(found, say=say)
     document: dict[str, object] = {"verdict": d.verdict, "message": message(d), "suspects": []}
     known = (content_hash(r.readings), len(r.readings))
@@ -235,8 +235,10 @@ def demo(
         config, wanted or RANDOM, number, output, configs_dir() / "cells", catalogue, world
     )
     laws = None
-    if wanted == INVENTED:
-        laws = LawSearch(output.absolute().parent, _law_name(output), replacing=True)
+    if wanted == INVENTED:  # named after the campaign, which it replaces, too
+        word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
+        name = f"law_of_{word}" if word else "law"
+        laws = LawSearch(output.absolute().parent, name, replacing=True)
     with _campaign(t, told, poses, without_devices, ambiguous) as (m, r, doubt):
         with working(t.progress) as say:
             model = baseline(r.cell, r.readings, r.mode, catalogue)
@@ -300,7 +302,16 @@ def demo(
         revisions=revisions_json(rows),
         parameters=[asdict(p) for p in truth],
         truth=r.world.truth,
-        compensation=None if improved is None else _improvement_json(improved),
+        compensation=None
+        if improved is None
+        else {
+            "points": improved.everything.count,
+            "before_m": improved.everything.before.mean_m,
+            "after_m": improved.everything.after.mean_m,
+            "stated_m": improved.everything.band_m,
+            "inside": improved.everything.inside,
+            "measured": improved.to_dict(),
+        },
         diagnoses=[to_json(s.diagnosis) for s in found.steps],
     )
 
@@ -368,19 +379,6 @@ def _put_to_use(t: Terminal, p: Procedure, measure: Measure, drawn: bool) -> Imp
     return improved
 
 
-def _improvement_json(found: Improvement) -> dict[str, object]:
-    """Return the error before and after, measured, for JSON."""
-    e = found.everything
-    return {
-        "points": e.count,
-        "before_m": e.before.mean_m,
-        "after_m": e.after.mean_m,
-        "stated_m": e.band_m,
-        "inside": e.inside,
-        "measured": found.to_dict(),
-    }
-
-
 def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     used = np.unique(r.readings.load)
     loads = [name for k, name in enumerate(r.readings.load_names) if k in used and name != "none"]
@@ -398,12 +396,6 @@ def _introduce(t: Terminal, r: Rehearsal, choice: str, seed: int) -> None:
     )
     kind = "deflections: loaded minus unloaded" if r.mode == "deflection" else "absolute positions"
     t.show(f"The model is fitted to {kind}.\n")
-
-
-def _law_name(output: Path) -> str:
-    """Return the name of the law that a demo finds: after its campaign, which it replaces, too."""
-    word = re.sub(r"[^a-z0-9]+", "_", output.stem.lower()).strip("_")
-    return f"law_of_{word}" if word else "law"
 
 
 def _judge_law(r: Rehearsal, found: Refinement, laws: LawSearch) -> tuple[bool, str]:

@@ -6,7 +6,7 @@ reading that stands alone. A row group of the file is what one worker reads; it 
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,11 +119,10 @@ def open_stream(
     stream = ReadingStream(path, arm, noise, station, names, rows)
     first = next(k for k, count in enumerate(rows) if count)
     covers = _covers(path, first) if columns.COVERS in header else INSTRUMENT
-    rounding = None
-    if not covers.endswith(ROUNDING):
-        rounding = rounding_variance(next(stream.chunks(first)).value[:, :3], 1.0)
-    covers = covers.removesuffix(ROUNDING)
-    return ReadingStream(path, arm, noise, station, names, rows, covers, rounding)
+    if covers.endswith(ROUNDING):
+        return replace(stream, covers=covers.removesuffix(ROUNDING))
+    rounding = rounding_variance(next(stream.chunks(first)).value[:, :3], 1.0)
+    return replace(stream, covers=covers, rounding=rounding)
 
 
 def _opened(path: Path) -> Any:
