@@ -48,9 +48,6 @@ def import_campaign(
         second: the second file of a mapping that is for two.
         overwrite: replace a campaign that is there.
         say: takes progress, one line each.
-
-    Raises:
-        InputError: anything in table or cell that cannot be right, or the file exists.
     """
     settings = load_config(config)
     base_dir = config.absolute().parent

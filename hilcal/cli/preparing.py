@@ -123,11 +123,7 @@ class Draft:
 
 
 def number(words: str, unit: str) -> float:
-    """Read a number, in `unit` or in the one that is behind it.
-
-    Raises:
-        InputError: it is none.
-    """
+    """Read a number, in `unit` or in the one that is behind it."""
     found = _quantities(words, unit)
     if len(found) != 1:
         raise InputError(f"{words.strip()!r} is no number; valid: one in {unit}")

@@ -115,10 +115,6 @@ def scaling_study(
         arm: the arm; None for the UR10e.
         engine: what the experiments are computed on.
         advance: told 1 for each experiment that is done.
-
-    Raises:
-        InputError: fewer than 2 runs or poses, no correlation, or one outside [0, 1).
-        CannotAnswerError: the arm cannot hold the wrenches in so many poses.
     """
     check(runs, correlations, poses)
     design = make_design(rng, arm or load_arm("ur10e"), poses)

@@ -52,11 +52,7 @@ class ReadingStream:
         return sum(self.rows[:group])
 
     def chunks(self, group: int) -> Iterator[Readings]:
-        """Yield the readings of a row group, at most `CHUNK` at a time.
-
-        Raises:
-            InputError: a damaged file, or a row that cannot be right, by its number.
-        """
+        """Yield the readings of a row group, at most `CHUNK` at a time."""
         row = 1 + self.first_row(group)
         for table in _tables(self.path, group, self.columns):
             yield self._readings(table, row)
@@ -92,9 +88,6 @@ def open_stream(
     Args:
         noise: gives the covariances where the file has none.
         station: (3,) where the tracker's beam starts, m; the origin where None.
-
-    Raises:
-        InputError: no pyarrow, a damaged or interrupted file, a column that is missing or unknown.
     """
     file = _opened(path)
     header = list(file.schema_arrow.names)

@@ -48,9 +48,6 @@ def propose(path: Path, second: Path | None = None, joints: int | None = None) -
     Args:
         second: a second file that holds the other columns of the same readings.
         joints: number of the arm's joints, where it is known.
-
-    Raises:
-        InputError: a file that cannot be read, or two that do not belong together.
     """
     first = sniff(path)
     grid, doubts = first.grid, [("file", words) for words in first.doubts]

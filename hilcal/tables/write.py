@@ -32,11 +32,7 @@ Column = Sequence[object] | np.ndarray  # Numbers, or words; None for a cell wit
 
 
 def check_suffix(path: Path) -> None:
-    """Refuse names of other kinds of files.
-
-    Raises:
-        InputError: names the valid ones.
-    """
+    """Refuse names of other kinds of files."""
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: unknown kind of table; valid: {' or '.join(SUFFIXES)}")
 
@@ -47,9 +43,6 @@ def write_columns(path: Path, columns: Mapping[str, Column], about: Mapping[str,
     Args:
         path: ends in .csv or .parquet.
         about: what the table is about, for the metadata of Parquet; CSV has no place for it.
-
-    Raises:
-        InputError: another ending, no pyarrow for Parquet, or the file cannot be written.
     """
     check_suffix(path)
     plain = {
@@ -157,9 +150,6 @@ def plan_csv(
     Args:
         wrenches: (6,) by load, base axes, N and N·m; adds fx_N ... mz_Nm where given.
         units: of the joints' values (`Arm.units`); all in rad where None.
-
-    Raises:
-        KeyError: a load of the plan has no wrench.
     """
     columns: dict[str, Column] = {ORDER: list(range(1, 1 + len(plan.steps)))}
     columns |= {name: [getattr(step, name) for step in plan.steps] for name in TEXT}
